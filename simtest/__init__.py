@@ -1,0 +1,64 @@
+"""simtest: a rendering-validated simulation testbed for reconstruction from specular highlights in endoscopy.
+
+The public names are loaded when they are first used; importing the package loads neither the renderer nor the
+viewers.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from simtest.api import LabelledFrame, render, validate
+    from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
+    from simtest.estimators import Estimate
+    from simtest.geometry import Camera, Patch
+    from simtest.reconstruction import Specularity, reconstruct
+    from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene
+
+_HOMES = {
+    "simtest.api": ("LabelledFrame", "render", "validate"),
+    "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
+    "simtest.estimators": ("Estimate",),
+    "simtest.geometry": ("Camera", "Patch"),
+    "simtest.reconstruction": ("Specularity", "reconstruct"),
+    "simtest.spec": ("Experiment", "Scene", "load_camera", "load_experiment", "load_scene"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "BackendError",
+    "Camera",
+    "Estimate",
+    "Experiment",
+    "Failure",
+    "InputError",
+    "LabelledFrame",
+    "Patch",
+    "Reason",
+    "Scene",
+    "SimtestError",
+    "Specularity",
+    "load_camera",
+    "load_experiment",
+    "load_scene",
+    "reconstruct",
+    "render",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from simtest.provenance import version
+
+        return version()
+    if name not in _HOME:
+        raise AttributeError(f"module 'simtest' has no attribute {name!r}")
+    import importlib
+
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

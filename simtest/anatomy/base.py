@@ -1,0 +1,213 @@
+"""What every surface offers: its place in front of the camera, exact points on rays, and a shape to render."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """Where a ray tracer saw rays meet the rendered shape: the start for the exact solution.
+
+    Parameters
+    ----------
+    distance : ndarray, shape (N,)
+        Distance along each unit ray, mm; inf where the ray misses.
+    face : ndarray of int, shape (N,)
+        Triangle hit (0 for shapes that are no meshes).
+    barycentric : ndarray, shape (N, 2)
+        Weights of the triangle's second and third corners.
+    """
+
+    distance: Array
+    face: IntArray
+    barycentric: Array
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Exact points of a surface, in the frame of the rays that found them.
+
+    Parameters
+    ----------
+    distance : ndarray, shape (N,)
+        Distance along the ray, mm; NaN where there is none.
+    position, normal : ndarray, shape (N, 3)
+        Point, mm, and unit normal facing the ray's origin.
+    k_min, k_max : ndarray, shape (N,)
+        Principal curvatures, 1/mm, convex towards the ray's origin positive.
+    direction_min, direction_max : ndarray, shape (N, 3)
+        Unit principal directions.
+    valid : ndarray of bool, shape (N,)
+        False where the ray misses or no solution was found; all other fields are NaN there.
+    """
+
+    distance: Array
+    position: Array
+    normal: Array
+    k_min: Array
+    k_max: Array
+    direction_min: Array
+    direction_max: Array
+    valid: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A triangle mesh in the model frame.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+        Counter-clockwise seen from the side of the normals.
+    normals : ndarray, shape (V, 3)
+        Unit vertex normals of the smooth surface, on the side of the camera.
+    """
+
+    vertices: Array
+    faces: IntArray
+    normals: Array
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the renderer builds.
+
+    Parameters
+    ----------
+    kind : {"plane", "sphere", "cylinder", "mesh"}
+        Mitsuba's analytic shape, or a mesh.
+    flip : bool
+        Whether the analytic shape is seen from its inside.
+    parameters : dict
+        For an analytic shape: ``to_model``, a (4, 4) matrix from the unit shape to the model frame.
+    mesh : TriangleMesh, optional
+        For kind "mesh".
+    key : str
+        Identity of what has to be rebuilt; two shapes with equal keys differ in `parameters` alone.
+    """
+
+    kind: str
+    flip: bool
+    parameters: dict[str, Any]
+    mesh: TriangleMesh | None
+    key: str
+
+
+class SurfaceModel(ABC):
+    """A surface in its own model frame with the camera's pose.
+
+    Attributes
+    ----------
+    model_from_camera : ndarray, shape (4, 4)
+        Rigid transform from the camera frame to the model frame, mm.
+    """
+
+    model_from_camera: Array
+
+    @abstractmethod
+    def shape(self) -> Shape:
+        """Give what the renderer builds, in the model frame."""
+
+    @abstractmethod
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Give the exact points where rays meet the surface.
+
+        Parameters
+        ----------
+        origins, directions : ndarray, shape (N, 3)
+            Rays in the model frame, mm; unit directions.
+        hits : RayHits
+            Where a ray tracer saw them meet the rendered shape. Closed forms ignore all but the misses.
+
+        Returns
+        -------
+        SurfacePoints
+            In the model frame.
+        """
+
+
+def pack_points(origins: Array, directions: Array, distance: Array, normal: Array, shape_operator: Array) -> SurfacePoints:
+    """Make `SurfacePoints` from distances, normals and shape operators; turns them to face the rays' origins.
+
+    Parameters
+    ----------
+    origins, directions : ndarray, shape (N, 3)
+        Rays; unit directions.
+    distance : ndarray, shape (N,)
+        mm; NaN or inf where there is no point.
+    normal : ndarray, shape (N, 3)
+        Unit normals of either sign.
+    shape_operator : ndarray, shape (N, 3, 3)
+        S with dN = S dP for the given sign of N: symmetric, S N = 0.
+
+    Returns
+    -------
+    SurfacePoints
+        k_min, k_max are the eigenvalues of S in the tangent plane (theory.md section 0).
+    """
+    sign = np.where(np.einsum("ij,ij->i", normal, directions) > 0, -1.0, 1.0)
+    normal = normal * sign[:, None]
+    S = shape_operator * sign[:, None, None]
+    tangent, other = tangent_basis(normal)
+    a = np.einsum("ni,nij,nj->n", tangent, S, tangent)
+    b = np.einsum("ni,nij,nj->n", tangent, S, other)
+    c = np.einsum("ni,nij,nj->n", other, S, other)
+    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
+    angle = 0.5 * np.arctan2(b, (a - c) / 2)  # direction of the larger eigenvalue
+    direction_max = np.cos(angle)[:, None] * tangent + np.sin(angle)[:, None] * other
+    direction_min = np.cos(angle)[:, None] * other - np.sin(angle)[:, None] * tangent
+    valid = np.isfinite(distance) & np.isfinite(normal).all(axis=1) & np.isfinite(mean)
+
+    def only_valid(values: Array) -> Array:
+        return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
+
+    position = origins + np.where(valid, distance, np.nan)[:, None] * directions
+    return SurfacePoints(
+        distance=only_valid(distance),
+        position=position,
+        normal=only_valid(normal),
+        k_min=only_valid(mean - half),
+        k_max=only_valid(mean + half),
+        direction_min=only_valid(direction_min),
+        direction_max=only_valid(direction_max),
+        valid=valid,
+    )
+
+
+def tangent_basis(normal: Array) -> tuple[Array, Array]:
+    """Give two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
+
+    The branch-free construction of Duff et al. 2017 (J. Comput. Graph. Tech. 6(1)).
+    """
+    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    return first, second
+
+
+def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Array]:
+    """Give normal and shape operator of a level set from gradient, shape (N, 3), and Hessian, shape (N, 3, 3).
+
+    N = g/|g|, dN = (I - N N^T) H dP / |g|, restricted to the tangent plane.
+
+    Returns
+    -------
+    normal : ndarray, shape (N, 3)
+    shape_operator : ndarray, shape (N, 3, 3)
+    """
+    length = np.linalg.norm(gradient, axis=1)
+    normal = gradient / length[:, None]
+    projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    return normal, projector @ hessian @ projector / length[:, None, None]

@@ -1,0 +1,133 @@
+"""A generated colon, seen from inside: exact points on rays, and the mesh that is rendered."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from hashlib import blake2b
+
+import numpy as np
+
+from simtest.anatomy.base import Array, RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, pack_points
+from simtest.anatomy.recipe import ColonRecipe
+from simtest.anatomy.tube import Tube
+from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
+
+TRIANGLES = 200_000
+"""Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
+
+
+@dataclass(frozen=True)
+class _Build:
+    """A recipe's surface, its mesh, and (u, v) of each triangle's corners, shape (F, 3, 2)."""
+
+    tube: Tube
+    mesh: TriangleMesh
+    corners: Array
+    key: str
+
+    @cached_property
+    def probe(self) -> MeshProbe:
+        return MeshProbe(self.mesh)
+
+    def inside(self, points: Array) -> Array:
+        """Give the signed distance of points, shape (N, 3), to the wall, mm; positive in the lumen.
+
+        The magnitude is that to the mesh; the sign is exact: a slice u = const is the plane through C(u)
+        perpendicular to T(u), in which the lumen is the disc below r(u, v).
+        """
+        u, v, radial = self.tube.slice_of(points)
+        free = (radial < self.tube.radius(u, v).f) & (u >= 0) & (u <= self.tube.recipe.length_mm)
+        return np.where(free, 1.0, -1.0) * self.probe.distance(points)
+
+
+@lru_cache(maxsize=4)
+def build(recipe: ColonRecipe) -> _Build:
+    """Make the surface and the mesh of a recipe.
+
+    Parameters
+    ----------
+    recipe : ColonRecipe
+
+    Returns
+    -------
+    object
+        With the fields ``tube``, ``mesh`` (mm, normals into the lumen), ``corners`` and ``key``.
+
+    Raises
+    ------
+    InputError
+        If the folds close the lumen or the tube bends into itself.
+    """
+    tube = Tube(recipe)
+    cell = math.sqrt(2 * recipe.length_mm * 2 * math.pi * recipe.radius_mm / TRIANGLES)
+    rows, columns = round(recipe.length_mm / cell), round(2 * math.pi * recipe.radius_mm / cell)
+    u, v = np.linspace(0, recipe.length_mm, rows + 1), 2 * math.pi / columns * np.arange(columns + 1)
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    # Two triangles a cell, counter-clockwise seen from the lumen as P_u x P_v points there.
+    di, dj = np.array([[0, 1, 1], [0, 1, 0]]), np.array([[0, 0, 1], [0, 1, 1]])
+    row, column = i[:, None, None] + di, j[:, None, None] + dj
+    # A corner beyond the seam keeps v = 2 pi while its vertex is that of v = 0.
+    corners = np.stack([u[row], v[column]], axis=-1).reshape(-1, 3, 2)
+    faces = (row * columns + column % columns).reshape(-1, 3)
+    grid_u, grid_v = (g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij"))
+    vertices, along, around = tube.tangents(grid_u, grid_v)
+    normals = np.cross(along, around)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    digest = blake2b(recipe.model_dump_json().encode(), digest_size=12).hexdigest()
+    return _Build(tube, TriangleMesh(vertices, faces, normals), corners, f"colon-{digest}")
+
+
+class Colon(SurfaceModel):
+    """A generated colon with a camera inside.
+
+    Parameters
+    ----------
+    recipe : ColonRecipe
+        The sizes. The mesh is cached by recipe.
+    viewpoint : int
+        Number of the camera pose, >= 0.
+
+    Raises
+    ------
+    InputError
+        If the recipe gives no usable tube.
+    """
+
+    def __init__(self, recipe: ColonRecipe, viewpoint: int) -> None:
+        self._build = build(recipe)
+        self.model_from_camera = lumen_pose(
+            recipe.type, viewpoint, self._sites, self._build.inside, self._build.probe.cast
+        )
+
+    def _sites(self, rng: Generator) -> Array:
+        """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
+        recipe, tube, count = self._build.tube.recipe, self._build.tube, 32
+        u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
+        radial = 0.6 * np.sqrt(rng.random(count)) * tube.radius(u, v).f
+        return tube.centreline(u) + radial[:, None] * tube.frame(u, v)[1]
+
+    def shape(self) -> Shape:
+        """Give the mesh of about 200,000 triangles, with exact vertices and normals, open at both ends."""
+        return Shape("mesh", False, {}, self._build.mesh, self._build.key)
+
+    def clearance(self, points: Array) -> Array:
+        """Give the signed distance of points, shape (N, 3), model frame, to the wall, mm; positive in the lumen."""
+        return self._build.inside(points)
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Give the exact points where rays meet the smooth surface (see `SurfaceModel.points`).
+
+        Newton's method on P(u, v) = origin + t direction, to 1e-10 mm, from (u, v) of the mesh's hit; a ray that
+        grazes the mesh but misses the smooth surface has no point.
+        """
+        tube, hit = self._build.tube, np.flatnonzero(np.isfinite(hits.distance))
+        second, third = hits.barycentric[hit].T
+        weights = np.stack([1 - second - third, second, third], axis=1)
+        u, v = np.einsum("nc,nck->kn", weights, self._build.corners[hits.face[hit]])
+        distance, u, v = tube.solve(origins[hit], directions[hit], hits.distance[hit], u, v)
+        good = np.isfinite(distance)
+        distances = np.full(len(origins), np.nan)
+        normals, operators = np.full((len(origins), 3), np.nan), np.full((len(origins), 3, 3), np.nan)
+        distances[hit] = distance
+        normals[hit[good]], operators[hit[good]] = tube.normal_and_shape_operator(u[good], v[good])
+        return pack_points(origins, directions, distances, normals, operators)

@@ -1,0 +1,65 @@
+"""From the description of a surface to its model."""
+
+from pathlib import Path
+
+from simtest.anatomy.analytic import Cylinder, Plane, Quadric, Sphere
+from simtest.anatomy.base import SurfaceModel
+from simtest.errors import InputError
+from simtest.resources import find
+from simtest.spec.scene import (
+    AnatomySurface,
+    CylinderSurface,
+    PlaneSurface,
+    QuadricSurface,
+    SphereSurface,
+    Surface,
+)
+
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
+
+
+def make_surface(spec: Surface) -> SurfaceModel:
+    """Make the model of a surface.
+
+    Parameters
+    ----------
+    spec : Surface
+        From a scene.
+
+    Returns
+    -------
+    SurfaceModel
+
+    Raises
+    ------
+    InputError
+        If a recipe or mesh file is missing or malformed.
+    """
+    match spec:
+        case PlaneSurface():
+            return Plane(spec)
+        case SphereSurface():
+            return Sphere(spec)
+        case CylinderSurface():
+            return Cylinder(spec)
+        case QuadricSurface():
+            return Quadric(spec)
+        case AnatomySurface():
+            return _make_anatomy(spec)
+
+
+def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
+    # Imported here: the mesh libraries are slow to load and analytic scenes do not need them.
+    from simtest.anatomy.colon import Colon
+    from simtest.anatomy.liver import Liver
+    from simtest.anatomy.mesh import MeshSurface
+    from simtest.anatomy.recipe import ColonRecipe, load_recipe
+
+    suffix = Path(spec.path).suffix.lower()
+    if suffix in MESH_SUFFIXES:
+        return MeshSurface(spec)
+    if suffix not in ("", ".toml"):
+        allowed = ", ".join((".toml", *MESH_SUFFIXES))
+        raise InputError(f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name")
+    recipe = load_recipe(find(spec.path, "meshes"))
+    return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)

@@ -1,0 +1,85 @@
+"""The workflows behind the commands: render a labelled frame, run an experiment with its report."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from simtest.dataset.frame import LabelledFrame, make_frame
+from simtest.reconstruction import reconstruct
+from simtest.spec import Experiment, Scene, load_experiment, load_scene
+from simtest.validation.runner import Progress
+
+__all__ = ["LabelledFrame", "reconstruct", "render", "validate"]
+
+
+def render(scene: Scene | str | Path, settings: Mapping[str, Any] | None = None, variant: str | None = None) -> LabelledFrame:
+    """Render a scene with its ground truth.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, a scene file, or the name of a shipped scene.
+    settings : mapping, optional
+        Values that replace those of a scene file, by key path, such as ``{"surface.radius_mm": 5.0}``.
+    variant : str, optional
+        Mitsuba variant.
+
+    Returns
+    -------
+    LabelledFrame
+
+    Raises
+    ------
+    InputError
+        If the scene is malformed or the camera sees no surface.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    return make_frame(described, variant)
+
+
+def validate(
+    experiment: Experiment | str | Path,
+    out: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    command: str = "",
+    variant: str | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Run an experiment and write its report.
+
+    Parameters
+    ----------
+    experiment : Experiment, str or Path
+        An experiment, its file, or the name of a shipped one.
+    out : str or Path
+        Folder of the run: results.parquet, summary.json, figures/, index.html. A stopped run goes on.
+    settings : mapping, optional
+        Values that replace those of the file, by key path.
+    command : str
+        How the run was called, for the report.
+    variant : str, optional
+        Mitsuba variant.
+    progress : callable, optional
+        Called with realisations done, realisations in all, and the name of the setting.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    InputError
+        If the experiment is malformed, an estimator unknown, or `out` holds something else than a run.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    # Imported here: the figures' libraries are slow to load and rendering alone does not need them.
+    from simtest.report import write_report
+    from simtest.validation.runner import run_experiment
+
+    described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
+    run = run_experiment(described, Path(out), command, variant, progress)
+    return write_report(run.folder)

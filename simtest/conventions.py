@@ -1,0 +1,42 @@
+"""Frames, units and signs, on one page. Constants only.
+
+Camera frame
+    OpenCV: x right, y down, z forward; the camera centre V is the origin. Lengths in mm.
+Angles
+    Radians in code, degrees in reports and in names that end in ``_deg``.
+Pixels
+    The centre of pixel (column i, row j) is (i + 0.5, j + 0.5). Routines that return integer-centred
+    coordinates (`skimage.measure.find_contours`, OpenCV) are shifted once, in `simtest.geometry`.
+Normals
+    Unit, facing the camera: N . P < 0 for the surface point P (not N_z < 0, which is wrong off axis).
+Curvature
+    Signed, convex towards the camera positive. S is the shape operator, dN = S du, and
+    k_min <= k_max are its eigenvalues in 1/mm.
+Transforms
+    ``b_from_a`` maps coordinates of frame a to frame b.
+Isovalues
+    t is relative to the smoothed peak of its region of interest.
+Noise
+    sigma is the standard deviation as a share of full scale after exposure.
+"""
+
+PIXEL_CENTRE = 0.5
+"""Offset of a pixel's centre from its integer index, in px."""
+
+DEFAULT_SMOOTHING_PX = 2.0
+"""Standard deviation of the Gaussian that smooths a frame before isophotes are traced, in px."""
+
+CIRCLE_POSE_ISOVALUE = 0.5
+"""Default isovalue of `circle_pose` in rendered experiments."""
+
+CONE_AXIS_ISOVALUES = (0.3, 0.4, 0.5, 0.6, 0.7)
+"""Default isovalues of `cone_axis`."""
+
+HIGHLIGHT_ISOVALUE = 0.5
+"""A highlight is the region enclosed by its isophote at this value."""
+
+HIGHLIGHT_CONTRAST_SIGMA = 10.0
+"""A highlight's peak stands at least this many noise standard deviations above its surroundings."""
+
+HIGHLIGHT_MIN_GAIN = 0.25
+"""Least abs(1 + d k) of an isolated highlight: below it the spot is a streak or a ring."""

@@ -1,0 +1,180 @@
+"""Isolated peaks: local maxima whose isophote at half height closes inside the frame and holds no higher peak."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+EXPANSION = 2.0
+"""Region of interest over the highlight's size at half height: a Gaussian spot's isophote at t = 0.1 is 1.8 times it."""
+
+MARGIN_PX = 8
+MIN_AREA_PX = 12
+"""Fewer pixels above half height give no ellipse."""
+
+MAX_PEAKS = 2000
+"""The brightest local maxima that are looked at."""
+
+NOISE_FREE_SHARE = 1e-3
+"""Contrast that is asked for where the noise is 0, as a share of the frame's maximum."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A detected specularity.
+
+    Parameters
+    ----------
+    box : tuple of int
+        Region of interest: column, row, width, height, px.
+    peak : tuple of int
+        Column and row of the brightest smoothed pixel.
+    contrast : float
+        Peak above its surroundings, frame units.
+    """
+
+    box: tuple[int, int, int, int]
+    peak: tuple[int, int]
+    contrast: float
+
+
+@dataclass(frozen=True)
+class Component:
+    """The connected pixels above half of a peak's value.
+
+    Parameters
+    ----------
+    mask : ndarray of bool, shape (h, w)
+        The pixels.
+    x, y : int
+        Column and row of the mask's first pixel in the frame.
+    closed : bool
+        Whether they stay clear of the frame's border.
+    """
+
+    mask: Mask
+    x: int
+    y: int
+    closed: bool
+
+
+def detect(smoothed: Image, noise: float, isolated: bool = True) -> list[Region]:
+    """Find the specularities of a frame.
+
+    Parameters
+    ----------
+    smoothed : ndarray of float32, shape (H, W)
+        Smoothed intensities.
+    noise : float
+        Standard deviation of the unsmoothed frame's noise, frame units.
+    isolated : bool
+        Leave out those whose isophote at t = 0.5 reaches the frame's border.
+
+    Returns
+    -------
+    list of Region
+        The brightest first. Each is a local maximum whose isophote at t = 0.5 closes inside the frame without a
+        higher value in it, and which stands 10 noise standard deviations above its surroundings.
+    """
+    image = np.where(np.isfinite(smoothed), smoothed, 0).astype(np.float32)
+    if min(image.shape) < 3 or image.max() <= 0:
+        return []
+    threshold = max(HIGHLIGHT_CONTRAST_SIGMA * noise, NOISE_FREE_SHARE * float(image.max()))
+    taken = np.zeros(image.shape, dtype=bool)
+    regions = []
+    for row, column in _local_maxima(image, threshold):
+        if taken[row, column]:
+            continue
+        found = half_height_component(image, row, column)
+        if found is None:
+            continue
+        mask, x, y = found.mask, found.x, found.y
+        taken[y : y + mask.shape[0], x : x + mask.shape[1]] |= mask
+        if isolated and not found.closed:
+            continue
+        height_above = contrast(image, found, float(image[row, column]))
+        if height_above >= threshold and np.count_nonzero(mask) >= MIN_AREA_PX:
+            regions.append(Region(_expanded_box(found, image.shape), (column, row), height_above))
+    return regions
+
+
+def _local_maxima(image: Image, threshold: float) -> list[tuple[int, int]]:
+    """Give rows and columns of the local maxima above a threshold, the brightest first."""
+    highest = cv2.dilate(image, np.ones((3, 3), np.uint8))
+    rows, columns = np.nonzero((image >= highest) & (image > threshold))
+    order = np.argsort(-image[rows, columns], kind="stable")[:MAX_PEAKS]
+    return [(int(rows[i]), int(columns[i])) for i in order]
+
+
+def half_height_component(image: Image, row: int, column: int) -> Component | None:
+    """Give the connected pixels above half of a peak's value, or None where they hold a higher peak.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W)
+        Smoothed intensities.
+    row, column : int
+        The peak's pixel.
+
+    Returns
+    -------
+    Component or None
+    """
+    peak = float(image[row, column])
+    rows, columns = image.shape
+    half = 8
+    while True:
+        y0, y1 = max(row - half, 0), min(row + half + 1, rows)
+        x0, x1 = max(column - half, 0), min(column + half + 1, columns)
+        window = image[y0:y1, x0:x1]
+        labels, _ = ndimage.label(window >= HIGHLIGHT_ISOVALUE * peak)
+        mask = labels == labels[row - y0, column - x0]
+        if float(window[mask].max()) > peak:
+            return None
+        edges = ((mask[0], y0 == 0), (mask[-1], y1 == rows), (mask[:, 0], x0 == 0), (mask[:, -1], x1 == columns))
+        touched = [at_border for line, at_border in edges if line.any()]
+        if all(touched):
+            return Component(mask, x0, y0, closed=not touched)
+        half *= 2
+
+
+def contrast(image: Image, component: Component, peak: float) -> float:
+    """Give a peak's height above the median of its surroundings: the region of interest outside the component.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W)
+        Smoothed intensities.
+    component : Component
+        The highlight at half height.
+    peak : float
+        The peak's value.
+
+    Returns
+    -------
+    float
+        In the image's units; above the frame's least value where the component fills its region.
+    """
+    left, top, width, height = _expanded_box(component, image.shape)
+    inside = np.zeros((height, width), dtype=bool)
+    rows, columns = np.nonzero(component.mask)
+    inside[rows + component.y - top, columns + component.x - left] = True
+    around = image[top : top + height, left : left + width][~inside]
+    return peak - float(np.median(around) if around.size else image.min())
+
+
+def _expanded_box(component: Component, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    mask, x, y = component.mask, component.x, component.y
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    grow_x = int((columns[-1] - columns[0] + 1) * (EXPANSION - 1) / 2) + MARGIN_PX
+    grow_y = int((rows[-1] - rows[0] + 1) * (EXPANSION - 1) / 2) + MARGIN_PX
+    x0, x1 = max(x + int(columns[0]) - grow_x, 0), min(x + int(columns[-1]) + 1 + grow_x, shape[1])
+    y0, y1 = max(y + int(rows[0]) - grow_y, 0), min(y + int(rows[-1]) + 1 + grow_y, shape[0])
+    return x0, y0, x1 - x0, y1 - y0

@@ -1,0 +1,53 @@
+"""Finds estimators by name, those of other packages too, through the entry-point group ``simtest.estimators``."""
+
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+
+from simtest.errors import InputError
+from simtest.estimators.base import Estimator
+
+GROUP = "simtest.estimators"
+
+
+def _entry_points() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def available() -> list[str]:
+    """List the names of all installed estimators, sorted."""
+    return sorted(_entry_points())
+
+
+def load_estimators(names: Sequence[str]) -> dict[str, Estimator]:
+    """Load estimators.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As registered.
+
+    Returns
+    -------
+    dict
+        Estimator by name, in the order asked for.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, given twice, or its package cannot be imported.
+    """
+    points = _entry_points()
+    loaded: dict[str, Estimator] = {}
+    for name in names:
+        if name not in points:
+            raise InputError(f"estimator {name!r}: not installed; allowed: {', '.join(sorted(points))}")
+        if name in loaded:
+            raise InputError(f"estimator {name!r}: given twice")
+        try:
+            estimator = points[name].load()
+        except Exception as error:
+            raise InputError(f"estimator {name!r}: {points[name].value} cannot be imported ({error})") from error
+        if not callable(estimator):
+            raise InputError(f"estimator {name!r}: {points[name].value} is not callable")
+        loaded[name] = estimator
+    return loaded

@@ -1,0 +1,21 @@
+"""NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
+
+from simtest.geometry.camera import Camera
+from simtest.geometry.circle_pose import CirclePose, circle_pose, cone_axes
+from simtest.geometry.conics import Ellipse, backproject_conic, ellipse_of_conic
+from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse
+from simtest.geometry.isophotes import Patch, smooth
+
+__all__ = [
+    "Camera",
+    "CirclePose",
+    "Ellipse",
+    "FittedConic",
+    "Patch",
+    "backproject_conic",
+    "circle_pose",
+    "cone_axes",
+    "ellipse_of_conic",
+    "fit_ellipse",
+    "smooth",
+]

@@ -1,0 +1,162 @@
+"""Isophotes of a highlight: the closed contour at a share of the smoothed peak that encloses it."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from skimage.measure import find_contours
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.errors import Failure, InputError, Reason
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+
+def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
+    """Smooth a frame with a Gaussian.
+
+    Parameters
+    ----------
+    frame : array_like, shape (H, W)
+        Intensities.
+    sigma_px : float
+        Standard deviation, px; 0 leaves the frame as it is.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W)
+    """
+    image = np.ascontiguousarray(frame, dtype=np.float32)
+    if sigma_px <= 0:
+        return image
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A region of interest of a smoothed frame around one peak.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (h, w)
+        Smoothed intensities of the region.
+    origin_px : tuple of int
+        Column and row of the region's first pixel in the frame.
+    peak_px : ndarray, shape (2,)
+        Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
+    peak_value : float
+        Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    """
+
+    values: Image
+    origin_px: tuple[int, int]
+    peak_px: Array
+    peak_value: float
+    _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
+
+    @classmethod
+    def cut(cls, smoothed: Image, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None) -> "Patch | Failure":
+        """Cut a region out of a smoothed frame.
+
+        Parameters
+        ----------
+        smoothed : ndarray of float32, shape (H, W)
+            The frame.
+        box : tuple of int
+            Column, row, width, height of the region; inside the frame.
+        peak : tuple of int, optional
+            Column and row of the peak's pixel; default the brightest of the region.
+
+        Returns
+        -------
+        Patch or Failure
+            A Failure if the region holds values that are not finite, or no positive one above the others.
+
+        Raises
+        ------
+        InputError
+            If the box is empty or leaves the frame.
+        """
+        x, y, width, height = box
+        rows, columns = smoothed.shape
+        if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
+            raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
+        values = smoothed[y : y + height, x : x + width]
+        if not np.isfinite(values).all():
+            return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
+        if peak is None:
+            row, column = np.unravel_index(int(values.argmax()), values.shape)
+        else:
+            column, row = peak[0] - x, peak[1] - y
+        value = float(values[row, column])
+        if value <= 0 or value <= float(values.min()):
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
+        local = _parabolic_peak(values, int(row), int(column)) + PIXEL_CENTRE
+        return cls(values, (x, y), local + [x, y], value)
+
+    def isophote(self, isovalue: float) -> Array | Failure:
+        """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
+
+        Parameters
+        ----------
+        isovalue : float
+            t in (0, 1), relative to the smoothed peak.
+
+        Returns
+        -------
+        ndarray, shape (N, 2), or Failure
+            Closed polygon in the frame, px, first point repeated at the end; the largest if several enclose the peak.
+
+        Raises
+        ------
+        InputError
+            If t is outside (0, 1).
+        """
+        if not 0 < isovalue < 1:
+            raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
+        if isovalue not in self._contours:
+            self._contours[isovalue] = self._trace(isovalue)
+        return self._contours[isovalue]
+
+    def _trace(self, isovalue: float) -> Array | Failure:
+        if min(self.values.shape) < 3:
+            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"region of {self.values.shape[1]} x {self.values.shape[0]} px")
+        best, best_area = None, 0.0
+        for contour in find_contours(self.values, isovalue * self.peak_value):
+            points = contour[:, ::-1] + PIXEL_CENTRE + self.origin_px
+            if len(points) < 4 or not np.array_equal(points[0], points[-1]):
+                continue
+            area = abs(polygon_area(points))
+            if area > best_area and encloses(points, self.peak_px):
+                best, best_area = points, area
+        if best is None:
+            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}")
+        return best
+
+
+def _parabolic_peak(values: Image, row: int, column: int) -> Array:
+    """Refine a peak's pixel by a parabola along each axis; at the border the pixel itself is kept. Gives (x, y)."""
+    position = [float(column), float(row)]
+    for axis, (index, line) in enumerate(((column, values[row, :]), (row, values[:, column]))):
+        if 0 < index < len(line) - 1:
+            before, here, after = (float(v) for v in line[index - 1 : index + 2])
+            bend = before - 2 * here + after
+            if bend < 0:
+                position[axis] += float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+    return np.array(position)
+
+
+def polygon_area(points: Array) -> float:
+    """Give the signed area of a closed polygon, shape (N, 2), last point equal to the first (shoelace formula)."""
+    x, y = (points - points[0]).T
+    return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2)
+
+
+def encloses(points: Array, point: Array) -> bool:
+    """Tell whether a closed polygon, shape (N, 2), encloses a point, shape (2,), by the even-odd rule."""
+    x, y = (points - point).T
+    crosses = (y[:-1] > 0) != (y[1:] > 0)
+    x0, y0, x1, y1 = x[:-1][crosses], y[:-1][crosses], x[1:][crosses], y[1:][crosses]
+    return bool(np.count_nonzero(x0 - y0 * (x1 - x0) / (y1 - y0) > 0) % 2)

@@ -1,0 +1,127 @@
+"""From one frame and its camera to normals: detect the specularities, run the estimators on each."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.detection import Region, detect, estimate_noise
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate, Estimator, load_estimators
+from simtest.geometry import Camera, Patch, smooth
+
+DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+
+
+@dataclass(frozen=True)
+class Specularity:
+    """One region of interest and what each estimator made of it.
+
+    Parameters
+    ----------
+    region : Region
+        Where it is.
+    patch : Patch or Failure
+        The smoothed crop.
+    estimates : dict
+        `Estimate` or `Failure` by estimator name.
+    """
+
+    region: Region
+    patch: Patch | Failure
+    estimates: dict[str, Estimate | Failure]
+
+
+def reconstruct(
+    frame: npt.ArrayLike,
+    camera: Camera,
+    estimators: Sequence[str] | Mapping[str, Estimator] = DEFAULT_ESTIMATORS,
+    roi: tuple[int, int, int, int] | None = None,
+    smoothing_px: float = DEFAULT_SMOOTHING_PX,
+    isolated: bool = True,
+) -> list[Specularity]:
+    """Reconstruct the normals at a frame's isolated specularities.
+
+    Parameters
+    ----------
+    frame : array_like, shape (H, W) or (H, W, C)
+        Linear intensities of any scale; channels are averaged.
+    camera : Camera
+        Calibration of the same size.
+    estimators : sequence of str, or mapping
+        Names as registered, or the estimators themselves by name.
+    roi : tuple of int, optional
+        Column, row, width, height of the one region of interest; default: regions detected in the frame.
+    smoothing_px : float
+        Standard deviation of the Gaussian smoothing, px, in [0, 50].
+    isolated : bool
+        Detect only specularities whose isophote at t = 0.5 closes inside the frame.
+
+    Returns
+    -------
+    list of Specularity
+        The brightest first; empty where the frame holds no isolated specularity.
+
+    Raises
+    ------
+    InputError
+        If the frame is no image, differs in size from the camera's calibration, holds NaN or infinity in more than
+        the region given, or an argument is out of range.
+    """
+    intensity = check_frame(frame, camera)
+    if not 0 <= smoothing_px <= 50:
+        raise InputError(f"smoothing_px = {smoothing_px!r}: must be in [0, 50]")
+    chosen = dict(estimators) if isinstance(estimators, Mapping) else load_estimators(estimators)
+    smoothed = smooth(intensity, smoothing_px)
+    if roi is not None:
+        patch = Patch.cut(smoothed, roi)
+        peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
+        found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
+    else:
+        regions = detect(smoothed, estimate_noise(intensity), isolated)
+        found = [(region, Patch.cut(smoothed, region.box, region.peak)) for region in regions]
+    return [
+        Specularity(region, patch, {name: run(estimator, patch, camera) for name, estimator in chosen.items()})
+        for region, patch in found
+    ]
+
+
+def check_frame(frame: npt.ArrayLike, camera: Camera) -> npt.NDArray[np.float32]:
+    """Give a frame as float32 intensities, shape (H, W); raise `InputError` where it is no image of the camera's size."""
+    try:
+        image = np.asarray(frame, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"frame: must be an array of numbers ({error})") from error
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise InputError(f"frame has shape {image.shape}: must be (H, W) or (H, W, C)")
+    if image.ndim == 3:
+        image = image.mean(axis=2, dtype=np.float32)
+    if image.shape != (camera.height, camera.width):
+        raise InputError(
+            f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
+            "the size of the camera's calibration"
+        )
+    if not np.isfinite(image).all():
+        bad = int(np.count_nonzero(~np.isfinite(image)))
+        raise InputError(f"frame holds {bad} values that are NaN or infinite: all must be finite")
+    return image
+
+
+def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimate | Failure:
+    """Run an estimator on a patch; what it raises or gives in the wrong form becomes a Failure with its text."""
+    if isinstance(patch, Failure):
+        return patch
+    try:
+        result = estimator(patch, camera)
+    except Exception as error:
+        # An estimator of another package may fail in any way; one highlight must not end a run of thousands.
+        return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+    if isinstance(result, Failure):
+        return result
+    if not isinstance(result, Estimate):
+        return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
+    if not (np.isfinite(result.normal).all() and abs(np.linalg.norm(result.normal) - 1) < 1e-6):
+        return Failure(Reason.NOT_FINITE, f"normal {np.asarray(result.normal).tolist()} is not a unit vector")
+    return result

@@ -1,0 +1,275 @@
+"""Chooses the rendering backend: which libLLVM Dr.Jit loads and which Mitsuba variant runs.
+
+A bad libLLVM can abort the process at its first kernel, so each candidate compiles and runs a small kernel in a
+child process before the real one uses it. Nothing is set when this module is imported.
+"""
+
+import ctypes.util
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sys
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from simtest.errors import BackendError
+
+DEFAULT_VARIANT = "llvm_ad_mono"
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+VARIANT_VARIABLE = "SIMTEST_VARIANT"
+PIP_PACKAGE = "karellen-llvm-core"
+PROBE_TIMEOUT_S = 120
+
+# The kernel holds a `max`: libLLVM 15 compiles everything up to it and then aborts the process.
+_PROBE = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+import drjit as dr
+from drjit.llvm import Float
+x = dr.arange(Float, 64)
+dr.make_opaque(x)
+assert dr.allclose(dr.maximum(x, 3) + dr.minimum(x, 3), x + 3)
+print("simtest-probe-ok")
+"""
+
+MENDING = (
+    f"(1) pip install {PIP_PACKAGE} (Linux x86-64), or (2) install the system's LLVM 19 or newer, "
+    f"or (3) set {LIBRARY_VARIABLE} to the file libLLVM.so of LLVM 19 or newer"
+)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A libLLVM that might be used.
+
+    Parameters
+    ----------
+    origin : str
+        Where it was found.
+    path : str
+        The file.
+    verdict : str
+        "ok", or why it cannot be used; empty while untried.
+    """
+
+    origin: str
+    path: str
+    verdict: str = ""
+
+
+def requested_variant(variant: str | None = None) -> str:
+    """Give the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default."""
+    return variant or os.environ.get(VARIANT_VARIABLE) or DEFAULT_VARIANT
+
+
+def candidates() -> list[Candidate]:
+    """List the libraries in the order they are tried: the variable, the pip package's, the system's newest."""
+    found = []
+    if variable := os.environ.get(LIBRARY_VARIABLE):
+        found.append(Candidate(LIBRARY_VARIABLE, variable))
+    if packaged := _packaged_library():
+        found.append(Candidate(f"pip package {PIP_PACKAGE}", packaged))
+    found += [Candidate("system", path) for path in _system_libraries()]
+    return found
+
+
+def _packaged_library() -> str | None:
+    try:
+        files = importlib.metadata.files(PIP_PACKAGE) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for file in files:
+        if re.fullmatch(r"libLLVM\.so\.\d+\.\d+", file.name):
+            return str(Path(str(file.locate())).resolve())
+    return None
+
+
+def _system_libraries() -> list[str]:
+    """Give the system's libLLVM files, the newest version first, each file once."""
+    folders = ["/usr/lib", "/usr/lib64", "/usr/local/lib", *map(str, Path("/usr/lib").glob("*-linux-gnu"))]
+    folders += map(str, Path("/usr/lib").glob("llvm-*/lib"))
+    versions: dict[str, tuple[int, ...]] = {}
+    for folder in folders:
+        for path in Path(folder).glob("libLLVM*.so*"):
+            if match := re.fullmatch(r"libLLVM(?:-(\d+))?\.so(?:\.([\d.]+))?|libLLVM-([\d.]+)\.so(?:\.\d+)?", path.name):
+                numbers = next((group for group in match.groups() if group), "0")
+                version = tuple(int(part) for part in numbers.strip(".").split("."))
+                resolved = str(path.resolve())
+                versions[resolved] = max(version, versions.get(resolved, (0,)))
+    if not versions and (name := ctypes.util.find_library("LLVM")):
+        versions[name] = (0,)
+    return sorted(versions, key=lambda path: versions[path], reverse=True)
+
+
+def probe(candidate: Candidate) -> Candidate:
+    """Try a library in a child process; the verdict is cached per file (path, size, time of change).
+
+    Parameters
+    ----------
+    candidate : Candidate
+        An untried library.
+
+    Returns
+    -------
+    Candidate
+        With its verdict.
+    """
+    path = Path(candidate.path)
+    if path.is_dir():
+        verdict = "is a folder; must be the file libLLVM.so itself"
+    elif not path.is_file():
+        verdict = "no such file"
+    else:
+        status = path.stat()
+        versions = importlib.metadata.version("drjit")
+        key = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|drjit {versions}"
+        cache = _read_cache()
+        verdict = cache.get(key) or _run_probe(str(path))
+        if cache.get(key) != verdict and not verdict.startswith("could not be tried"):
+            _write_cache({**cache, key: verdict})
+    return Candidate(candidate.origin, candidate.path, verdict)
+
+
+def _run_probe(path: str) -> str:
+    environment = {**os.environ, LIBRARY_VARIABLE: path}
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"could not be tried ({type(error).__name__})"
+    if "simtest-probe-ok" in child.stdout:
+        return "ok"
+    lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    if child.returncode < 0:
+        return f"aborts when compiling a kernel (signal {-child.returncode}); too old for Dr.Jit"
+    said = next((line for line in lines if "LLVM" in line and "Traceback" not in line), lines[-1] if lines else "")
+    return f"is not a usable libLLVM ({said[:160]})"
+
+
+def _cache_file() -> Path:
+    return Path(platformdirs.user_cache_dir("simtest")) / "libllvm.json"
+
+
+def _read_cache() -> dict[str, str]:
+    try:
+        cache = json.loads(_cache_file().read_text())
+    except (OSError, ValueError):
+        return {}
+    return cache if isinstance(cache, dict) else {}
+
+
+def _write_cache(cache: dict[str, str]) -> None:
+    """Store the verdicts; a cache that cannot be written costs only time."""
+    file = _cache_file()
+    part = file.with_suffix(f".{os.getpid()}.part")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps(cache))
+        os.replace(part, file)
+    except OSError:
+        part.unlink(missing_ok=True)
+
+
+def choose_library() -> tuple[Candidate | None, list[Candidate]]:
+    """Try the candidates in order until one survives.
+
+    Returns
+    -------
+    chosen : Candidate or None
+        The first that works.
+    tried : list of Candidate
+        All that were tried, with verdicts.
+    """
+    tried = []
+    for candidate in candidates():
+        tried.append(probe(candidate))
+        if tried[-1].verdict == "ok":
+            return tried[-1], tried
+    return None, tried
+
+
+def load(variant: str | None = None) -> Any:
+    """Give the mitsuba module with its variant set; every use of the renderer goes through here.
+
+    Parameters
+    ----------
+    variant : str, optional
+        Such as "llvm_ad_mono" or "cuda_ad_mono"; see `requested_variant`.
+
+    Returns
+    -------
+    module
+        mitsuba.
+
+    Raises
+    ------
+    BackendError
+        If no libLLVM works, or the variant does not exist; the message says how to mend it.
+    """
+    name = requested_variant(variant)
+    if name.startswith("llvm") and not _drjit_loaded():
+        chosen, tried = choose_library()
+        if chosen is None:
+            raise BackendError(no_library_message(tried))
+        for failed in tried[:-1]:
+            if failed.origin == LIBRARY_VARIABLE:
+                warnings.warn(f"{LIBRARY_VARIABLE}={failed.path}: {failed.verdict}; using {chosen.path}", stacklevel=2)
+        os.environ[LIBRARY_VARIABLE] = chosen.path
+    import mitsuba
+
+    if name not in mitsuba.variants():
+        usable = ", ".join(v for v in mitsuba.variants() if "_ad_" in v and "polarized" not in v)
+        raise BackendError(f"variant {name!r}: unknown to this Mitsuba; allowed: {usable}")
+    if mitsuba.variant() != name:
+        try:
+            mitsuba.set_variant(name)
+        except ImportError as error:
+            raise BackendError(f"variant {name}: cannot be used here ({str(error).splitlines()[0]})") from error
+    return mitsuba
+
+
+def _drjit_loaded() -> bool:
+    return "drjit" in sys.modules and "mitsuba" in sys.modules and sys.modules["mitsuba"].variant() is not None
+
+
+def library_in_use() -> str | None:
+    """Give the libLLVM that this process was told to use, or None."""
+    return os.environ.get(LIBRARY_VARIABLE) or None
+
+
+def no_library_message(tried: list[Candidate]) -> str:
+    """Say in one line why no library works and the three ways to mend it."""
+    causes = "; ".join(f"{c.path} ({c.origin}): {c.verdict}" for c in tried) or "none found"
+    return f"no usable libLLVM: {causes}. To mend it: {MENDING}"
+
+
+def describe(variant: str | None = None) -> dict[str, Any]:
+    """Give what `simtest doctor` reports: variant, candidates with verdicts, the choice, versions.
+
+    Parameters
+    ----------
+    variant : str, optional
+        See `requested_variant`.
+
+    Returns
+    -------
+    dict
+        JSON-ready.
+    """
+    name = requested_variant(variant)
+    chosen, tried = choose_library() if name.startswith("llvm") else (None, [])
+    versions = {p: importlib.metadata.version(p) for p in ("mitsuba", "drjit")}
+    return {
+        "variant": name,
+        "library": chosen.path if chosen else None,
+        "candidates": [asdict(c) for c in tried],
+        "versions": versions,
+        "problem": no_library_message(tried) if name.startswith("llvm") and chosen is None else None,
+    }

@@ -1,0 +1,100 @@
+"""What a session gives: radiance, ground-truth maps and the true highlights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatImage = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """Linear radiance, relative units (power per steradian over mm^2), split by its way.
+
+    Parameters
+    ----------
+    specular, diffuse, indirect : ndarray of float32, shape (H, W) or (H, W, 3)
+        Direct light off the specular lobe, off the diffuse base, and light of more than one bounce. Two
+        dimensions in mono variants.
+    """
+
+    specular: FloatImage
+    diffuse: FloatImage
+    indirect: FloatImage
+
+    @property
+    def total(self) -> FloatImage:
+        """Sum of the parts, shape (H, W) or (H, W, 3)."""
+        return self.specular + self.diffuse + self.indirect
+
+
+@dataclass(frozen=True)
+class TruthMaps:
+    """Ground truth at each pixel's centre, camera frame; NaN where there is no surface.
+
+    Parameters
+    ----------
+    depth : ndarray, shape (H, W)
+        Distance along the ray, mm.
+    position, normal : ndarray, shape (H, W, 3)
+        Point, mm, and unit normal of the smooth surface facing the camera.
+    shading_normal, geometric_normal : ndarray, shape (H, W, 3)
+        Normals that the renderer used: interpolated, and of the triangle.
+    k_min, k_max : ndarray, shape (H, W)
+        Principal curvatures, 1/mm, convex towards the camera positive.
+    direction_min, direction_max : ndarray, shape (H, W, 3)
+        Unit principal directions.
+    mask : ndarray of bool, shape (H, W)
+        Where there is a surface.
+    """
+
+    depth: Array
+    position: Array
+    normal: Array
+    shading_normal: Array
+    geometric_normal: Array
+    k_min: Array
+    k_max: Array
+    direction_min: Array
+    direction_max: Array
+    mask: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class TrueHighlight:
+    """A surface point where the normal bisects the directions to a light and to the camera.
+
+    Parameters
+    ----------
+    light : int
+        Index of the light in the rig.
+    bp_px : ndarray, shape (2,)
+        Sub-pixel position in the image.
+    position, normal : ndarray, shape (3,)
+        Camera frame; mm and unit.
+    distance : float
+        d, mm.
+    kd_min, kd_max : float
+        Distance times principal curvatures.
+    lit : bool
+        Whether the light reaches the point.
+    radiance : float
+        Radiance at the nearest pixel.
+    """
+
+    light: int
+    bp_px: Array
+    position: Array
+    normal: Array
+    distance: float
+    kd_min: float
+    kd_max: float
+    lit: bool
+    radiance: float
+
+    @property
+    def min_gain(self) -> float:
+        """Least abs(1 + d k): near 0 the spot is a streak or a ring."""
+        return min(abs(1 + self.kd_min), abs(1 + self.kd_max))

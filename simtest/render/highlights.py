@@ -1,0 +1,170 @@
+"""True highlights: sub-pixel points where the normal bisects the directions to the light and to the camera.
+
+The misfit w between normal and bisector is a two-vector field over the image; its zeros are found by Newton steps
+from the pixels whose own step lands next to them (theory.md sections 3 and 6).
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from simtest.anatomy.base import tangent_basis
+from simtest.render.frames import Array, Radiance, TrueHighlight
+
+if TYPE_CHECKING:
+    from simtest.anatomy import SurfacePoints
+    from simtest.render.session import Session
+
+MIN_GAIN = 0.05
+"""Where abs(1 + d k) is smaller the point is no point but a streak; seeds there are not followed."""
+
+NEWTON_STEPS = 30
+DIFFERENCE_PX = 0.05
+CONVERGED_PX = 1e-3
+SAME_PX = 0.5
+MAX_STEP_PX = 4.0
+MAX_SEEDS = 4000
+
+
+def misfit(points: "SurfacePoints", light: Array) -> Array:
+    """Give the normal minus the bisector of the directions to light and camera, across the sightline.
+
+    Parameters
+    ----------
+    points : SurfacePoints
+        Camera frame.
+    light : ndarray, shape (3,)
+        Camera frame, mm.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Zero exactly where the normal is the bisector; NaN where there is no surface.
+    """
+    P = points.position
+    to_camera = -P / np.linalg.norm(P, axis=1, keepdims=True)
+    to_light = light - P
+    to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+    bisector = to_camera + to_light
+    bisector /= np.linalg.norm(bisector, axis=1, keepdims=True)
+    first, second = tangent_basis(to_camera)
+    gap = points.normal - bisector
+    return np.stack([np.sum(first * gap, axis=1), np.sum(second * gap, axis=1)], axis=1)
+
+
+def find(session: "Session", radiance: Radiance, stride: int) -> list[TrueHighlight]:
+    """Find the true highlights of all lights in view.
+
+    Parameters
+    ----------
+    session : Session
+        Casts exact rays.
+    radiance : Radiance
+        Of the same frame.
+    stride : int
+        Distance of the seeds' grid, px.
+
+    Returns
+    -------
+    list of TrueHighlight
+        The brightest first.
+    """
+    camera = session.camera
+    grid = _seed_grid(session, stride)
+    found = []
+    for index, light in enumerate(session.scene.rig.lights):
+        place = np.array(light.place_mm)
+        seeds = _seeds(grid[0], grid[1], place, stride)
+        solutions = _newton(session, seeds, place)
+        solutions = _distinct(solutions[camera.contains(solutions)])
+        if len(solutions):
+            found += _describe(session, radiance, solutions, index)
+    return sorted(found, key=lambda highlight: -highlight.radiance)
+
+
+def _seed_grid(session: "Session", stride: int) -> tuple[Array, "SurfacePoints"]:
+    """Give pixel centres on a grid, shape (h, w, 2), with their exact points, flattened."""
+    camera = session.camera
+    pixels = camera.pixel_centres()[stride // 2 :: stride, stride // 2 :: stride]
+    return pixels, session.cast(pixels.reshape(-1, 2))[0]
+
+
+def _seeds(pixels: Array, points: "SurfacePoints", light: Array, stride: int) -> Array:
+    """Give the grid points whose own Newton step lands within two cells, shape (N, 2), px."""
+    height, width = pixels.shape[:2]
+    if min(height, width) < 3:
+        return np.empty((0, 2))
+    w = misfit(points, light).reshape(height, width, 2)
+    along_y, along_x = np.gradient(w, axis=(0, 1))
+    determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step_x = (along_y[..., 1] * w[..., 0] - along_y[..., 0] * w[..., 1]) / determinant
+        step_y = (along_x[..., 0] * w[..., 1] - along_x[..., 1] * w[..., 0]) / determinant
+        near = np.hypot(step_x, step_y) < 2.0
+    gain = np.minimum(np.abs(1 + points.distance * points.k_min), np.abs(1 + points.distance * points.k_max))
+    near &= gain.reshape(height, width) > MIN_GAIN
+    seeds = pixels[near] - stride * np.stack([step_x[near], step_y[near]], axis=1)
+    return _distinct(seeds)[:MAX_SEEDS]
+
+
+def _newton(session: "Session", seeds: Array, light: Array) -> Array:
+    """Refine seeds to zeros of the misfit; gives those that converged, shape (M, 2), px."""
+    position = seeds.copy()
+    step_length = np.full(len(position), np.inf)
+    offsets = DIFFERENCE_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    for _ in range(NEWTON_STEPS):
+        active = np.flatnonzero(~(step_length < CONVERGED_PX / 100))
+        if not len(active):
+            break
+        stencil = (position[active, None, :] + offsets).reshape(-1, 2)
+        w = misfit(session.cast(stencil)[0], light).reshape(-1, 5, 2)
+        along_x = (w[:, 1] - w[:, 2]) / (2 * DIFFERENCE_PX)
+        along_y = (w[:, 3] - w[:, 4]) / (2 * DIFFERENCE_PX)
+        J = np.stack([along_x, along_y], axis=-1)
+        determinant = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+        solvable = np.isfinite(determinant) & (np.abs(determinant) > 1e-18)
+        step = np.full((len(active), 2), np.nan)
+        step[solvable] = -np.linalg.solve(J[solvable], w[solvable, 0, :, None])[..., 0]
+        length = np.linalg.norm(step, axis=1)
+        with np.errstate(invalid="ignore"):
+            step *= np.minimum(1.0, MAX_STEP_PX / length)[:, None]
+        position[active] += step
+        step_length[active] = length
+        keep = np.isfinite(position).all(axis=1)
+        position, step_length = position[keep], step_length[keep]
+    return position[step_length < CONVERGED_PX]
+
+
+def _distinct(points: Array) -> Array:
+    """Keep one of the points that lie within half a pixel of each other."""
+    kept: list[Array] = []
+    cells: dict[tuple[int, int], list[Array]] = {}
+    for point in points[np.isfinite(points).all(axis=1)]:
+        cell = (int(point[0] // SAME_PX), int(point[1] // SAME_PX))
+        around = [p for i in (-1, 0, 1) for j in (-1, 0, 1) for p in cells.get((cell[0] + i, cell[1] + j), [])]
+        if all(np.hypot(*(point - other)) > SAME_PX for other in around):
+            cells.setdefault(cell, []).append(point)
+            kept.append(point)
+    return np.array(kept).reshape(-1, 2)
+
+
+def _describe(session: "Session", radiance: Radiance, solutions: Array, light: int) -> list[TrueHighlight]:
+    points, _, _ = session.cast(solutions)
+    lit = session.lit(points.position, light)
+    total = radiance.total if radiance.total.ndim == 2 else radiance.total.mean(axis=2)
+    columns = np.clip(solutions[:, 0].astype(int), 0, session.camera.width - 1)
+    rows = np.clip(solutions[:, 1].astype(int), 0, session.camera.height - 1)
+    return [
+        TrueHighlight(
+            light=light,
+            bp_px=solutions[i],
+            position=points.position[i],
+            normal=points.normal[i],
+            distance=float(points.distance[i]),
+            kd_min=float(points.distance[i] * points.k_min[i]),
+            kd_max=float(points.distance[i] * points.k_max[i]),
+            lit=bool(lit[i]),
+            radiance=float(total[rows[i], columns[i]]),
+        )
+        for i in np.flatnonzero(points.valid)
+    ]

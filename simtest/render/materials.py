@@ -1,0 +1,77 @@
+"""From a scene's reflectance to Mitsuba BSDFs: the full one and its diffuse base alone."""
+
+from typing import Any
+
+from simtest.spec.scene import PhongReflectance, PrincipledReflectance, RoughConductorReflectance, RoughPlasticReflectance
+
+AnyReflectance = PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance
+
+
+def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> dict[str, Any]:
+    """Describe a reflectance to `mi.load_dict`.
+
+    Parameters
+    ----------
+    reflectance : reflectance model
+        From the scene.
+    phong_plugin : str
+        Name under which the Phong plugin is registered.
+    diffuse_only : bool
+        Give the same material without its specular part: the difference of the two is the specular radiance.
+
+    Returns
+    -------
+    dict
+    """
+    specular = 0.0 if diffuse_only else 1.0
+    base = {"type": "rgb", "value": [reflectance.diffuse * c for c in reflectance.colour]}
+    match reflectance:
+        case PhongReflectance():
+            return {
+                "type": phong_plugin,
+                "exponent": reflectance.exponent,
+                "specular": specular * reflectance.specular,
+                "normalised": reflectance.normalised,
+                "diffuse_reflectance": base,
+            }
+        case RoughPlasticReflectance():
+            return {
+                "type": "roughplastic",
+                "distribution": "ggx",
+                "alpha": reflectance.alpha,
+                "diffuse_reflectance": base,
+                "specular_reflectance": {"type": "uniform", "value": specular},
+            }
+        case PrincipledReflectance():
+            return {
+                "type": "principled",
+                "base_color": base,
+                "roughness": {"type": "uniform", "value": reflectance.roughness},
+                "specular": 0.5 * specular,
+            }
+        case RoughConductorReflectance():
+            return {
+                "type": "blendbsdf",
+                "weight": reflectance.diffuse,
+                "glossy": {
+                    "type": "roughconductor",
+                    "material": "none",
+                    "distribution": "ggx",
+                    "alpha": reflectance.alpha,
+                    "specular_reflectance": {"type": "uniform", "value": specular},
+                },
+                "matt": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(reflectance.colour)}},
+            }
+
+
+def parameter_updates(reflectance: AnyReflectance, diffuse_only: bool) -> dict[str, float] | None:
+    """Give the parameters that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
+
+    Returns
+    -------
+    dict or None
+        None where the material has to be rebuilt.
+    """
+    if isinstance(reflectance, PhongReflectance):
+        return {"exponent": reflectance.exponent, "specular": 0.0 if diffuse_only else reflectance.specular}
+    return None

@@ -1,0 +1,50 @@
+"""From a surface's shape to Mitsuba's."""
+
+from typing import Any
+
+import numpy as np
+
+from simtest.anatomy import Shape, TriangleMesh
+
+
+def make_shape(mi: Any, shape: Shape, bsdf: dict[str, Any]) -> Any:
+    """Make what `mi.load_dict` takes for a shape.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    shape : Shape
+        In the model frame.
+    bsdf : dict
+        Its material.
+
+    Returns
+    -------
+    dict or mitsuba.Mesh
+        The description of an analytic shape, or a mesh with the vertex normals given.
+    """
+    if shape.mesh is not None:
+        return _make_mesh(mi, shape.mesh, bsdf)
+    plugin = {"plane": "rectangle", "sphere": "sphere", "cylinder": "cylinder"}[shape.kind]
+    transform = mi.ScalarTransform4f(shape.parameters["to_model"].tolist())
+    return {"type": plugin, "to_world": transform, "flip_normals": shape.flip, "bsdf": bsdf}
+
+
+def _make_mesh(mi: Any, mesh: TriangleMesh, bsdf: dict[str, Any]) -> Any:
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(bsdf)
+    made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = _flat(mesh.vertices, np.float32)
+    parameters["faces"] = _flat(mesh.faces, np.uint32)
+    parameters.update()
+    # A change of positions makes Mitsuba compute normals from the triangles: the exact ones come after it.
+    parameters["vertex_normals"] = _flat(mesh.normals, np.float32)
+    parameters.update()
+    return made
+
+
+def _flat(values: Any, dtype: Any) -> Any:
+    """Flatten an array row by row into 32-bit numbers, as Mitsuba stores buffers."""
+    return np.ascontiguousarray(values, dtype=dtype).ravel()

@@ -1,0 +1,206 @@
+"""Curves: rows gathered by setting, means with intervals, and the law predicted for them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy.special import stdtrit
+
+from simtest.conventions import CIRCLE_POSE_ISOVALUE
+from simtest.report.run import Run
+from simtest.report.style import Array, Axis, estimator_order
+from simtest.validation import laws
+
+_BINS = 12
+_PHONG_EXPONENT = 50.0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve: the means of one estimator on one label, with the law that was predicted for them.
+
+    Parameters
+    ----------
+    estimator, label : str
+        What the colour and the marker stand for.
+    x, y, low, high : ndarray, shape (n,)
+        Place and mean of each setting, and the 95 % t interval of the mean (NaN for a single value).
+    law_at : ndarray, shape (n,)
+        The law's mean prediction at each point; NaN where there is none.
+    law_x, law_y : ndarray, shape (m,)
+        The law as a line; empty where there is none.
+    names, counts : tuple of str
+        Setting, and "values of rows" for each point.
+    joined : bool
+        Whether the points follow one sweep; false for bins over many highlights.
+    """
+
+    estimator: str
+    label: str
+    x: Array
+    y: Array
+    low: Array
+    high: Array
+    law_at: Array
+    law_x: Array
+    law_y: Array
+    names: tuple[str, ...]
+    counts: tuple[str, ...]
+    joined: bool
+
+
+@dataclass(frozen=True)
+class Ask:
+    """What to gather: the quantity on x, its companion that must be held, the value and its law."""
+
+    x: str
+    value: str
+    law: str
+    hold: str | None = None
+
+
+def prepared(run: Run) -> pl.DataFrame:
+    """Give the rows of true highlights, with `kd` (the principal k d of larger size) and `kd_other`."""
+    larger = pl.col("kd_max").abs() >= pl.col("kd_min").abs()
+    return run.results.filter(pl.col("true_id").is_not_null()).with_columns(
+        kd=pl.when(larger).then("kd_max").otherwise("kd_min"),
+        kd_other=pl.when(larger).then("kd_min").otherwise("kd_max"),
+        ok=(pl.col("status") == "ok").fill_null(False),
+    )
+
+
+def varies(values: pl.Series) -> bool:
+    """Tell whether per-setting means differ by more than a tenth of the largest (and more than 5e-4)."""
+    values = values.drop_nulls()
+    if values.len() < 2:
+        return False
+    spread = float(values.max() - values.min())  # type: ignore[operator, arg-type]
+    return spread > max(5e-4, 0.1 * float(values.abs().max()))  # type: ignore[arg-type]
+
+
+def scattered(rows: pl.DataFrame, x: str) -> bool:
+    """Tell whether a quantity changes so much within one setting that rows must be binned by it instead."""
+    if rows.is_empty():
+        return False
+    spread = rows.group_by("setting").agg((pl.col(x).max() - pl.col(x).min()).alias("spread"))["spread"].max()
+    size = rows[x].abs().max()
+    return bool(spread is not None and size is not None and spread > max(0.02, 0.5 * size))  # type: ignore[operator]
+
+
+def slices(rows: pl.DataFrame, x: str, hold: str | None) -> Iterator[tuple[str, pl.DataFrame, bool]]:
+    """Give, for each label that sweeps x, its rows and whether they are to be binned.
+
+    Where the other quantity is swept as well (a grid), only the settings at its smallest size remain.
+    """
+    quantities = [x, hold] if hold else [x]
+    for (label,), part in rows.filter(pl.col(x).is_not_null()).group_by("label", maintain_order=True):
+        is_scattered = scattered(part, x)
+        means = part.group_by("setting", maintain_order=True).agg(pl.col(quantities).mean())
+        if not is_scattered and not varies(means[x]):
+            continue
+        if hold and not is_scattered and not scattered(part, hold) and varies(means[hold]):
+            size = means[hold].abs()
+            near = size <= float(size.min() or 0.0) + max(1e-6, 0.05 * float(size.max() or 0.0))  # type: ignore[arg-type]
+            kept = means.filter(near)
+            if not varies(kept[x]):
+                continue
+            part = part.filter(pl.col("setting").is_in(kept["setting"].to_list()))
+        yield str(label), part, is_scattered
+
+
+def _aggregate(rows: pl.DataFrame, ask: Ask, is_scattered: bool) -> pl.DataFrame:
+    rank = pl.col(ask.x).rank("dense") - 1
+    group = (rank * _BINS // (rank.max() + 1)).cast(pl.String) if is_scattered else pl.col("setting")
+    exponent = pl.col("reflectance.exponent") if "reflectance.exponent" in rows.columns else pl.lit(None)
+    values = pl.col(ask.value).filter(pl.col("ok") & pl.col(ask.value).is_not_null())
+    return (
+        rows.with_columns(group=group, exponent=exponent.cast(pl.Float64))
+        .group_by("estimator", "group", maintain_order=True)
+        .agg(
+            x=pl.col(ask.x).mean(), kd=pl.col("kd").mean(), kd_other=pl.col("kd_other").mean(),
+            y=values.mean(), std=values.std(), least=values.min(), n=values.len(), rows=pl.len(),
+            law=pl.col(ask.law).mean(), isovalue=pl.col("isovalue").median(), exponent=pl.col("exponent").mean(),
+        )
+        .sort("x", maintain_order=True)
+    )  # fmt: skip
+
+
+def _interval(table: pl.DataFrame) -> tuple[Array, Array]:
+    """95 % t interval of the mean; its lower end is not drawn below the least value seen."""
+    n = table["n"].to_numpy().astype(float)
+    std = table["std"].cast(pl.Float64).to_numpy()
+    y, least = table["y"].cast(pl.Float64).to_numpy(), table["least"].cast(pl.Float64).to_numpy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        half = np.where(n > 1, stdtrit(np.maximum(n - 1, 1), 0.975) * std / np.sqrt(n), np.nan)
+    return np.maximum(y - half, least), y + half
+
+
+def gather(rows: pl.DataFrame, ask: Ask, axis: Axis) -> tuple[list[Curve], list[str]]:
+    """Gather the curves of a figure, and the places that have no value."""
+    curves, empty = [], []
+    for label, part, is_scattered in slices(rows, ask.x, ask.hold):
+        table = _aggregate(part, ask, is_scattered)
+        for name in estimator_order(table["estimator"].to_list()):
+            own = table.filter(pl.col("estimator") == name)
+            empty += [f"{name}, {group}" for group in own.filter(pl.col("n") == 0)["group"].to_list()]
+            law_x, law_y = _law_line(own, ask, name, axis, is_scattered)
+            own = own.filter(pl.col("n") > 0)
+            if own.is_empty():
+                continue
+            low, high = _interval(own)
+            curves.append(
+                Curve(
+                    name, label, _array(own["x"]), _array(own["y"]), low, high, _array(own["law"]), law_x, law_y,
+                    tuple("bin of highlights" if is_scattered else str(g) for g in own["group"]),
+                    tuple(f"{n} of {m}" for n, m in zip(own["n"], own["rows"], strict=True)), not is_scattered,
+                )
+            )  # fmt: skip
+    return curves, empty
+
+
+def _array(values: pl.Series) -> Array:
+    return values.cast(pl.Float64).to_numpy().astype(float)
+
+
+def _law_line(table: pl.DataFrame, ask: Ask, estimator: str, axis: Axis, is_scattered: bool) -> tuple[Array, Array]:
+    """Draw the closed form between the settings where it agrees with the rows' own law, else join the latter."""
+    table = table.filter(pl.col("law").is_not_null() & pl.col("x").is_not_null())
+    nothing = np.empty(0)
+    if table.is_empty():
+        return nothing, nothing
+    x, law = _array(table["x"]), _array(table["law"])
+    kd, other = _array(table["kd"]), _array(table["kd_other"])
+
+    def closed_form(at_x: Array, at_kd: Array, at_other: Array) -> Array | None:
+        low, high = np.minimum(at_kd, at_other), np.maximum(at_kd, at_other)
+        if ask.value == "axis_ratio":
+            return laws.axis_ratio(low, high)
+        if ask.x == "eps_over_d" and estimator != "circle_pose":
+            return np.degrees(laws.offset_error(at_x))
+        if ask.x == "kd" and estimator == "circle_pose":
+            isovalue = table["isovalue"].median() or CIRCLE_POSE_ISOVALUE
+            lobe = 4 * (table["exponent"].mean() or _PHONG_EXPONENT)  # type: ignore[operator]
+            return np.degrees(laws.circle_pose_error(*laws.isophote_half_axes(isovalue, lobe, low, high)))  # type: ignore[arg-type]
+        return None
+
+    at_points = closed_form(x, kd, other)
+    margin = 0.01 if ask.value == "axis_ratio" else 0.05
+    agrees = at_points is not None and bool(np.all(np.abs(at_points - law) <= margin + 0.01 * np.abs(law)))
+    if is_scattered or not agrees or x.size < 2 or np.ptp(axis.place(x)) == 0:
+        return x, law
+    places = np.unique(np.concatenate([np.linspace(*_ends(axis.place(x)), 120), axis.place(x)]))
+    fine = axis.unplace(places)
+    line = closed_form(fine, np.interp(fine, x, kd), np.interp(fine, x, other))
+    return fine, np.asarray(line)
+
+
+def _ends(values: Array) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
+def finite(values: npt.ArrayLike) -> Array:
+    """Give the finite values, flattened."""
+    data = np.asarray(values, dtype=float).ravel()
+    return data[np.isfinite(data)]

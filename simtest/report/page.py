@@ -1,0 +1,182 @@
+"""Writes the page of a run: figures as PNG, and one HTML file that needs nothing else."""
+
+import base64
+import io
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from simtest.report import static, style, words
+from simtest.report.gallery import isophote_colour
+from simtest.report.run import Run, read_run
+from simtest.report.series import LineFigure, line_figures
+from simtest.report.surface3d import surface_3d
+from simtest.report.tables import SUMMARY_COLUMNS, heat_maps, summary_rows, surface_figure
+
+_IMAGE_BUDGET = 1_350_000
+_FIRST = 6
+_MAX_HEAT_MAPS = 18
+
+
+def write_report(run: Path) -> Path:
+    """Write the figures and the page of a run.
+
+    Parameters
+    ----------
+    run : pathlib.Path
+        Run directory with results.parquet, summary.json and, if there is one, gallery/*.npz.
+
+    Returns
+    -------
+    pathlib.Path
+        ``run/index.html``. Beside it, ``run/figures/*.png`` are written anew; pictures of an earlier report go.
+
+    Raises
+    ------
+    InputError
+        If a file of the run is missing or malformed.
+    """
+    data = read_run(Path(run))
+    folder = data.path / "figures"
+    colours = style.colours(data.estimators)
+    if folder.is_dir():
+        for old in folder.glob("*.png"):
+            old.unlink()
+    with static.settings():
+        sections, charts = _sections(data, colours, folder)
+    html = _render(data, colours, sections, charts)
+    page = data.path / "index.html"
+    part = page.with_name(page.name + ".part")
+    part.write_text(html, encoding="utf-8")
+    os.replace(part, page)
+    return page
+
+
+def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Draw everything once: PNG files as a side effect, the page's parts and its plotly figures as the value."""
+    from simtest.report import interactive
+
+    charts: dict[str, str] = {}
+    lines = line_figures(run)
+    for figure in lines:
+        static.save(static.draw_lines(figure, colours), folder / f"{figure.key}.png")
+        charts[figure.key] = interactive.to_json(interactive.lines(figure, colours))
+    sections: dict[str, Any] = {"headline": words.headline(run, lines), "lines": [_line_section(f) for f in lines]}
+    maps = heat_maps(run)[:_MAX_HEAT_MAPS]
+    if maps:
+        static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
+        for i, item in enumerate(maps):
+            charts[f"heatmap_{i}"] = interactive.to_json(interactive.heat_map(item, maps))
+        sections["heat"] = [
+            {"key": f"heatmap_{i}", "title": f"{m.estimator}, {m.label}", "line": words.heat_line(m)}
+            for i, m in enumerate(maps)
+        ]
+    surfaces = surface_figure(run, has_lines=bool(lines or maps))
+    if surfaces:
+        sections["surfaces"] = surfaces
+        if surfaces.boxes:
+            static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
+            charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
+    paths = static.draw_gallery(run.gallery, colours, folder)
+    sections["gallery"] = _gallery_section(run, paths)
+    view = surface_3d(run)
+    if view:
+        path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
+        charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
+        sections["view"] = {"title": view.title, "picture": picture(path, 120_000)}
+    return sections, charts
+
+
+def _line_section(figure: LineFigure) -> dict[str, Any]:
+    marks = style.symbols(figure.labels)
+    return {
+        "key": figure.key,
+        "title": figure.title,
+        "about": figure.about,
+        "measured": words.measured(figure),
+        "marks": [(marks[label].text, label) for label in figure.labels] if len(figure.labels) > 1 else [],
+        "binned": any(not curve.joined for curve in figure.curves),
+    }
+
+
+def _gallery_section(run: Run, paths: Sequence[Path]) -> list[dict[str, Any]]:
+    share = _IMAGE_BUDGET // max(len(paths), 1)
+    return [
+        {**words.gallery_caption(item), "picture": picture(path, min(share, 130_000)), "file": path.name}
+        for item, path in zip(run.gallery, paths, strict=True)
+    ]
+
+
+def picture(path: Path, limit: int) -> str:
+    """Give a PNG as a data address of a WebP picture.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The picture.
+    limit : int
+        Wanted size in bytes; quality and then width are lowered until it is met, but not below 40 and 420 px.
+
+    Returns
+    -------
+    str
+        ``data:image/webp;base64,...``
+    """
+    from PIL import Image
+
+    with Image.open(path) as source:
+        image = source.convert("RGB")
+    data = b""
+    for width, quality in ((640, 85), (640, 70), (560, 60), (480, 50), (420, 40)):
+        if image.width > width:
+            image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+        buffer = io.BytesIO()
+        image.save(buffer, "WEBP", quality=quality)
+        data = buffer.getvalue()
+        if len(data) <= limit:
+            break
+    return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], charts: Mapping[str, str]) -> str:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["degrees"] = style.degrees
+    content = run.experiments.get(run.experiment) or {}
+    return environment.get_template("template.html.j2").render(
+        experiment=run.experiment,
+        title=content.get("title") or run.experiment,
+        description=content.get("description") or "",
+        headline=sections["headline"],
+        lines=sections["lines"],
+        heat=sections.get("heat", []),
+        surfaces=sections.get("surfaces"),
+        gallery=sections["gallery"],
+        gallery_total=run.gallery_total,
+        first=_FIRST,
+        view=sections.get("view"),
+        summary=summary_rows(run),
+        columns=[heading for _, heading in SUMMARY_COLUMNS],
+        provenance=words.provenance_rows(run),
+        colours={name: colours[name] for name in style.estimator_order(colours)},
+        truth_colour=style.TRUTH,
+        isophotes=[(t, _hex(isophote_colour(t))) for t in (0.1, 0.3, 0.5, 0.7, 0.9)],
+        charts={key: Markup(text) for key, text in charts.items()},
+        plotly=Markup(_plotly_script()) if charts else None,
+    )
+
+
+def _hex(colour: tuple[float, float, float, float]) -> str:
+    return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
+
+
+def _plotly_script() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs()).replace("</script", "<\\/script")

@@ -1,0 +1,135 @@
+"""The figures of curves: computed once here, drawn by two thin backends (`static`, `interactive`)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from simtest.report.curves import Ask, Curve, gather, prepared, varies
+from simtest.report.run import Run
+from simtest.report.style import Axis, curvature_axis, estimator_order
+
+TOLERANCE_DEG = 0.3
+TOLERANCE_SHARE = 0.03
+"""A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4)."""
+
+_ERROR_TITLE = "angular error (deg)"
+
+
+@dataclass(frozen=True)
+class LineFigure:
+    """A figure of curves over one quantity."""
+
+    key: str
+    title: str
+    about: str
+    x: Axis
+    y: Axis
+    curves: tuple[Curve, ...]
+    empty: tuple[str, ...] = ()
+    shared_law: bool = False
+    law_name: str = "law"
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels in order of appearance."""
+        return list(dict.fromkeys(curve.label for curve in self.curves))
+
+    @property
+    def estimators(self) -> list[str]:
+        """Estimators in the report's order."""
+        return estimator_order(curve.estimator for curve in self.curves)
+
+
+def line_figures(run: Run) -> list[LineFigure]:
+    """Compute the figures of curves for which the run has data.
+
+    Parameters
+    ----------
+    run : Run
+        A run directory.
+
+    Returns
+    -------
+    list of LineFigure
+        Keys error_vs_curvature, axis_ratio, error_vs_offset and error_vs_<parameter> for other swept parameters.
+    """
+    rows = prepared(run)
+    kd = "curvature times distance, k d"
+    measures = rows.filter(pl.col("axis_ratio").is_not_null())["estimator"].unique().to_list()
+    error = Axis(_ERROR_TITLE, "log")
+    wanted = [
+        ("error_vs_curvature", "Error against curvature", curvature_axis(rows["kd"].to_numpy(), kd), error,
+         Ask("kd", "error_oracle_deg", "error_law_deg", "eps_over_d"),
+         "The mean angle between the better candidate and the true normal against distance times the principal "
+         "curvature of larger size (convex positive), with the error law as a line."),
+        ("axis_ratio", "Axis ratio against curvature", curvature_axis(rows["kd"].to_numpy(), kd),
+         Axis("axis ratio of the isophotes", "linear", (0.0, 1.05)),
+         Ask("kd", "axis_ratio", "axis_ratio_law", "eps_over_d"),
+         "The mean axis ratio of the isophotes against distance times the principal curvature of larger size, with its "
+         "law, the smaller over the larger |1 + d k|, as a line."),
+        ("error_vs_offset", "Error against light offset", Axis("light offset over distance, ε/d"), error,
+         Ask("eps_over_d", "error_oracle_deg", "error_law_deg", "kd"),
+         "The mean angle between the better candidate and the true normal against the light's offset from the camera "
+         "over distance, with the law of half the angle between light and camera, about atan(ε/d)/2, as a line."),
+    ]  # fmt: skip
+    figures = []
+    for key, title, x, y, ask, about in wanted:
+        shared = ask.value == "axis_ratio"
+        curves, empty = gather(rows.filter(pl.col("estimator").is_in(measures)) if shared else rows, ask, x)
+        if curves:
+            figures.append(LineFigure(key, title, about, x, y, tuple(curves), tuple(empty), shared))
+    return figures + _sweep_figures(run, rows)
+
+
+def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 6) -> list[LineFigure]:
+    """Error against every other swept parameter whose values do not already show as curvature or offset."""
+    figures: list[LineFigure] = []
+    for name in run.swept:
+        if len(figures) == most:
+            break
+        kept = []
+        for _, part in rows.filter(pl.col(name).is_not_null()).group_by("label", maintain_order=True):
+            means = part.group_by(name).agg(pl.col("kd").mean(), pl.col("eps_over_d").mean())
+            if means.height > 1 and not varies(means["kd"]) and not varies(means["eps_over_d"]):
+                kept.append(part)
+        if not kept:
+            continue
+        part = pl.concat(kept).with_columns(pl.col(name).cast(pl.Float64))
+        part = part.with_columns(setting=pl.lit(f"{name} = ") + pl.col(name).cast(pl.String))
+        curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg"), Axis(name))
+        if curves:
+            slug = "".join(c if c.isalnum() else "_" for c in name)
+            about = f"The mean angle between the better candidate and the true normal against {name}, over all else."
+            title = f"Error against {name}"
+            y = Axis(_ERROR_TITLE, "log")
+            figures.append(LineFigure(f"error_vs_{slug}", title, about, Axis(name), y, tuple(curves), tuple(empty)))
+    return figures
+
+
+def law_misses(figure: LineFigure) -> dict[str, tuple[int, int, float, str]]:
+    """Count, by estimator, the points that meet their law.
+
+    Parameters
+    ----------
+    figure : LineFigure
+        A figure of errors in degrees, or of axis ratios (3 % of the law alone).
+
+    Returns
+    -------
+    dict
+        (points within tolerance, points with a law, largest departure, where), by estimator.
+    """
+    result: dict[str, tuple[int, int, float, str]] = {}
+    for name in figure.estimators:
+        gaps: list[tuple[float, bool, str]] = []
+        for curve in (c for c in figure.curves if c.estimator == name):
+            floor = 0.0 if figure.shared_law else TOLERANCE_DEG
+            for y, law, where in zip(curve.y, curve.law_at, curve.names, strict=True):
+                if np.isfinite(law):
+                    gap = float(abs(y - law))
+                    gaps.append((gap, bool(gap <= max(floor, TOLERANCE_SHARE * law)), f"{curve.label}, {where}"))
+        if gaps:
+            worst = max(gaps)
+            result[name] = (sum(met for _, met, _ in gaps), len(gaps), worst[0], worst[2])
+    return result

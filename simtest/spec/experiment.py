@@ -1,0 +1,113 @@
+"""The experiment: which scenes, which swept parameters, how many realisations, which estimators."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from simtest.resources import find
+from simtest.spec.reading import Spec, apply_settings, read_toml, validate
+
+
+class Uniform(Spec):
+    """A uniform distribution over [low, high)."""
+
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Uniform":
+        if self.low > self.high:
+            raise ValueError(f"low = {self.low:g} must not exceed high = {self.high:g}")
+        return self
+
+
+class Group(Spec):
+    """One family of settings on one base scene.
+
+    `sweep` holds tables of equally long lists that vary together; several tables are multiplied out. `pool` is the
+    same, but its values count as realisations of one setting. `random` draws a value for each realisation.
+    """
+
+    scene: str = Field(description="base scene: a shipped name or a path")
+    label: str = Field("", max_length=80, description="name of the curve in the figures; default the surface's")
+    set: dict[str, Any] = Field(default_factory=dict, description="values that replace the scene's, by key path")
+    sweep: tuple[dict[str, tuple[Any, ...]], ...] = ()
+    pool: tuple[dict[str, tuple[Any, ...]], ...] = ()
+    random: dict[str, Uniform] = Field(default_factory=dict)
+    realisations: int | None = Field(None, ge=1, le=10**6, description="default the experiment's")
+    isolated: bool = Field(
+        True, description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V"
+    )
+
+    @model_validator(mode="after")
+    def _equal_lengths(self) -> "Group":
+        for table in (*self.sweep, *self.pool):
+            lengths = {key: len(values) for key, values in table.items()}
+            if not lengths or 0 in lengths.values() or len(set(lengths.values())) > 1:
+                raise ValueError(f"lists of one sweep must be equally long and not empty, got lengths {lengths}")
+        return self
+
+
+class Experiment(Spec):
+    """A validation experiment."""
+
+    name: str = Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")
+    title: str = ""
+    description: str = ""
+    realisations: int = Field(20, ge=1, le=10**6)
+    seed: int = Field(0, ge=0, lt=2**63)
+    estimators: tuple[str, ...] = Field(("circle_pose", "brightest_point", "cone_axis"), min_length=1)
+    groups: tuple[Group, ...] = Field(min_length=1)
+
+
+_EXPERIMENT_KEYS = frozenset({"realisations", "seed", "estimators", "title", "description"})
+
+
+def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None) -> Experiment:
+    """Read an experiment file.
+
+    Parameters
+    ----------
+    name : str or Path
+        A path, or the name of a shipped experiment.
+    settings : mapping, optional
+        Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced; all other paths
+        are those of the scene and apply to each group, in place of a sweep over the same path.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed.
+    """
+    path = find(name, "scenes", "experiments")
+    settings = dict(settings or {})
+    own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
+    data = apply_settings(read_toml(path), own, str(path))
+    data.setdefault("name", path.stem)
+    experiment = validate(Experiment, data, str(path))
+    if not settings:
+        return experiment
+    groups = tuple(_override(group, settings) for group in experiment.groups)
+    return experiment.model_copy(update={"groups": groups})
+
+
+def _override(group: Group, settings: Mapping[str, Any]) -> Group:
+    """Fix scene values in a group; a swept or random value of the same path gives way."""
+    def without(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
+        kept = ({k: v for k, v in table.items() if k not in settings} for table in tables)
+        return tuple(table for table in kept if table)
+
+    return group.model_copy(
+        update={
+            "set": {**group.set, **settings},
+            "sweep": without(group.sweep),
+            "pool": without(group.pool),
+            "random": {k: v for k, v in group.random.items() if k not in settings},
+        }
+    )

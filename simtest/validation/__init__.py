@@ -1,0 +1,1 @@
+"""Experiments, metrics, error laws and statistics."""

@@ -1,0 +1,160 @@
+"""From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
+
+import itertools
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from simtest.resources import find
+from simtest.seeds import Stage, generator
+from simtest.spec import Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
+
+
+@dataclass(frozen=True)
+class Case:
+    """One setting of an experiment, or one pooled part of it.
+
+    Parameters
+    ----------
+    label : str
+        Name of the curve.
+    setting : str
+        Name of the setting within the experiment, unique together with the part.
+    part : int
+        Which of the setting's pooled values.
+    swept : dict
+        Value by key path of the swept and pooled parameters.
+    data : dict
+        The scene's tables.
+    where : str
+        The scene's file, for messages.
+    random : dict
+        Distribution by key path, drawn for each realisation.
+    realisations : int
+        How many.
+    isolated : bool
+        Whether isolated highlights alone count as true ones.
+    command : str
+        Renders the scene alone (drawn values at the scene file's).
+    """
+
+    label: str
+    setting: str
+    part: int
+    swept: dict[str, Any]
+    data: dict[str, Any]
+    where: str
+    random: dict[str, Any]
+    realisations: int
+    isolated: bool
+    command: str
+
+    @property
+    def name(self) -> str:
+        """The case's place in the seed tree."""
+        return f"{self.setting} | part {self.part}"
+
+    def numbers(self) -> range:
+        """Numbers of the realisations, running on over the parts of a setting."""
+        return range(self.part * self.realisations, (self.part + 1) * self.realisations)
+
+    def scene(self, experiment: Experiment, realisation: int) -> tuple[Scene, dict[str, Any]]:
+        """Give the scene of a realisation and the values drawn for it.
+
+        Raises
+        ------
+        InputError
+            If a swept or drawn value does not fit the schema.
+        """
+        rng = generator(experiment.seed, experiment.name, self.name, realisation, Stage.SWEEP)
+        drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
+        data = apply_settings(self.data, drawn, self.where) if drawn else self.data
+        return scene_from_dict(data, self.where), drawn
+
+
+def expand(experiment: Experiment) -> list[Case]:
+    """List an experiment's cases.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From a file.
+
+    Returns
+    -------
+    list of Case
+        In the order of the file.
+
+    Raises
+    ------
+    InputError
+        If a scene is missing or malformed, or a swept value does not fit: found before anything is rendered.
+    """
+    cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
+    for case in cases:
+        case.scene(experiment, case.numbers()[0])
+    return cases
+
+
+def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
+    path = find(group.scene, "scenes")
+    base = apply_settings(read_toml(path), group.set, str(path))
+    base.setdefault("name", path.stem)
+    count = experiment.realisations if group.realisations is None else group.realisations
+    cases = []
+    for swept in _combinations(group.sweep):
+        for part, pooled in enumerate(_combinations(group.pool)):
+            values = {**swept, **pooled}
+            data = apply_settings(base, values, str(path))
+            label = group.label or scene_from_dict(data, str(path)).surface.label
+            setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
+            columns = {key: _plain(value) for key, value in values.items()}
+            again = " ".join(f"--set {shlex.quote(f'{k}={_toml(v)}')}" for k, v in {**group.set, **values}.items())
+            command = f"simtest render {group.scene} {again} --out frame".replace("  ", " ")
+            random = dict(group.random)
+            cases.append(
+                Case(label, setting, part, columns, data, str(path), random, count, group.isolated, command)
+            )
+    return cases
+
+
+def _combinations(tables: tuple[Mapping[str, tuple[Any, ...]], ...]) -> list[dict[str, Any]]:
+    """Multiply tables out; within one table the lists vary together."""
+    rows = [[dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)] for table in tables]
+    return [{k: v for part in parts for k, v in part.items()} for parts in itertools.product(*rows)]
+
+
+def _short(path: str, among: Mapping[str, Any]) -> str:
+    """Give the last part of a key path, or all of it where that is not unique."""
+    last = path.rsplit(".", 1)[-1]
+    return last if sum(key.rsplit(".", 1)[-1] == last for key in among) == 1 else path
+
+
+def _plain(value: Any) -> Any:
+    """Give a swept value as it stands in a column: numbers and text as they are, a table by its type."""
+    if isinstance(value, Mapping):
+        return str(value.get("type", _toml(value)))
+    return _toml(value) if isinstance(value, list | tuple) else value
+
+
+def _toml(value: Any) -> str:
+    """Write a value so that ``--set key=value`` reads it back."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_quoted(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_quoted(item) for item in value) + "]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _quoted(value: Any) -> str:
+    return f'"{value}"' if isinstance(value, str) else _toml(value)
+
+
+def swept_example(cases: list[Case]) -> dict[str, Any]:
+    """Give an example value for each swept, pooled or drawn parameter: the columns that results gain."""
+    example: dict[str, Any] = {}
+    for case in cases:
+        example |= case.swept
+        example |= dict.fromkeys(case.random, 0.0)
+    return example

@@ -1,0 +1,132 @@
+"""The closed-form laws that the renders confirm or refute (theory.md sections 3 and 4).
+
+All functions are vectorised over their arguments. d k is distance times signed curvature; angles in radians;
+half-axes are tangents of the half-angles of the back-projected cone.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def gains(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> tuple[Array, Array]:
+    """Give the smaller and the larger of abs(1 + d k): by how much the normal turns per sightline angle.
+
+    Parameters
+    ----------
+    kd_min, kd_max : array_like
+        d times the principal curvatures.
+
+    Returns
+    -------
+    smaller, larger : ndarray
+    """
+    first, second = np.abs(1 + np.asarray(kd_min, float)), np.abs(1 + np.asarray(kd_max, float))
+    return np.minimum(first, second), np.maximum(first, second)
+
+
+def axis_ratio(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:
+    """Give the isophotes' axis ratio to second order: abs(1 + d k)_min / abs(1 + d k)_max (section 3, item 3).
+
+    Parameters
+    ----------
+    kd_min, kd_max : array_like
+        d times the principal curvatures.
+
+    Returns
+    -------
+    ndarray
+        In [0, 1].
+    """
+    smaller, larger = gains(kd_min, kd_max)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(smaller / larger)
+
+
+def isophote_half_axes(
+    isovalue: npt.ArrayLike, lobe_curvature: npt.ArrayLike, kd_min: npt.ArrayLike, kd_max: npt.ArrayLike
+) -> tuple[Array, Array]:
+    """Give the half-axes of an isophote, second order in the image angle (section 3, items 1 and 3).
+
+    -log t = (c m^2 + 2 m) w^2 / 2 along a principal direction with m = 1 + d k; the 2 m is the falloff with 1/d^2.
+
+    Parameters
+    ----------
+    isovalue : array_like
+        t in (0, 1).
+    lobe_curvature : array_like
+        c = -(log f)''(0) of the reflectance; 4 n for Phong.
+    kd_min, kd_max : array_like
+        d times the principal curvatures.
+
+    Returns
+    -------
+    a, b : ndarray
+        a >= b, tangents of the half-angles; inf where the isophote does not close.
+    """
+    c, level = np.asarray(lobe_curvature, float), -2 * np.log(np.asarray(isovalue, float))
+
+    def half_axis(kd: npt.ArrayLike) -> Array:
+        m = 1 + np.asarray(kd, float)
+        stiffness = c * m**2 + 2 * m
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(stiffness > 0, np.sqrt(level / stiffness), np.inf))
+
+    first, second = half_axis(kd_min), half_axis(kd_max)
+    return np.maximum(first, second), np.minimum(first, second)
+
+
+def circle_pose_error(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
+    """Give the error of circle pose on a curved surface (section 4): sin(error) = sqrt((1 - (b/a)^2)/(1 + b^2)).
+
+    Parameters
+    ----------
+    a, b : array_like
+        Tangents of the cone's half-angles, a >= b.
+
+    Returns
+    -------
+    ndarray
+        Angle between either candidate and the true normal, rad; NaN where the isophote does not close.
+    """
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(a), np.arcsin(np.sqrt(np.clip((1 - (b / a) ** 2) / (1 + b**2), 0, 1))), np.nan)
+
+
+def offset_error(eps_over_d: npt.ArrayLike) -> Array:
+    """Give the sightline's error under light offset (section 4): about atan(eps_perp / d) / 2.
+
+    Parameters
+    ----------
+    eps_over_d : array_like
+        Light offset perpendicular to the sightline over distance.
+
+    Returns
+    -------
+    ndarray
+        Angle, rad.
+    """
+    return np.asarray(np.arctan(np.asarray(eps_over_d, float)) / 2)
+
+
+def bisector_angle(position: npt.ArrayLike, light: npt.ArrayLike) -> Array:
+    """Give half the angle at a surface point between the light and the camera: the exact form of `offset_error`.
+
+    Parameters
+    ----------
+    position : array_like, shape (..., 3)
+        Surface point in the camera frame, mm.
+    light : array_like, shape (..., 3)
+        Light in the camera frame, mm.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Angle, rad.
+    """
+    P = np.asarray(position, float)
+    to_light = np.asarray(light, float) - P
+    sine = np.linalg.norm(np.cross(-P, to_light), axis=-1)
+    return np.asarray(np.arctan2(sine, np.sum(-P * to_light, axis=-1)) / 2)

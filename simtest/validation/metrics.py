@@ -1,0 +1,207 @@
+"""Rows of results: one for each estimator at each detected or missed specularity."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from simtest.errors import Failure
+from simtest.estimators import Estimate
+from simtest.reconstruction import Specularity
+from simtest.render import Session
+from simtest.render.frames import Array
+from simtest.spec.scene import PhongReflectance, Scene
+from simtest.validation import laws
+from simtest.validation.truth import JudgedHighlight
+
+SCHEMA: dict[str, pl.DataType] = {
+    "experiment": pl.String(), "label": pl.String(), "surface": pl.String(), "reflectance": pl.String(),
+    "setting": pl.String(), "realisation": pl.Int64(), "specularity": pl.Int64(), "true_id": pl.Int64(),
+    "seed": pl.Int64(), "estimator": pl.String(), "status": pl.String(), "flags": pl.String(),
+    "error_deg": pl.Float64(), "error_oracle_deg": pl.Float64(), "error_look_deg": pl.Float64(),
+    "error_law_deg": pl.Float64(), "n_candidates": pl.Int64(), "choice_margin": pl.Float64(),
+    "rank_correct": pl.Int64(), "normal_x": pl.Float64(), "normal_y": pl.Float64(), "normal_z": pl.Float64(),
+    "truth_x": pl.Float64(), "truth_y": pl.Float64(), "truth_z": pl.Float64(), "bp_x_px": pl.Float64(),
+    "bp_y_px": pl.Float64(), "bp_true_x_px": pl.Float64(), "bp_true_y_px": pl.Float64(), "look_x_px": pl.Float64(),
+    "look_y_px": pl.Float64(), "cov_11": pl.Float64(), "cov_12": pl.Float64(), "cov_22": pl.Float64(),
+    "mahalanobis2": pl.Float64(), "distance_mm": pl.Float64(), "kd_min": pl.Float64(), "kd_max": pl.Float64(),
+    "eps_over_d": pl.Float64(), "noise_sigma": pl.Float64(), "peak_snr": pl.Float64(), "isovalue": pl.Float64(),
+    "isovalues": pl.String(), "axis_ratio": pl.Float64(), "axis_ratio_law": pl.Float64(), "path_depth": pl.Int64(),
+    "n_lights": pl.Int64(),
+}  # fmt: skip
+"""Columns that always exist, in order; the swept parameters follow by their own names."""
+
+
+@dataclass(frozen=True)
+class RowContext:
+    """What all rows of one realisation share.
+
+    Parameters
+    ----------
+    session : Session
+        Holds the scene; casts exact rays.
+    common : dict
+        Values of the columns that name the row's place in the experiment.
+    """
+
+    session: Session
+    common: dict[str, Any]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.session.scene
+
+
+def angle_deg(first: Array, second: Array) -> Array:
+    """Give the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
+    cross = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
+
+
+def rows(
+    context: RowContext, specularities: list[Specularity], truths: list[JudgedHighlight], matched: dict[int, int],
+    estimators: list[str],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Give the rows of one realisation: of each detection, and of each truth that no detection found.
+
+    Parameters
+    ----------
+    context : RowContext
+        The scene and the shared columns.
+    specularities : list of Specularity
+        Detections with their estimates.
+    truths : list of JudgedHighlight
+        The highlights that count as true.
+    matched : dict
+        Index of the truth by index of the detection.
+    estimators : list of str
+        Names, for the missed.
+
+    Returns
+    -------
+    list of dict
+    """
+    made = []
+    for i, specularity in enumerate(specularities):
+        truth = truths[matched[i]] if i in matched else None
+        for name, result in specularity.estimates.items():
+            row = {**_base(context, truth), "specularity": i, "true_id": matched.get(i), "estimator": name}
+            row |= _result(context, specularity, result, truth)
+            made.append(row)
+    for j, truth in enumerate(truths):
+        if j not in matched.values():
+            missed = {"specularity": None, "true_id": j, "status": "missed"}
+            made += [{**_base(context, truth), **missed, "estimator": name} for name in estimators]
+    return made
+
+
+def _base(context: RowContext, truth: JudgedHighlight | None) -> dict[str, Any]:
+    scene = context.scene
+    row = {
+        **context.common,
+        "surface": scene.surface.label,
+        "reflectance": scene.reflectance.type,
+        "noise_sigma": scene.sensor.noise_sigma,
+        "path_depth": scene.render.path_depth,
+        "n_lights": len(scene.rig.lights),
+    }
+    if truth is None:
+        return row
+    highlight = truth.highlight
+    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    row |= {
+        "distance_mm": highlight.distance,
+        "kd_min": highlight.kd_min,
+        "kd_max": highlight.kd_max,
+        "eps_over_d": float(np.linalg.norm(light)) / highlight.distance,
+        "peak_snr": truth.peak_snr if np.isfinite(truth.peak_snr) else None,
+        "axis_ratio_law": float(laws.axis_ratio(highlight.kd_min, highlight.kd_max)),
+        "bp_true_x_px": float(highlight.bp_px[0]),
+        "bp_true_y_px": float(highlight.bp_px[1]),
+    }
+    return row | dict(zip(("truth_x", "truth_y", "truth_z"), highlight.normal.tolist(), strict=True))
+
+
+def _result(
+    context: RowContext, specularity: Specularity, result: Estimate | Failure, truth: JudgedHighlight | None
+) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    if not isinstance(specularity.patch, Failure):
+        row["bp_x_px"], row["bp_y_px"] = (float(v) for v in specularity.patch.peak_px)
+    if isinstance(result, Failure):
+        return row | {"status": str(result.reason), "flags": result.detail}
+    isovalues = [isophote.isovalue for isophote in result.isophotes]
+    row |= {
+        "status": "ok",
+        "flags": ",".join(result.flags),
+        "n_candidates": len(result.candidates),
+        "choice_margin": result.choice_margin,
+        "look_x_px": float(result.look_px[0]),
+        "look_y_px": float(result.look_px[1]),
+        "isovalue": isovalues[0] if len(isovalues) == 1 else None,
+        "isovalues": ",".join(f"{t:g}" for t in isovalues) or None,
+        "axis_ratio": result.axis_ratio,
+    }
+    row |= dict(zip(("normal_x", "normal_y", "normal_z"), result.normal.tolist(), strict=True))
+    if result.covariance is not None:
+        row |= {"cov_11": result.covariance[0, 0], "cov_12": result.covariance[0, 1], "cov_22": result.covariance[1, 1]}
+    return row if truth is None else row | _errors(context, result, truth)
+
+
+def _errors(context: RowContext, estimate: Estimate, truth: JudgedHighlight) -> dict[str, Any]:
+    to_truth = angle_deg(estimate.candidates, truth.highlight.normal)
+    look = context.session.cast(estimate.look_px[None])[0] if np.isfinite(estimate.look_px).all() else None
+    seen = look is not None and bool(look.valid[0])
+    return {
+        "error_deg": float(angle_deg(estimate.normal, truth.highlight.normal)),
+        "error_oracle_deg": float(to_truth.min()),
+        "error_look_deg": float(angle_deg(estimate.normal, look.normal[0])) if seen and look is not None else None,
+        "error_law_deg": law_deg(context.scene, estimate, truth),
+        "rank_correct": int(to_truth.argmin()),
+    }
+
+
+def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
+    """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
+
+    With a light at the camera: circle pose (two candidates) on a curved surface. With an offset light: half the
+    angle between light and camera for estimators of one candidate.
+    """
+    highlight = truth.highlight
+    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    offset = float(np.linalg.norm(light)) > 0
+    if len(estimate.candidates) == 1:
+        return float(np.degrees(laws.bisector_angle(highlight.position, light))) if offset else None
+    if offset or len(estimate.isophotes) != 1:
+        return None
+    a, b = laws.isophote_half_axes(
+        estimate.isophotes[0].isovalue, lobe_curvature(scene), highlight.kd_min, highlight.kd_max
+    )
+    error = float(np.degrees(laws.circle_pose_error(a, b)))
+    return error if np.isfinite(error) else None
+
+
+def lobe_curvature(scene: Scene) -> float:
+    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form.
+
+    4 n for Phong as published, one more with the cosine of the normalised form.
+    """
+    reflectance = scene.reflectance
+    if isinstance(reflectance, PhongReflectance):
+        return 4 * reflectance.exponent + (1.0 if reflectance.normalised else 0.0)
+    return 1e6
+
+
+def table(made: list[dict[str, Any]], swept: dict[str, Any]) -> pl.DataFrame:
+    """Make the table of results from rows; `swept` gives an example value for each swept parameter's column."""
+    extra = {name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}
+    schema = {**SCHEMA, **extra}
+    return pl.DataFrame([{name: row.get(name) for name in schema} for row in made], schema=schema)
+
+
+def _dtype(value: Any) -> pl.DataType:
+    if isinstance(value, bool):
+        return pl.Boolean()
+    return pl.Float64() if isinstance(value, int | float) else pl.String()

@@ -1,0 +1,218 @@
+"""Runs an experiment: case by case, each kept as soon as it is done, so that a stopped run goes on."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from simtest import provenance
+from simtest.errors import InputError
+from simtest.estimators import Estimator, load_estimators
+from simtest.files import write_atomically, write_json
+from simtest.render import Session, backend
+from simtest.spec import Experiment, Scene
+from simtest.spec.scene import AnatomySurface
+from simtest.validation import gallery
+from simtest.validation.cases import Case, expand, swept_example
+from simtest.validation.metrics import table
+from simtest.validation.realise import View, realise, view
+from simtest.validation.statistics import summarise
+
+GALLERY_ITEMS = 24
+PARTS = "parts"
+
+Progress = Callable[[int, int, str], None]
+"""Called with realisations done, realisations in all, and the name of the setting."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds results.parquet, summary.json and gallery/.
+    results : polars.DataFrame
+        All rows.
+    summary : dict
+        As in summary.json.
+    resumed : int
+        Cases that an earlier, interrupted run had finished.
+    """
+
+    folder: Path
+    results: pl.DataFrame
+    summary: dict[str, Any]
+    resumed: int
+
+
+def run_experiment(
+    experiment: Experiment, folder: Path, command: str = "", variant: str | None = None, progress: Progress | None = None
+) -> Run:
+    """Run an experiment, or go on with an interrupted run of the same.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What to run.
+    folder : Path
+        Made if need be. A folder that holds something else than a run is refused.
+    command : str
+        How the run was called, for the report.
+    variant : str, optional
+        Mitsuba variant.
+    progress : callable, optional
+        See `Progress`.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    InputError
+        If the experiment does not fit the schema, an estimator is unknown or the folder holds something else.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    started, clock = datetime.now(UTC), time.monotonic()
+    cases = expand(experiment)
+    estimators = load_estimators(experiment.estimators)
+    parts = _prepare(folder, experiment, cases, backend.requested_variant(variant))
+    work = _Work(experiment, cases, estimators, folder, command, variant)
+    resumed = work.run(parts, progress)
+    results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
+    summary = {
+        "run": {
+            **provenance.environment(),
+            "variant": backend.requested_variant(variant),
+            "llvm": backend.library_in_use(),
+            "seed": experiment.seed,
+            "realisations": experiment.realisations,
+            "started": started.isoformat(timespec="seconds"),
+            "duration_s": round(time.monotonic() - clock, 1),
+            "command": command,
+            "inputs": _inputs(cases),
+        },
+        "experiments": {
+            experiment.name: {
+                "title": experiment.title or experiment.name,
+                "description": experiment.description,
+                "settings": summarise(results),
+            }
+        },
+    }
+    write_atomically(folder / "results.parquet", results.write_parquet)
+    write_json(folder / "summary.json", summary)
+    _remove(parts)
+    _remove(folder / "figures")
+    return Run(folder, results, summary, resumed)
+
+
+@dataclass
+class _Work:
+    experiment: Experiment
+    cases: list[Case]
+    estimators: dict[str, Estimator]
+    folder: Path
+    command: str
+    variant: str | None
+    session: Session | None = None
+
+    def run(self, parts: Path, progress: Progress | None) -> int:
+        """Run the cases that are not done yet; gives how many were."""
+        total, done, resumed = sum(case.realisations for case in self.cases), 0, 0
+        shown = set(np.linspace(0, len(self.cases) - 1, min(GALLERY_ITEMS, len(self.cases))).round().astype(int).tolist())
+        swept = swept_example(self.cases)
+        for index, case in enumerate(self.cases):
+            if _part_file(parts, index).exists():
+                resumed += 1
+                done += case.realisations
+                continue
+            rows: list[dict[str, Any]] = []
+            seen: View | None = None
+            for number in case.numbers():
+                if progress:
+                    progress(done, total, case.setting)
+                scene, drawn = case.scene(self.experiment, number)
+                if seen is None or scene != seen.scene:
+                    seen = self._view(scene)
+                assert self.session is not None
+                made = realise(self.session, self.experiment, case, number, seen, drawn, self.estimators)
+                rows += made.rows
+                if index in shown and number == case.numbers()[0]:
+                    item = self.folder / "gallery" / f"{index:04d}.npz"
+                    gallery.save(item, self.session, case, seen, made, case.command)
+                done += 1
+            write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
+        if progress:
+            progress(total, total, "done")
+        return resumed
+
+    def _view(self, scene: Scene) -> View:
+        if self.session is None:
+            self.session = Session(scene, self.variant)
+        return view(self.session, scene)
+
+
+def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: str) -> Path:
+    """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
+    mine = {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS}
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file; must be a folder")
+    strangers = [p.name for p in folder.iterdir() if p.name not in mine] if folder.is_dir() else []
+    if strangers:
+        raise InputError(f"--out {folder}: holds {strangers[0]}, which is no part of a run; must be empty or hold a run")
+    parts = folder / PARTS
+    fingerprint = {
+        "experiment": experiment.model_dump(mode="json"),
+        "scenes": [case.data for case in cases],
+        "inputs": _inputs(cases),
+        "versions": provenance.versions(),
+        "source": provenance.source_hash(),
+        "variant": variant,
+    }
+    digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
+    record = parts / "fingerprint.json"
+    if not (record.is_file() and json.loads(record.read_text() or "null") == digest):
+        # Results of an earlier run stay until the new ones replace them.
+        _remove(parts)
+        _remove(folder / "gallery")
+    try:
+        parts.mkdir(parents=True, exist_ok=True)
+        (folder / "gallery").mkdir(exist_ok=True)
+        write_json(record, digest)
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from error
+    return parts
+
+
+def _part_file(parts: Path, index: int) -> Path:
+    return parts / f"case-{index:05d}.parquet"
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of plain files that a run has made."""
+    if folder.is_dir():
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+
+
+def _inputs(cases: list[Case]) -> dict[str, str]:
+    """Give the hashes of the files that the cases were read from."""
+    files = {Path(case.where) for case in cases}
+    for case in cases:
+        surface = case.data["surface"]
+        if surface.get("type") == "anatomy":
+            path = AnatomySurface.model_validate(surface).file()
+            files.add(path)
+    return {str(file): provenance.file_hash(file) for file in sorted(files) if file.is_file()}

@@ -1,0 +1,202 @@
+"""The generated colon: derivatives against finite differences, Newton points, mesh, recipe."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simtest.anatomy.base import RayHits
+from simtest.anatomy.colon import Colon, build
+from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, load_recipe
+from simtest.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+LOBE = "[[lobes]]\ncentre_mm = [0, 0, 0]\nsemi_axes_mm = [50, 40, %d]"
+STEP = 2e-3  # of the finite differences: truncation ~ h^4, rounding ~ eps / h^2
+
+
+@pytest.fixture(scope="module")
+def recipe() -> ColonRecipe:
+    recipe = load_recipe(ROOT / "meshes" / "colon.toml")
+    assert isinstance(recipe, ColonRecipe)
+    return recipe
+
+
+def chosen_hits(recipe, count=4000, seed=0):
+    """Rays from the camera through random points of random faces, as a ray tracer would report them."""
+    mesh = build(recipe).mesh
+    rng = np.random.default_rng(seed)
+    face, (b, c) = rng.integers(len(mesh.faces), size=count), np.sort(rng.random((2, count)), axis=0)
+    b, c = b, c - b
+    points = np.einsum("cn,nci->ni", np.stack([1 - b - c, b, c]), mesh.vertices[mesh.faces[face]])
+    facing = mesh.normals[mesh.faces[face, 0]]
+    origins = points + 4.0 * facing + rng.normal(size=(count, 3)) * 0.8
+    directions = points - origins
+    distance = np.linalg.norm(directions, axis=1)
+    return origins, directions / distance[:, None], RayHits(distance, face, np.stack([b, c], axis=1)), facing
+
+
+def parameters(tube, points):
+    """(u, v) of surface points, found apart from the Newton solution under test."""
+    u, v, radial = tube.slice_of(points)
+    return u, v, radial - tube.radius(u, v).f
+
+
+def central(f, h):
+    """First and second derivatives of 4th order of f: R -> (N, ...) at 0."""
+    m2, m1, z, p1, p2 = (f(k * h) for k in (-2, -1, 0, 1, 2))
+    return (m2 - 8 * m1 + 8 * p1 - p2) / (12 * h), (-m2 + 16 * m1 - 30 * z + 16 * p1 - p2) / (12 * h * h)
+
+
+def test_partial_derivatives_match_finite_differences(recipe):
+    tube = build(recipe).tube
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(0, recipe.length_mm, 3000), rng.uniform(-4, 8, 3000)
+    jet = tube.jet(u, v)
+    h_v = STEP / 20
+    du, duu = central(lambda h: tube.jet(u + h, v).f, STEP)
+    dv, dvv = central(lambda h: tube.jet(u, v + h).f, h_v)
+    duv, _ = central(lambda h: tube.jet(u, v + h).u, h_v)
+    np.testing.assert_allclose(jet.u, du, atol=2e-9)
+    np.testing.assert_allclose(jet.v, dv, atol=1e-7)
+    np.testing.assert_allclose(jet.uu, duu, atol=2e-6)
+    np.testing.assert_allclose(jet.uv, duv, atol=1e-7)
+    np.testing.assert_allclose(jet.vv, dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
+
+
+def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
+    """The normal from differenced positions; S from differenced normals, along the reported directions."""
+    colon, tube = Colon(recipe, 0), build(recipe).tube
+    origins, directions, hits, _ = chosen_hits(recipe, 2000)
+    points = colon.points(origins, directions, hits)
+    ok = points.valid
+    u, v, off = parameters(tube, points.position[ok])
+    assert np.abs(off).max() < 1e-9
+
+    def normal(u, v):
+        pu, _ = central(lambda h: tube.jet(u + h, v).f, STEP)
+        pv, _ = central(lambda h: tube.jet(u, v + h).f, STEP / 20)
+        n = np.cross(pu, pv)
+        return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+    difference = np.linalg.norm(np.cross(normal(u, v), points.normal[ok]), axis=1)
+    assert difference.max() < 1e-6
+    nu, _ = central(lambda h: normal(u + h, v), 0.02)
+    nv, _ = central(lambda h: normal(u, v + h), 0.001)
+    jet = tube.jet(u, v)
+    J, dN = np.stack([jet.u, jet.v], axis=2), np.stack([nu, nv], axis=2)
+    S = dN @ np.linalg.pinv(J)
+    S = (S + S.transpose(0, 2, 1)) / 2
+    for k, d in ((points.k_min, points.direction_min), (points.k_max, points.direction_max)):
+        measured = np.einsum("ni,nij,nj->n", d[ok], S, d[ok])
+        assert (np.abs(measured - k[ok]) <= 1e-4 * np.maximum(np.abs(k[ok]), 1 / 30)).all()
+    mixed = np.einsum("ni,nij,nj->n", points.direction_min[ok], S, points.direction_max[ok])
+    assert np.abs(mixed).max() < 3e-6
+
+
+def test_newton_points_lie_on_ray_and_surface(recipe):
+    origins, directions, hits, facing = chosen_hits(recipe)
+    points = Colon(recipe, 0).points(origins, directions, hits)
+    assert points.valid.mean() > 0.999
+    ok = points.valid
+    _, _, off = parameters(build(recipe).tube, points.position[ok])
+    assert np.abs(off).max() < 1e-9
+    np.testing.assert_allclose(
+        points.position[ok], origins[ok] + points.distance[ok, None] * directions[ok], atol=1e-12
+    )
+    assert np.abs(points.distance - hits.distance)[ok].max() < 0.1
+    assert (np.einsum("ni,ni->n", points.normal, directions)[ok] < 0).all()
+    assert (np.einsum("ni,ni->n", points.normal, facing)[ok] > 0.9).all()
+
+
+def test_points_at_the_seam_and_misses(recipe):
+    built = build(recipe)
+    seam = np.flatnonzero(built.corners[:, :, 1].max(axis=1) > 2 * np.pi - 1e-9)[:50]
+    centre = built.mesh.vertices[built.mesh.faces[seam]].mean(axis=1)
+    normal = built.mesh.normals[built.mesh.faces[seam, 0]]
+    distance = np.full(len(seam), 3.0)
+    distance[0] = np.inf
+    third = np.full((len(seam), 2), 1 / 3)
+    points = Colon(recipe, 0).points(centre + 3 * normal, -normal, RayHits(distance, seam, third))
+    assert not points.valid[0]
+    assert np.isnan(points.position[0]).all()
+    assert points.valid[1:].all()
+    assert np.abs(points.distance[1:] - 3).max() < 0.02
+
+
+def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
+    shape = Colon(recipe, 0).shape()
+    mesh = shape.mesh
+    assert shape.kind == "mesh"
+    assert 190_000 < len(mesh.faces) < 210_000
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    uses = np.unique(edges, axis=0, return_counts=True)[1]
+    assert set(uses) == {1, 2}
+    ends = np.unique(np.unique(edges, axis=0)[uses == 1])
+    u, _, _ = build(recipe).tube.slice_of(mesh.vertices[ends])
+    assert len(ends) == (uses == 1).sum()
+    np.testing.assert_allclose(np.minimum(np.abs(u), np.abs(u - recipe.length_mm)), 0, atol=1e-9)
+    corners = mesh.vertices[mesh.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ni,ni->n", cross, mesh.normals[mesh.faces[:, 0]]) > 0).all()
+    u, _, _ = build(recipe).tube.slice_of(mesh.vertices[::97])
+    inward = build(recipe).tube.centreline(u) - mesh.vertices[::97]
+    # Along the flank of a fold the normal may lean, but on the whole it points to the centreline.
+    assert np.median(np.einsum("ni,ni->n", inward, mesh.normals[::97]) / np.linalg.norm(inward, axis=1)) > 0.9
+
+
+def test_folds_are_convex_and_walls_concave_towards_the_camera(recipe):
+    origins, directions, hits, _ = chosen_hits(recipe)
+    points = Colon(recipe, 0).points(origins, directions, hits)
+    assert np.nanmedian(points.k_min) < -1 / 40
+    assert 1 / 5 < np.nanmax(points.k_max) < 1 / 2  # fold edges of 2 to 5 mm
+
+
+def test_centreline_has_unit_speed_and_is_exact(recipe):
+    tube = build(recipe).tube
+    u = np.linspace(0, recipe.length_mm, 501)
+    fine = np.linspace(0, recipe.length_mm, 200_001)
+    psi = tube.heading(fine)[0]
+    h = fine[1] - fine[0]
+    simpson = h / 3 * (np.cos(psi[:-2:2]) + 4 * np.cos(psi[1:-1:2]) + np.cos(psi[2::2])).sum()
+    assert tube.centreline(u)[-1, 2] == pytest.approx(simpson, abs=1e-11)
+    speed, _ = central(lambda s: tube.centreline(u + s), 1e-2)
+    np.testing.assert_allclose(np.linalg.norm(speed, axis=1), 1, atol=1e-11)
+
+
+def test_key_and_mesh_follow_the_recipe_alone(recipe):
+    a, b = Colon(recipe, 0).shape(), Colon(recipe, 5).shape()
+    other = Colon(recipe.model_copy(update={"seed": 7}), 0).shape()
+    assert a.key == b.key != other.key
+    assert a.mesh is b.mesh
+    assert not np.array_equal(a.mesh.vertices, other.mesh.vertices)
+
+
+@pytest.mark.parametrize("update", [{"bend_deg": 180.0, "length_mm": 40.0}, {"fold_spacing_mm": 5.0}])
+def test_impossible_tubes_are_refused(recipe, update):
+    with pytest.raises(InputError, match="colon recipe"):
+        Colon(recipe.model_copy(update=update), 0)
+
+
+def test_recipes_load_and_refuse_what_is_malformed(tmp_path):
+    assert isinstance(load_recipe(ROOT / "meshes" / "liver.toml"), LiverRecipe)
+    for text, message in (
+        ("radius_mm = 20", "type: missing"),
+        ('type = "lung"', "allowed: colon, liver"),
+        ("type = [1]", "allowed: colon, liver"),
+        ('type = "colon"\nradius = 3', "unknown key"),
+        ('type = "colon"\nradius_mm = nan', "radius_mm"),
+        ('type = "colon"\nfold_depth_mm = 25.0', "lumen"),
+        ('type = "liver"', "lobes"),
+        ('type = "liver"\nvisceral_normal = [0, 0, 0]\n' + LOBE % 30, "visceral_normal"),
+        ('type = "liver"\n' + LOBE % 1, "semi_axes_mm"),
+        ("type = ", "TOML"),
+    ):
+        path = tmp_path / "recipe.toml"
+        path.write_text(text)
+        with pytest.raises(InputError, match=message) as error:
+            load_recipe(path)
+        assert "\n" not in str(error.value)
+        assert "recipe.toml" in str(error.value)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_recipe(tmp_path / "none.toml")

@@ -1,0 +1,431 @@
+"""The report of a run, on small synthetic run directories."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.report import write_report
+from simtest.report.gallery import conic_points
+from simtest.report.run import read_run
+from simtest.report.series import law_misses, line_figures
+from simtest.report.static import heat_range
+from simtest.report.style import Axis, colours, number
+from simtest.report.surface3d import surface_3d
+from simtest.report.tables import heat_maps
+from simtest.validation import laws
+
+ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+REASONS = ("no_peak", "no_closed_isophote", "not_an_ellipse")
+DISTANCE = 10.0
+EVIL = '<script>alert("x")</script>&<img src=https://evil.example/x>'
+
+
+def rows_of_setting(rng, label, setting, kd, eps, realisations, estimators=ESTIMATORS, n_true=1, **more):
+    """Rows as the runner writes them: curvature k d = kd in one direction, light offset over distance eps."""
+    rows = []
+    for realisation in range(realisations):
+        for true_id in range(n_true):
+            k = kd if n_true == 1 else float(rng.uniform(-0.6, 4))
+            low, high = min(k, 0.0), max(k, 0.0)
+            a, b = laws.isophote_half_axes(0.5, 200, low, high)
+            pose = float(np.degrees(laws.circle_pose_error(a, b)))
+            half = float(np.degrees(laws.offset_error(eps)))
+            law = {"circle_pose": pose if eps == 0 else None, "brightest_point": half, "cone_axis": half}
+            noise = {"circle_pose": 5.0 / (1 + pose), "brightest_point": 0.3, "cone_axis": 0.009}
+            for name in estimators:
+                truth = max(pose, half) if name == "circle_pose" else half
+                error = float(np.hypot(truth, noise.get(name, 0.1) * abs(rng.normal(1, 0.4))))
+                status = "ok" if rng.random() > 0.04 else str(rng.choice([*REASONS, "missed"]))
+                ratio = float(laws.axis_ratio(low, high)) * rng.normal(1, 0.01)
+                rows.append(
+                    {
+                        "experiment": "", "surface": label.split()[0], "label": label, "setting": setting,
+                        "realisation": realisation, "specularity": true_id, "true_id": true_id, "estimator": name,
+                        "status": status, "error_deg": error if status == "ok" else None,
+                        "error_oracle_deg": error if status == "ok" else None, "error_law_deg": law.get(name),
+                        "kd_min": low, "kd_max": high, "eps_over_d": eps, "isovalue": 0.5,
+                        "axis_ratio": ratio if name == "circle_pose" and status == "ok" else None,
+                        "axis_ratio_law": float(laws.axis_ratio(low, high)) if name == "circle_pose" else None, **more,
+                    }
+                )  # fmt: skip
+            if n_true > 1 and rng.random() < 0.2:
+                rows.append(rows[-1] | {"true_id": None, "error_deg": None, "error_oracle_deg": None, "kd_min": None,
+                                        "kd_max": None, "error_law_deg": None, "status": "ok"})  # fmt: skip
+    return rows
+
+
+def make_rows(kind, realisations=4, estimators=ESTIMATORS, seed=0):
+    rng = np.random.default_rng(seed)
+    rows = []
+    if kind in ("overview", "curvature"):
+        for label, sign, radii in (("cylinder outside", 1, (1000, 100, 10, 5)), ("cylinder inside", -1, (100, 30, 15))):
+            for radius in radii:
+                rows += rows_of_setting(rng, label, f"{label} R = {radius} mm", sign * DISTANCE / radius, 0.0, realisations,
+                                        estimators, **{"surface.radius_mm": float(radius)})  # fmt: skip
+    if kind in ("overview", "light_offset"):
+        for eps in (0.0, 0.01, 0.05, 0.1, 0.2):
+            rows += rows_of_setting(rng, "plane offset", f"offset {eps}", 0.0, eps, realisations, estimators,
+                                    **{"rig.lights.0.offset_mm": eps * DISTANCE})  # fmt: skip
+    if kind == "grid":
+        for radius in (100, 20, 10):
+            for eps in (0.0, 0.05, 0.2):
+                rows += rows_of_setting(rng, "sphere", f"R = {radius}, offset {eps}", DISTANCE / radius, eps, realisations,
+                                        estimators)  # fmt: skip
+    if kind == "anatomy":
+        for surface in ("colon", "liver"):
+            for view in range(2):
+                rows += rows_of_setting(rng, surface, f"view {view}", 0.0, 0.0, realisations, estimators, n_true=5)
+    if kind == "noise":
+        for sigma in (0.0, 0.02, 0.05):
+            rows += rows_of_setting(rng, "plane", f"noise {sigma}", 0.0, 0.0, realisations, estimators,
+                                    **{"sensor.noise_sigma": sigma})  # fmt: skip
+    return [row | {"experiment": kind} for row in rows]
+
+
+def summarise(rows):
+    settings = {}
+    for row in rows:
+        entry = settings.setdefault(row["setting"], {}).setdefault(row["estimator"], {"rows": []})
+        entry["rows"].append(row)
+    for by_estimator in settings.values():
+        for name, entry in by_estimator.items():
+            errors = [r["error_deg"] for r in entry["rows"] if r["error_deg"] is not None]
+            failed = [r["status"] for r in entry["rows"] if r["status"] in REASONS]
+            mean = float(np.mean(errors)) if errors else None
+            by_estimator[name] = {
+                "n": len(entry["rows"]), "n_ok": len(errors), "n_failed_by_reason": {s: failed.count(s) for s in set(failed)},
+                "n_missed": sum(r["status"] == "missed" for r in entry["rows"]),
+                "n_false": sum(r["true_id"] is None for r in entry["rows"]), "mean_deg": mean, "mean_oracle_deg": mean,
+                "rms_deg": mean, "std_deg": None, "median_deg": mean, "p95_deg": mean, "max_deg": mean,
+                "mean_penalised_deg": mean, "ci95_deg": [mean, mean] if errors else None, "coverage95": None,
+            }  # fmt: skip
+    return settings
+
+
+def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose", detail=8):
+    """One cylinder seen from outside, with a true highlight and two estimates."""
+    width, height = size
+    camera = Camera.from_fov(60, width, height)
+    rays = camera.unproject(camera.pixel_centres())
+    normal0 = np.array([np.sin(tilt), 0, -np.cos(tilt)])
+    centre = np.array([0, 0, DISTANCE]) - radius * normal0
+    centre[0] += 2.0
+    a = rays[..., 0] ** 2 + rays[..., 2] ** 2
+    b = rays[..., 0] * centre[0] + rays[..., 2] * centre[2]
+    with np.errstate(invalid="ignore"):
+        distance = (b - np.sqrt(b**2 - a * (centre[0] ** 2 + centre[2] ** 2 - radius**2))) / a
+    position = rays * distance[..., None]
+    normal = (position - centre * [1, 0, 1]) * [1, 0, 1] / radius
+    frame = np.clip(-np.sum(normal * rays, axis=-1), 0, 1) ** 200
+    frame = np.nan_to_num(frame) + np.random.default_rng(0).normal(0, 0.02, frame.shape)
+    s = np.array([centre[0], 0, centre[2]]) / np.hypot(centre[0], centre[2])
+    spot, point = camera.project(s), s * (np.hypot(centre[0], centre[2]) - radius)
+    axes = np.array([0.03, 0.06]) * camera.fx
+    angle = np.linspace(0, 2 * np.pi, 40)
+    contours = [
+        {"t": t, "points": (spot + np.stack([np.cos(angle), np.sin(angle)], 1) * axes * np.sqrt(-np.log(t) / 0.7)).tolist()}
+        for t in (0.3, 0.5, 0.7)
+    ]
+    A = np.diag(1 / axes**2)
+    conic = np.block([[A, -(A @ spot)[:, None]], [-(A @ spot)[None], np.array([[spot @ A @ spot - 1]])]]).tolist()
+    turned = [(np.array([[np.cos(u), 0, np.sin(u)], [0, 1, 0], [-np.sin(u), 0, np.cos(u)]]) @ -s).tolist() for u in (-1, 1)]
+    common = {"specularity": 0, "true_id": 0, "status": "ok", "look_px": spot.tolist(), "bp_px": (spot + 0.7).tolist()}
+    estimates = [
+        common | {"estimator": estimator, "error_deg": 57.3, "normal": turned[0], "candidates": turned,
+                  "isophotes": contours[1:2], "ellipses": [conic]},
+        common | {"estimator": "cone_axis", "error_deg": 0.01, "normal": (-s).tolist(), "candidates": [(-s).tolist()],
+                  "isophotes": contours, "ellipses": []},
+        common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak", "error_deg": None,
+                  "normal": None, "candidates": [], "look_px": None, "isophotes": [], "ellipses": []},
+    ]  # fmt: skip
+    meta = {
+        "surface": "cylinder", "setting": f"R = {radius:g} mm", "label": "cylinder outside", "sigma": 0.02,
+        "command": "simtest render cylinder --set surface.radius_mm=10 --out DIR",
+        "camera": {"width": width, "height": height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+                   "skew": 0.0},
+        "truth": [{"id": 0, "bp_px": spot.tolist(), "normal": (-s).tolist(), "position": point.tolist(), "kd_min": 0.0,
+                   "kd_max": float(np.linalg.norm(point) / radius), "isolated": True}],
+        "estimates": estimates,
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    step = max(1, width // detail)
+    np.savez(path, frame=frame.astype(np.float32), position=position[::step, ::step].astype(np.float32),
+             normal=normal[::step, ::step].astype(np.float32), meta=json.dumps(meta))  # fmt: skip
+
+
+PROVENANCE = {
+    "commit": "0123abc", "version": "0.1.0", "versions": {"numpy": "2.4.6"}, "variant": None, "llvm": "23.1",
+    "processor": "test", "python": "3.11", "seed": 0, "started": "2026-01-01T00:00:00Z", "duration_s": 12.5,
+    "command": ["simtest", "validate", "overview"], "inputs": {"scenes/overview.toml": "ab" * 32},
+}  # fmt: skip
+
+
+def make_run(path, kind="overview", rows=None, items=1, **more):
+    rows = make_rows(kind, **more) if rows is None else rows
+    path.mkdir(parents=True, exist_ok=True)
+    pl.DataFrame(rows, infer_schema_length=None).write_parquet(path / "results.parquet")
+    content = {"title": f"Title of {kind}", "description": "What it does.", "settings": summarise(rows)}
+    (path / "summary.json").write_text(json.dumps({"run": PROVENANCE, "experiments": {kind: content}}))
+    for i in range(items):
+        make_item(path / "gallery" / f"item_{i:02d}.npz", radius=(10.0, 4.0, 30.0)[i % 3])
+    return path
+
+
+class Page(HTMLParser):
+    """The page's elements, with scripts and data apart."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.text, self._stack = [], [], []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._stack.append(tag)
+
+    def handle_endtag(self, tag):
+        self._stack.append(f"/{tag}")
+
+    def handle_data(self, data):
+        if self._stack[-1:] not in (["script"], ["style"]):
+            self.text.append(data)
+
+    def ids(self):
+        return {attrs["id"] for _, attrs in self.tags if "id" in attrs}
+
+
+def read_page(path):
+    html = path.read_text(encoding="utf-8")
+    page = Page(html)
+    assert len(html) < 8_000_000
+    for _, attrs in page.tags:
+        for key in ("src", "href"):
+            value = attrs.get(key) or "#"
+            assert value.startswith(("#", "data:", "figures/")), value
+    assert html.count("plotly.js v") <= 1
+    assert all(attrs.get("alt") for tag, attrs in page.tags if tag == "img")
+    assert not re.search(r"@import|url\(", html[: html.index("</style>")])
+    return page
+
+
+def png_size(path):
+    with path.open("rb") as file:
+        head = file.read(24)
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    return int.from_bytes(head[16:20]), int.from_bytes(head[20:24])
+
+
+@pytest.fixture(scope="module")
+def overview(tmp_path_factory):
+    path = make_run(tmp_path_factory.mktemp("overview"), items=2)
+    return path, write_report(path)
+
+
+def test_overview_page_has_its_sections(overview):
+    path, index = overview
+    assert index == path / "index.html"
+    page = read_page(index)
+    wanted = {"error_vs_curvature", "axis_ratio", "error_vs_offset", "gallery", "surface3d", "summary", "provenance"}
+    assert wanted <= page.ids()
+    assert not {"heatmap", "surfaces"} & page.ids()
+    text = " ".join(page.text)
+    for part in ("Title of overview", "circle_pose by", "gave no normal", "0123abc", "ab" * 32, "simtest render cylinder"):
+        assert part in text, part
+    assert {"viewport"} <= {attrs.get("name") for tag, attrs in page.tags if tag == "meta"}
+
+
+def test_overview_figures_are_written(overview):
+    path, _ = overview
+    names = {file.name for file in (path / "figures").iterdir()}
+    expected = {"error_vs_curvature.png", "axis_ratio.png", "error_vs_offset.png", "surface3d.png", "gallery_000.png"}
+    assert expected | {"gallery_001.png"} == names
+    for name in names:
+        width, height = png_size(path / "figures" / name)
+        assert 500 <= width <= 2500, name
+        assert 400 <= height <= 2500, name
+
+
+def test_overview_charts_are_data_of_both_kinds(overview):
+    html = overview[1].read_text(encoding="utf-8")
+    charts = dict(re.findall(r'<script type="application/json" id="data-(\w+)">(.*?)</script>', html, re.S))
+    assert set(charts) == {"error_vs_curvature", "axis_ratio", "error_vs_offset", "surface3d"}
+    kinds = {trace["type"] for text in charts.values() for trace in json.loads(text)["data"]}
+    assert kinds == {"scatter", "mesh3d", "scatter3d"}
+
+
+def test_series_follow_the_rows_and_the_laws(tmp_path):
+    run = read_run(make_run(tmp_path, "overview", items=0, realisations=6))
+    figures = {figure.key: figure for figure in line_figures(run)}
+    curves = {(c.estimator, c.label): c for c in figures["error_vs_curvature"].curves}
+    assert {label for _, label in curves} == {"cylinder outside", "cylinder inside"}
+    pose = curves["circle_pose", "cylinder outside"]
+    np.testing.assert_allclose(pose.x, [0.01, 0.1, 1, 2])
+    rows = run.results.filter(
+        (pl.col("estimator") == "circle_pose") & (pl.col("status") == "ok")
+        & (pl.col("setting") == "cylinder outside R = 10 mm")
+    )  # fmt: skip
+    assert pose.y[2] == pytest.approx(rows["error_oracle_deg"].mean())
+    assert (pose.low[2] < pose.y[2]) & (pose.y[2] < pose.high[2])
+    at_one = np.interp(1.0, pose.law_x, pose.law_y)
+    assert at_one == pytest.approx(np.degrees(laws.circle_pose_error(*laws.isophote_half_axes(0.5, 200, 0, 1))), abs=1e-6)
+    assert pose.law_x.size > 100
+    offset = {c.estimator: c for c in figures["error_vs_offset"].curves}
+    np.testing.assert_allclose(offset["cone_axis"].x, [0, 0.01, 0.05, 0.1, 0.2])
+    assert offset["circle_pose"].label == "plane offset"
+    met, total, gap, _ = law_misses(figures["error_vs_offset"])["cone_axis"]
+    assert (met, total) == (5, 5)
+    assert gap < 0.3
+    ratio = figures["axis_ratio"]
+    assert ratio.shared_law
+    assert {c.estimator for c in ratio.curves} == {"circle_pose"}
+
+
+def test_a_law_of_another_reflectance_is_drawn_from_the_rows(tmp_path):
+    rows = [r | {"error_law_deg": 33.0} for r in make_rows("curvature")]
+    figure = line_figures(read_run(make_run(tmp_path, "curvature", rows, items=0)))[0]
+    for curve in figure.curves:
+        np.testing.assert_allclose(curve.law_y, 33.0)
+        np.testing.assert_allclose(curve.law_x, curve.x)
+
+
+def test_grid_gives_heat_maps_and_slices(tmp_path):
+    path = make_run(tmp_path, "grid", items=0)
+    run = read_run(path)
+    maps = heat_maps(run)
+    assert [m.estimator for m in maps] == ["cone_axis", "circle_pose", "brightest_point"]
+    assert maps[0].mean_deg.shape == (3, 3)
+    assert maps[0].mean_deg[2] == pytest.approx(np.degrees(laws.offset_error(0.2)), abs=0.1)
+    curvature, _, offset = line_figures(run)
+    np.testing.assert_allclose(curvature.curves[0].x, [0.1, 0.5, 1])
+    np.testing.assert_allclose(offset.curves[0].x, [0, 0.05, 0.2])
+    page = read_page(write_report(path))
+    assert "heatmap" in page.ids()
+    assert png_size(path / "figures" / "heatmap.png")[0] > 1000
+    assert heat_range(maps)[0] > 0
+
+
+def test_anatomy_gives_surfaces_and_bins(tmp_path):
+    path = make_run(tmp_path, "anatomy", realisations=3)
+    run = read_run(path)
+    page = read_page(write_report(path))
+    assert {"surfaces", "error_vs_curvature"} <= page.ids()
+    assert png_size(path / "figures" / "anatomy.png")[0] > 800
+    figure = line_figures(run)[0]
+    assert not any(curve.joined for curve in figure.curves)
+    assert all(curve.x.size <= 12 for curve in figure.curves)
+    assert "false" in page.text
+
+
+def test_other_swept_parameters_get_a_figure(tmp_path):
+    path = make_run(tmp_path, "noise", items=0)
+    (figure,) = line_figures(read_run(path))
+    assert figure.key == "error_vs_sensor_noise_sigma"
+    np.testing.assert_allclose(figure.curves[0].x, [0, 0.02, 0.05])
+    assert figure.key in read_page(write_report(path)).ids()
+
+
+def test_no_ok_row_at_all(tmp_path):
+    rows = [r | {"status": "no_peak", "error_deg": None, "error_oracle_deg": None, "axis_ratio": None} for r in make_rows("overview")]
+    page = read_page(write_report(make_run(tmp_path, "overview", rows, items=0)))
+    assert "No row has a normal" in " ".join(page.text)
+    assert {"surfaces", "summary"} <= page.ids()
+    assert "gallery" not in page.ids()
+
+
+def test_a_single_setting(tmp_path):
+    rows = [r for r in make_rows("curvature") if r["setting"] == "cylinder outside R = 10 mm"]
+    page = read_page(write_report(make_run(tmp_path, "curvature", rows, items=0)))
+    assert "surfaces" in page.ids()
+    assert "error_vs_curvature" not in page.ids()
+
+
+@pytest.mark.parametrize("blank", [None, float("nan")])
+def test_null_and_nan_everywhere(tmp_path, blank):
+    keep = ("experiment", "setting", "estimator", "status")
+    rows = [{k: v if k in keep else blank for k, v in r.items()} for r in make_rows("curvature", realisations=1)]
+    page = read_page(write_report(make_run(tmp_path, "curvature", rows, items=0)))
+    assert "summary" in page.ids()
+
+
+def test_null_summary_and_empty_results(tmp_path):
+    make_run(tmp_path, "curvature", make_rows("curvature", realisations=1), items=0)
+    pl.read_parquet(tmp_path / "results.parquet").head(0).write_parquet(tmp_path / "results.parquet")
+    figures = {"cone_axis": dict.fromkeys(("n", "n_ok", "n_failed_by_reason", "mean_deg", "ci95_deg")), "other": None}
+    summary = {"run": None, "experiments": {"curvature": {"title": None, "settings": {"a": figures}}}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    page = read_page(write_report(tmp_path))
+    assert "nothing was measured" in " ".join(page.text)
+    assert "provenance" not in page.ids()
+
+
+def test_names_are_escaped(tmp_path):
+    rows = make_rows("overview", realisations=2, estimators=("cone_axis", EVIL))
+    rows = [r | {"experiment": EVIL, "setting": r["setting"] + EVIL, "label": r["label"] + EVIL} for r in rows]
+    path = make_run(tmp_path, EVIL, rows, items=0)
+    make_item(path / "gallery" / "a.npz", estimator=EVIL)
+    page = read_page(write_report(path))
+    assert EVIL in " ".join(page.text)
+    html = (path / "index.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in html
+    assert "<img src=https" not in html
+
+
+def test_missing_and_malformed_files_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"results\.parquet"):
+        write_report(tmp_path)
+    make_run(tmp_path, "curvature", items=0)
+    (tmp_path / "summary.json").write_text("{")
+    with pytest.raises(InputError, match=r"summary\.json"):
+        write_report(tmp_path)
+    make_run(tmp_path, "curvature", items=0)
+    (tmp_path / "gallery").mkdir()
+    (tmp_path / "gallery" / "bad.npz").write_bytes(b"no")
+    with pytest.raises(InputError, match=r"bad\.npz"):
+        write_report(tmp_path)
+
+
+def test_long_gallery_is_thinned(tmp_path):
+    make_run(tmp_path, "noise", items=26)
+    run = read_run(tmp_path)
+    assert (len(run.gallery), run.gallery_total) == (24, 26)
+    assert [run.gallery[0].name, run.gallery[-1].name] == ["item_00", "item_25"]
+
+
+def test_surface_without_truth_or_pixels(tmp_path):
+    make_item(tmp_path / "gallery" / "a.npz")
+    with np.load(tmp_path / "gallery" / "a.npz") as data:
+        content = dict(data)
+    meta = json.loads(str(content["meta"]))
+    meta["truth"], meta["estimates"] = [], [{"estimator": "x", "status": "ok", "bp_px": None, "isophotes": None}]
+    content |= {"meta": json.dumps(meta), "position": content["position"] * np.nan}
+    np.savez(tmp_path / "gallery" / "a.npz", **content)
+    make_run(tmp_path, "noise", items=0)
+    assert surface_3d(read_run(tmp_path)) is None
+    assert "surface3d" not in read_page(write_report(tmp_path)).ids()
+
+
+def test_conic_points():
+    circle = conic_points([[1, 0, -2], [0, 1, -3], [-2, -3, 4 + 9 - 25]])
+    np.testing.assert_allclose(np.hypot(circle[:, 0] - 2, circle[:, 1] - 3), 5)
+    assert conic_points([[1, 0, 0], [0, -1, 0], [0, 0, -1]]) is None
+    assert conic_points([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) is None
+    assert conic_points([[None] * 3] * 3) is None
+    assert conic_points("nothing") is None
+
+
+def test_style():
+    shades = colours(["new", "cone_axis", "circle_pose", "also new"])
+    assert len(set(shades.values())) == 4
+    assert shades["cone_axis"] == "#0072B2"
+    assert [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)] == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
+    axis = Axis("x", "stretched")
+    np.testing.assert_allclose(axis.unplace(axis.place([-0.5, 0, 3])), [-0.5, 0, 3], atol=1e-12)
+    places, texts = axis.ticks([-0.5, 2])
+    assert "0" in texts
+    assert len(places) == len(texts)
