@@ -97,7 +97,9 @@ class Session:
             f"light_{i}": {"type": "point", "intensity": {"type": "uniform", "value": 1.0}}
             for i in range(len(self.scene.rig.lights))
         }
-        scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights})
+        # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
+        # would share a parameter, and an update of one would change both.
+        scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
         diffuse = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True))
         return _Built(key, scene, self.mi.traverse(scene), diffuse, self.mi.traverse(diffuse))
 

@@ -245,8 +245,8 @@ def _legend(figure: "Figure", item: GalleryItem, colours: Mapping[str, str]) -> 
     levels = sorted({float(i["t"]) for e in item.estimates for i in e.get("isophotes") or [] if i.get("t") is not None})
     handles = [Line2D([], [], color=TRUTH, marker="+", lw=3, ms=9, mew=2, label="truth")]
     handles += [Line2D([], [], color=colours.get(n, NEUTRAL), marker="x", ls="--", label=_short(n)) for n in names]
-    shown = levels if len(levels) <= 2 else [levels[0], levels[-1]]
-    handles += [Line2D([], [], color=isophote_colour(t), lw=2, label=f"isophote t = {t:g}") for t in shown]
+    step = -(-len(levels) // 5) or 1
+    handles += [Line2D([], [], color=isophote_colour(t), lw=2, label=f"isophote t = {t:g}") for t in levels[::step]]
     figure.legend(handles=handles, loc="outside lower center", ncol=2, fontsize=7.5, frameon=False)
 
 

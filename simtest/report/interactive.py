@@ -180,8 +180,9 @@ def surface_3d(data: Surface3D, colours: Mapping[str, str]) -> go.Figure:
         )
     )  # fmt: skip
     scene = {
-        "aspectmode": "data", "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.5, "y": -1.1, "z": -1.6}},
-        **{f"{a}axis": {"title": {"text": f"{a} (mm)"}, "backgroundcolor": "rgba(0,0,0,0)"} for a in "xyz"},
+        "aspectmode": "data",
+        "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}},
+        **{f"{a}axis": {"title": {"text": f"{a} (mm)"}, "nticks": 5} for a in "xyz"},
     }  # fmt: skip
     figure.update_layout(_layout(560, scene=scene, dragmode="orbit"))
     figure.update_layout(margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"y": 0})

@@ -123,6 +123,7 @@ def draw_heat_maps(maps: Sequence[HeatMap], colours: Mapping[str, str]) -> "Figu
     import matplotlib
     import matplotlib.pyplot as plt
     from matplotlib.colors import LogNorm
+    from matplotlib.ticker import FuncFormatter, NullFormatter
 
     columns = min(3, len(maps))
     rows = -(-len(maps) // columns)
@@ -144,7 +145,9 @@ def draw_heat_maps(maps: Sequence[HeatMap], colours: Mapping[str, str]) -> "Figu
             ax.text(column, row, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
     for ax in list(axes.flat)[len(maps) :]:
         ax.set_visible(False)
-    figure.colorbar(picture, ax=axes, label="mean angular error (deg)", shrink=0.9)
+    bar = figure.colorbar(picture, ax=axes, label="mean angular error (deg)", shrink=0.9)
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    bar.ax.yaxis.set_minor_formatter(NullFormatter())
     return figure
 
 

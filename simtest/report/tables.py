@@ -176,11 +176,22 @@ def _box(hits: pl.Series, surface: str, estimator: str, place: float, width: flo
 
 
 SUMMARY_COLUMNS = (
-    ("n", "rows"), ("n_ok", "ok"), ("n_failed", "failed"), ("n_missed", "missed"), ("n_false", "false"),
-    ("mean_deg", "mean °"), ("mean_oracle_deg", "mean, better candidate °"), ("rms_deg", "RMS °"),
-    ("std_deg", "std °"), ("median_deg", "median °"), ("p95_deg", "95th pct °"), ("max_deg", "max °"),
-    ("mean_penalised_deg", "mean, failures as 90°"), ("ci95_deg", "95 % interval °"), ("coverage95", "coverage 95 %"),
-)  # fmt: skip
+    ("n", "rows"),
+    ("n_ok", "ok"),
+    ("n_failed", "failed"),
+    ("n_missed", "missed"),
+    ("n_false", "false"),
+    ("mean_deg", "mean\u00a0°"),
+    ("mean_oracle_deg", "mean, better candidate\u00a0°"),
+    ("rms_deg", "RMS\u00a0°"),
+    ("std_deg", "std\u00a0°"),
+    ("median_deg", "median\u00a0°"),
+    ("p95_deg", "95th pct\u00a0°"),
+    ("max_deg", "max\u00a0°"),
+    ("mean_penalised_deg", "mean, failures as\u00a090°"),
+    ("ci95_deg", "95\u00a0% interval\u00a0°"),
+    ("coverage95", "coverage 95\u00a0%"),
+)
 """Keys of summary.json and their headings."""
 
 

@@ -55,36 +55,37 @@ def rows_of_setting(rng, label, setting, kd, eps, realisations, estimators=ESTIM
                     }
                 )  # fmt: skip
             if n_true > 1 and rng.random() < 0.2:
-                rows.append(rows[-1] | {"true_id": None, "error_deg": None, "error_oracle_deg": None, "kd_min": None,
-                                        "kd_max": None, "error_law_deg": None, "status": "ok"})  # fmt: skip
+                blank = dict.fromkeys(("true_id", "error_deg", "error_oracle_deg", "kd_min", "kd_max", "error_law_deg"))
+                rows.append(rows[-1] | blank | {"status": "ok"})
     return rows
+
+
+def sweeps_of(kind):
+    """(label, setting, k d, eps/d, swept parameters) of an experiment."""
+    curved = [("cylinder outside", radius, DISTANCE / radius) for radius in (1000, 100, 10, 5)]
+    curved += [("cylinder inside", radius, -DISTANCE / radius) for radius in (100, 30, 15)]
+    curvature = [
+        (label, f"{label} R = {radius} mm", kd, 0.0, {"surface.radius_mm": float(radius)})
+        for label, radius, kd in curved
+    ]
+    offset = [
+        ("plane offset", f"offset {eps}", 0.0, eps, {"rig.lights.0.offset_mm": eps * DISTANCE})
+        for eps in (0.0, 0.01, 0.05, 0.1, 0.2)
+    ]
+    pairs = [(radius, eps) for radius in (100, 20, 10) for eps in (0.0, 0.05, 0.2)]
+    grid = [("sphere", f"R = {radius}, offset {eps}", DISTANCE / radius, eps, {}) for radius, eps in pairs]
+    noise = [("plane", f"noise {sigma}", 0.0, 0.0, {"sensor.noise_sigma": sigma}) for sigma in (0.0, 0.02, 0.05)]
+    anatomy = [(surface, f"view {view}", 0.0, 0.0, {}) for surface in ("colon", "liver") for view in range(2)]
+    return {"curvature": curvature, "light_offset": offset, "overview": curvature + offset, "grid": grid,
+            "noise": noise, "anatomy": anatomy}[kind]  # fmt: skip
 
 
 def make_rows(kind, realisations=4, estimators=ESTIMATORS, seed=0):
     rng = np.random.default_rng(seed)
     rows = []
-    if kind in ("overview", "curvature"):
-        for label, sign, radii in (("cylinder outside", 1, (1000, 100, 10, 5)), ("cylinder inside", -1, (100, 30, 15))):
-            for radius in radii:
-                rows += rows_of_setting(rng, label, f"{label} R = {radius} mm", sign * DISTANCE / radius, 0.0, realisations,
-                                        estimators, **{"surface.radius_mm": float(radius)})  # fmt: skip
-    if kind in ("overview", "light_offset"):
-        for eps in (0.0, 0.01, 0.05, 0.1, 0.2):
-            rows += rows_of_setting(rng, "plane offset", f"offset {eps}", 0.0, eps, realisations, estimators,
-                                    **{"rig.lights.0.offset_mm": eps * DISTANCE})  # fmt: skip
-    if kind == "grid":
-        for radius in (100, 20, 10):
-            for eps in (0.0, 0.05, 0.2):
-                rows += rows_of_setting(rng, "sphere", f"R = {radius}, offset {eps}", DISTANCE / radius, eps, realisations,
-                                        estimators)  # fmt: skip
-    if kind == "anatomy":
-        for surface in ("colon", "liver"):
-            for view in range(2):
-                rows += rows_of_setting(rng, surface, f"view {view}", 0.0, 0.0, realisations, estimators, n_true=5)
-    if kind == "noise":
-        for sigma in (0.0, 0.02, 0.05):
-            rows += rows_of_setting(rng, "plane", f"noise {sigma}", 0.0, 0.0, realisations, estimators,
-                                    **{"sensor.noise_sigma": sigma})  # fmt: skip
+    for label, setting, kd, eps, swept in sweeps_of(kind):
+        n_true = 5 if kind == "anatomy" else 1
+        rows += rows_of_setting(rng, label, setting, kd, eps, realisations, estimators, n_true, **swept)
     return [row | {"experiment": kind} for row in rows]
 
 
@@ -99,7 +100,8 @@ def summarise(rows):
             failed = [r["status"] for r in entry["rows"] if r["status"] in REASONS]
             mean = float(np.mean(errors)) if errors else None
             by_estimator[name] = {
-                "n": len(entry["rows"]), "n_ok": len(errors), "n_failed_by_reason": {s: failed.count(s) for s in set(failed)},
+                "n": len(entry["rows"]), "n_ok": len(errors),
+                "n_failed_by_reason": {s: failed.count(s) for s in set(failed)},
                 "n_missed": sum(r["status"] == "missed" for r in entry["rows"]),
                 "n_false": sum(r["true_id"] is None for r in entry["rows"]), "mean_deg": mean, "mean_oracle_deg": mean,
                 "rms_deg": mean, "std_deg": None, "median_deg": mean, "p95_deg": mean, "max_deg": mean,
@@ -128,29 +130,29 @@ def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose
     spot, point = camera.project(s), s * (np.hypot(centre[0], centre[2]) - radius)
     axes = np.array([0.03, 0.06]) * camera.fx
     angle = np.linspace(0, 2 * np.pi, 40)
-    contours = [
-        {"t": t, "points": (spot + np.stack([np.cos(angle), np.sin(angle)], 1) * axes * np.sqrt(-np.log(t) / 0.7)).tolist()}
-        for t in (0.3, 0.5, 0.7)
-    ]
+    ring = np.stack([np.cos(angle), np.sin(angle)], 1) * axes
+    contours = [{"t": t, "points": (spot + ring * np.sqrt(-np.log(t) / 0.7)).tolist()} for t in (0.3, 0.5, 0.7)]
     A = np.diag(1 / axes**2)
     conic = np.block([[A, -(A @ spot)[:, None]], [-(A @ spot)[None], np.array([[spot @ A @ spot - 1]])]]).tolist()
-    turned = [(np.array([[np.cos(u), 0, np.sin(u)], [0, 1, 0], [-np.sin(u), 0, np.cos(u)]]) @ -s).tolist() for u in (-1, 1)]
+    turned = [[-s[0] * np.cos(u) - s[2] * np.sin(u), 0.0, s[0] * np.sin(u) - s[2] * np.cos(u)] for u in (-1, 1)]
     common = {"specularity": 0, "true_id": 0, "status": "ok", "look_px": spot.tolist(), "bp_px": (spot + 0.7).tolist()}
     estimates = [
         common | {"estimator": estimator, "error_deg": 57.3, "normal": turned[0], "candidates": turned,
                   "isophotes": contours[1:2], "ellipses": [conic]},
         common | {"estimator": "cone_axis", "error_deg": 0.01, "normal": (-s).tolist(), "candidates": [(-s).tolist()],
                   "isophotes": contours, "ellipses": []},
-        common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak", "error_deg": None,
-                  "normal": None, "candidates": [], "look_px": None, "isophotes": [], "ellipses": []},
+        common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak",
+                  "error_deg": None, "normal": None, "candidates": [], "look_px": None, "isophotes": [],
+                  "ellipses": []},
     ]  # fmt: skip
     meta = {
         "surface": "cylinder", "setting": f"R = {radius:g} mm", "label": "cylinder outside", "sigma": 0.02,
         "command": "simtest render cylinder --set surface.radius_mm=10 --out DIR",
-        "camera": {"width": width, "height": height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-                   "skew": 0.0},
-        "truth": [{"id": 0, "bp_px": spot.tolist(), "normal": (-s).tolist(), "position": point.tolist(), "kd_min": 0.0,
-                   "kd_max": float(np.linalg.norm(point) / radius), "isolated": True}],
+        "camera": {"width": width, "height": height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
+                   "cy": camera.cy, "skew": 0.0},
+        "truth": [{"id": 0, "bp_px": spot.tolist(), "normal": (-s).tolist(), "position": point.tolist(),
+                   "kd_min": 0.0, "kd_max": float(np.linalg.norm(point) / radius),
+                   "isolated": True}],
         "estimates": estimates,
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -235,7 +237,8 @@ def test_overview_page_has_its_sections(overview):
     assert wanted <= page.ids()
     assert not {"heatmap", "surfaces"} & page.ids()
     text = " ".join(page.text)
-    for part in ("Title of overview", "circle_pose by", "gave no normal", "0123abc", "ab" * 32, "simtest render cylinder"):
+    parts = ("Title of overview", "circle_pose by", "gave no normal", "0123abc", "ab" * 32, "simtest render cylinder")
+    for part in parts:
         assert part in text, part
     assert {"viewport"} <= {attrs.get("name") for tag, attrs in page.tags if tag == "meta"}
 
@@ -273,7 +276,8 @@ def test_series_follow_the_rows_and_the_laws(tmp_path):
     assert pose.y[2] == pytest.approx(rows["error_oracle_deg"].mean())
     assert (pose.low[2] < pose.y[2]) & (pose.y[2] < pose.high[2])
     at_one = np.interp(1.0, pose.law_x, pose.law_y)
-    assert at_one == pytest.approx(np.degrees(laws.circle_pose_error(*laws.isophote_half_axes(0.5, 200, 0, 1))), abs=1e-6)
+    law = np.degrees(laws.circle_pose_error(*laws.isophote_half_axes(0.5, 200, 0, 1)))
+    assert at_one == pytest.approx(law, abs=1e-6)
     assert pose.law_x.size > 100
     offset = {c.estimator: c for c in figures["error_vs_offset"].curves}
     np.testing.assert_allclose(offset["cone_axis"].x, [0, 0.01, 0.05, 0.1, 0.2])
@@ -331,7 +335,8 @@ def test_other_swept_parameters_get_a_figure(tmp_path):
 
 
 def test_no_ok_row_at_all(tmp_path):
-    rows = [r | {"status": "no_peak", "error_deg": None, "error_oracle_deg": None, "axis_ratio": None} for r in make_rows("overview")]
+    blank = dict.fromkeys(("error_deg", "error_oracle_deg", "axis_ratio"))
+    rows = [row | blank | {"status": "no_peak"} for row in make_rows("overview")]
     page = read_page(write_report(make_run(tmp_path, "overview", rows, items=0)))
     assert "No row has a normal" in " ".join(page.text)
     assert {"surfaces", "summary"} <= page.ids()
@@ -397,6 +402,15 @@ def test_long_gallery_is_thinned(tmp_path):
     assert [run.gallery[0].name, run.gallery[-1].name] == ["item_00", "item_25"]
 
 
+def test_colour_frames_and_odd_names_are_drawn(tmp_path):
+    make_item(tmp_path / "gallery" / "a.npz", estimator="_$x_1$")
+    with np.load(tmp_path / "gallery" / "a.npz") as data:
+        content = dict(data)
+    np.savez(tmp_path / "gallery" / "a.npz", **content | {"frame": np.repeat(content["frame"][..., None], 3, axis=-1)})
+    make_run(tmp_path, "grid", items=0, realisations=2, estimators=("_$x_1$",))
+    assert "_$x_1$" in " ".join(read_page(write_report(tmp_path)).text)
+
+
 def test_surface_without_truth_or_pixels(tmp_path):
     make_item(tmp_path / "gallery" / "a.npz")
     with np.load(tmp_path / "gallery" / "a.npz") as data:
@@ -423,7 +437,8 @@ def test_style():
     shades = colours(["new", "cone_axis", "circle_pose", "also new"])
     assert len(set(shades.values())) == 4
     assert shades["cone_axis"] == "#0072B2"
-    assert [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)] == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
+    texts = [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)]
+    assert texts == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
     axis = Axis("x", "stretched")
     np.testing.assert_allclose(axis.unplace(axis.place([-0.5, 0, 3])), [-0.5, 0, 3], atol=1e-12)
     places, texts = axis.ticks([-0.5, 2])

@@ -1,0 +1,72 @@
+"""The `simtest` command: its sub-commands, and errors of one line.
+
+Sub-commands are imported when they are called, so that `simtest --help` answers at once.
+"""
+
+import os
+import sys
+import warnings
+
+from cyclopts import App, CycloptsError
+
+from simtest.errors import BackendError, InputError, SimtestError
+
+APP = App(
+    name="simtest",
+    help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
+    version_flags=["--version"],
+    version=lambda: _version(),
+)
+APP.command("simtest.cli.doctor:doctor")
+APP.command("simtest.cli.schema:schema")
+APP.command("simtest.cli.render:render")
+APP.command("simtest.cli.reconstruct:reconstruct")
+APP.command("simtest.cli.validate:validate")
+
+INTERRUPTED = 130
+BAD_USE = 2
+
+
+def _version() -> str:
+    from simtest.provenance import version
+
+    return version()
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"simtest: warning: {message}", file=sys.stderr)
+
+
+def main() -> None:
+    """Run the command line; exit 0 (done), 1 (could not render or a command's own verdict), 2 (bad input), 130 (Ctrl-C)."""
+    if "--traceback" in sys.argv:
+        sys.argv.remove("--traceback")
+        sys.exit(APP())
+    warnings.showwarning = _warn
+    try:
+        # A command's result is its exit code.
+        code = APP(exit_on_error=False, print_error=False, result_action="return_value")
+        # Output may wait in a buffer whose reader has gone.
+        sys.stdout.flush()
+    except CycloptsError as error:
+        sys.exit(_say(" ".join(str(error).split()), BAD_USE))
+    except BackendError as error:
+        sys.exit(_say(str(error), 1))
+    except InputError as error:
+        sys.exit(_say(str(error), BAD_USE))
+    except SimtestError as error:
+        sys.exit(_say(str(error), 1))
+    except KeyboardInterrupt:
+        sys.exit(_say("stopped; what is finished is kept, and the same command goes on from there", INTERRUPTED))
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except Exception as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        sys.exit(_say(f"internal error, please report it ({text}); --traceback shows where", 1))
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(text: str, code: int) -> int:
+    print(f"simtest: {text}", file=sys.stderr)
+    return code

@@ -1,0 +1,31 @@
+"""`simtest reconstruct`."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from simtest.cli.options import Estimators, Out
+
+
+def reconstruct(
+    image: Path,
+    /,
+    *,
+    out: Out,
+    camera: Annotated[Path | None, Parameter(help="Calibration: TOML with width, height, fx, fy, cx, cy.")] = None,
+    fov: Annotated[float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")] = None,
+    estimators: Estimators = None,
+    roi: Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")] = None,
+) -> None:
+    """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, overlay.png.
+
+    Parameters
+    ----------
+    image : Path
+        PNG, JPEG, BMP or TIFF.
+    """
+    from simtest.dataset.picture import reconstruct_picture
+
+    for file in reconstruct_picture(image, out, camera, fov, estimators, roi):
+        print(file)

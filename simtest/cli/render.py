@@ -1,0 +1,20 @@
+"""`simtest render`."""
+
+from simtest.cli.options import Out, Settings, Variant
+
+
+def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
+    """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json.
+
+    Parameters
+    ----------
+    scene : str
+        A scene file, or the name of a shipped scene.
+    """
+    from simtest import api
+    from simtest.dataset import write_frame
+    from simtest.spec import parse_settings
+
+    frame = api.render(scene, parse_settings(settings or []), variant)
+    for file in write_frame(frame, out):
+        print(file)

@@ -1,0 +1,44 @@
+"""`simtest validate`."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from simtest.cli.options import Estimators, Settings, Variant
+
+DEFAULT_OUT = Path("reports/runs")
+
+
+def validate(
+    experiment: str,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder of the run; default reports/runs/EXPERIMENT.")] = None,
+    realisations: Annotated[int | None, Parameter(help="Realisations of each setting.")] = None,
+    seed: Annotated[int | None, Parameter(help="Seed of the run.")] = None,
+    settings: Settings = None,
+    estimators: Estimators = None,
+    variant: Variant = None,
+) -> None:
+    """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
+
+    Parameters
+    ----------
+    experiment : str
+        An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, reflectance, anatomy.
+    """
+    from simtest.api import validate as run
+    from simtest.cli.progress import progress_bar
+    from simtest.spec import load_experiment, parse_settings
+
+    values = parse_settings(settings or [])
+    own = {"realisations": realisations, "seed": seed, "estimators": estimators}
+    values |= {key: value for key, value in own.items() if value is not None}
+    described = load_experiment(experiment, values)
+    command = shlex.join(["simtest", *sys.argv[1:]])
+    with progress_bar() as progress:
+        page = run(described, out or DEFAULT_OUT / described.name, command=command, variant=variant, progress=progress)
+    print(page)
