@@ -12,7 +12,9 @@ from simtest.validation.runner import Progress
 __all__ = ["LabelledFrame", "reconstruct", "render", "validate"]
 
 
-def render(scene: Scene | str | Path, settings: Mapping[str, Any] | None = None, variant: str | None = None) -> LabelledFrame:
+def render(
+    scene: Scene | str | Path, settings: Mapping[str, Any] | None = None, variant: str | None = None
+) -> LabelledFrame:
     """Render a scene with its ground truth.
 
     Parameters

@@ -7,7 +7,17 @@ import subprocess
 from functools import cache
 from pathlib import Path
 
-PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "opencv-python-headless", "trimesh", "libigl", "polars")
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "numpy",
+    "scipy",
+    "scikit-image",
+    "opencv-python-headless",
+    "trimesh",
+    "libigl",
+    "polars",
+)
 _ROOT = Path(__file__).resolve().parent
 
 

@@ -89,7 +89,7 @@ def reconstruct(
 
 
 def check_frame(frame: npt.ArrayLike, camera: Camera) -> npt.NDArray[np.float32]:
-    """Give a frame as float32 intensities, shape (H, W); raise `InputError` where it is no image of the camera's size."""
+    """Give a frame as float32 intensities, shape (H, W); raise `InputError` where it does not fit the camera."""
     try:
         image = np.asarray(frame, dtype=np.float32)
     except (TypeError, ValueError) as error:

@@ -23,6 +23,14 @@ def data_root(kind: str) -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / kind
 
 
+def shown(text: object, limit: int = 300) -> str:
+    """Give a user's text as it stands in a message: on one line, and not longer than `limit`."""
+    line = str(text)
+    if not line or not line.isprintable():
+        line = repr(line)
+    return line if len(line) <= limit else line[: limit - 3] + "..."
+
+
 def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...] = (".toml",)) -> Path:
     """Find a file by path or by the name of a shipped one.
 
@@ -44,15 +52,20 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
     InputError
         If there is no such file; the message lists the names that exist.
     """
-    path = Path(name).expanduser()
-    if path.is_file():
-        return path
+    try:
+        path = Path(name).expanduser()
+        if path.is_file():
+            return path
+    except OSError as error:
+        raise InputError(f"{shown(name)}: cannot be read ({error.strerror})") from error
+    except RuntimeError as error:
+        raise InputError(f"{shown(name)}: no such home folder") from error
     root = data_root(kind) / folder
     if path.name == str(name):
         for suffix in suffixes:
             if (shipped := root / f"{path.name}{suffix}").is_file():
                 return shipped
     if path.is_dir():
-        raise InputError(f"{name}: is a folder; a file is needed")
+        raise InputError(f"{shown(name)}: is a folder; a file is needed")
     names = ", ".join(sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")}))
-    raise InputError(f"{name}: no such file; shipped by name: {names}")
+    raise InputError(f"{shown(name)}: no such file; shipped by name: {names}")

@@ -49,7 +49,7 @@ def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg:
     camera_from_model = np.eye(4)
     camera_from_model[:3, :3] = rotation @ frame
     camera_from_model[:3, 3] = [0.0, 0.0, distance_mm]
-    return np.linalg.inv(camera_from_model)
+    return np.asarray(np.linalg.inv(camera_from_model), dtype=np.float64)
 
 
 class _Analytic(SurfaceModel):

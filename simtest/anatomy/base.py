@@ -135,7 +135,9 @@ class SurfaceModel(ABC):
         """
 
 
-def pack_points(origins: Array, directions: Array, distance: Array, normal: Array, shape_operator: Array) -> SurfacePoints:
+def pack_points(
+    origins: Array, directions: Array, distance: Array, normal: Array, shape_operator: Array
+) -> SurfacePoints:
     """Make `SurfacePoints` from distances, normals and shape operators; turns them to face the rays' origins.
 
     Parameters

@@ -60,6 +60,8 @@ def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
         return MeshSurface(spec)
     if suffix not in ("", ".toml"):
         allowed = ", ".join((".toml", *MESH_SUFFIXES))
-        raise InputError(f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name")
+        raise InputError(
+            f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name"
+        )
     recipe = load_recipe(find(spec.path, "meshes"))
     return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)

@@ -8,9 +8,7 @@ from cyclopts import Parameter
 from simtest.cli.options import Variant
 
 
-def doctor(
-    *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False, variant: Variant = None
-) -> int:
+def doctor(*, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False, variant: Variant = None) -> int:
     """Check the rendering backend in a child process and say how to mend it; exit 1 if it cannot render.
 
     Parameters

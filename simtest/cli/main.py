@@ -38,7 +38,10 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def main() -> None:
-    """Run the command line; exit 0 (done), 1 (could not render or a command's own verdict), 2 (bad input), 130 (Ctrl-C)."""
+    """Run the command line.
+
+    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C.
+    """
     if "--traceback" in sys.argv:
         sys.argv.remove("--traceback")
         sys.exit(APP())

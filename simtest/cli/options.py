@@ -7,7 +7,9 @@ from cyclopts import Parameter
 
 Settings = Annotated[
     list[str] | None,
-    Parameter(name="--set", negative="", help="Replace a value: key=value, such as surface.radius_mm=5; may be repeated."),
+    Parameter(
+        name="--set", negative="", help="Replace a value: key=value, such as surface.radius_mm=5; may be repeated."
+    ),
 ]
 Variant = Annotated[
     str | None, Parameter(help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono.")

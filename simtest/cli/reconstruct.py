@@ -14,18 +14,20 @@ def reconstruct(
     *,
     out: Out,
     camera: Annotated[Path | None, Parameter(help="Calibration: TOML with width, height, fx, fy, cx, cy.")] = None,
-    fov: Annotated[float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")] = None,
+    fov: Annotated[
+        float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")
+    ] = None,
     estimators: Estimators = None,
     roi: Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")] = None,
 ) -> None:
-    """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, overlay.png.
+    """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, normals.ply, overlay.png.
 
     Parameters
     ----------
     image : Path
         PNG, JPEG, BMP or TIFF.
     """
-    from simtest.dataset.picture import reconstruct_picture
+    from simtest.picture import reconstruct_picture
 
     for file in reconstruct_picture(image, out, camera, fov, estimators, roi):
         print(file)

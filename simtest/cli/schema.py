@@ -12,7 +12,9 @@ def schema(of: Literal["scene", "experiment", "camera"] = "scene", /) -> None:
     of : str
         What to describe.
     """
+    from pydantic import BaseModel
+
     from simtest.spec import CameraSpec, Experiment, Scene
 
-    model = {"scene": Scene, "experiment": Experiment, "camera": CameraSpec}[of]
-    print(json.dumps(model.model_json_schema(), indent=2))
+    models: dict[str, type[BaseModel]] = {"scene": Scene, "experiment": Experiment, "camera": CameraSpec}
+    print(json.dumps(models[of].model_json_schema(), indent=2))

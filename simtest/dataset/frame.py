@@ -155,7 +155,7 @@ FIELDS = {
     "geometric_normal": "unit normal of the rendered triangle or shape, camera frame",
     "curvature": "principal curvatures k_min, k_max, 1/mm, convex towards the camera positive",
     "direction_min, direction_max": "unit principal directions, camera frame",
-    "radiance_specular, radiance_diffuse, radiance_indirect": "parts of the radiance: direct off lobe and base, and bounced",
+    "radiance_specular, radiance_diffuse, radiance_indirect": "parts of the radiance: direct off lobe, base; bounced",
     "mask": "where there is a surface",
 }
 
@@ -164,7 +164,12 @@ def _description(frame: LabelledFrame) -> dict[str, Any]:
     camera = frame.camera
     return {
         "scene": frame.scene.model_dump(mode="json"),
-        "camera": {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "pixel_centres": "integer + 0.5"},
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.K.tolist(),
+            "pixel_centres": "integer + 0.5",
+        },
         "full_scale": frame.full_scale,
         "highlights": [_highlight(judged) for judged in frame.highlights],
         "fields": FIELDS,

@@ -13,7 +13,7 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 EXPANSION = 2.0
-"""Region of interest over the highlight's size at half height: a Gaussian spot's isophote at t = 0.1 is 1.8 times it."""
+"""Region of interest over the highlight's size at half height; a Gaussian spot at t = 0.1 is 1.8 times that size."""
 
 MARGIN_PX = 8
 MIN_AREA_PX = 12

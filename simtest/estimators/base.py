@@ -101,7 +101,9 @@ def fit_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophot
     return FittedIsophote(isovalue, points, conic, backproject_conic(conic, camera))
 
 
-def fit_isophotes(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> tuple[list[FittedIsophote], list[Failure]]:
+def fit_isophotes(
+    patch: Patch, camera: Camera, isovalues: Sequence[float]
+) -> tuple[list[FittedIsophote], list[Failure]]:
     """Fit several isophotes (see `fit_isophote`); gives those that succeeded and the failures of the others."""
     results = [fit_isophote(patch, camera, t) for t in isovalues]
     fitted = [result for result in results if isinstance(result, FittedIsophote)]

@@ -13,9 +13,7 @@ MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
 
-def cone_axis(
-    patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AXIS_ISOVALUES
-) -> Estimate | Failure:
+def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AXIS_ISOVALUES) -> Estimate | Failure:
     """Average the cones' axes over several isovalues.
 
     Parameters

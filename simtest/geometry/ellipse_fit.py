@@ -12,6 +12,9 @@ Array = npt.NDArray[np.float64]
 MIN_POINTS = 6
 """An ellipse has five parameters; with five points or fewer the fit has no residual."""
 
+MAX_COORDINATE = 1e150
+"""Beyond it squares overflow."""
+
 MAX_AXIS_RATIO = 1e4
 """A fitted ellipse longer than this over its width is a line."""
 
@@ -59,6 +62,8 @@ def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
         return Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
     if not np.isfinite(xy).all():
         return Failure(Reason.NOT_FINITE, "contour points hold NaN or infinity")
+    if np.abs(xy).max() > MAX_COORDINATE:
+        return Failure(Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
     centre = xy.mean(axis=0)
     scale = float(np.sqrt(((xy - centre) ** 2).sum(axis=1).mean() / 2))
     if not scale > 1e-12 * (1 + float(np.abs(centre).max())):
@@ -89,10 +94,10 @@ def _fit_normalised(xy: Array) -> Array | Failure:
         _, vectors = np.linalg.eig(reduced)
     except np.linalg.LinAlgError:
         return Failure(Reason.DEGENERATE_CONIC, "the points lie on a line")
-    if np.iscomplexobj(vectors) and np.abs(vectors.imag).max() > 1e-9:
-        return Failure(Reason.NOT_AN_ELLIPSE, "the fit has no real solution")
+    # The two solutions that are no ellipse may coincide, as on a circle; rounding then makes them a complex pair.
+    real = np.abs(vectors.imag).max(axis=0) <= 1e-9
     vectors = np.real(vectors)
-    condition = 4 * vectors[0] * vectors[2] - vectors[1] ** 2
+    condition = np.where(real, 4 * vectors[0] * vectors[2] - vectors[1] ** 2, -np.inf)
     if not (condition > 0).any():
         return Failure(Reason.NOT_AN_ELLIPSE, "the fit has no elliptic solution")
     quadratic_part = vectors[:, int(np.argmax(condition))]

@@ -57,7 +57,9 @@ class Patch:
     _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
-    def cut(cls, smoothed: Image, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None) -> "Patch | Failure":
+    def cut(
+        cls, smoothed: Image, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None
+    ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
         Parameters
@@ -87,14 +89,14 @@ class Patch:
         if not np.isfinite(values).all():
             return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
         if peak is None:
-            row, column = np.unravel_index(int(values.argmax()), values.shape)
+            row, column = divmod(int(values.argmax()), values.shape[1])
         else:
             column, row = peak[0] - x, peak[1] - y
         value = float(values[row, column])
         if value <= 0 or value <= float(values.min()):
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
-        local = _parabolic_peak(values, int(row), int(column)) + PIXEL_CENTRE
-        return cls(values, (x, y), local + [x, y], value)
+        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + (x, y)
+        return cls(values, (x, y), peak_px, value)
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].

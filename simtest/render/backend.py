@@ -97,7 +97,9 @@ def _system_libraries() -> list[str]:
     versions: dict[str, tuple[int, ...]] = {}
     for folder in folders:
         for path in Path(folder).glob("libLLVM*.so*"):
-            if match := re.fullmatch(r"libLLVM(?:-(\d+))?\.so(?:\.([\d.]+))?|libLLVM-([\d.]+)\.so(?:\.\d+)?", path.name):
+            if match := re.fullmatch(
+                r"libLLVM(?:-(\d+))?\.so(?:\.([\d.]+))?|libLLVM-([\d.]+)\.so(?:\.\d+)?", path.name
+            ):
                 numbers = next((group for group in match.groups() if group), "0")
                 version = tuple(int(part) for part in numbers.strip(".").split("."))
                 resolved = str(path.resolve())

@@ -95,7 +95,7 @@ def _seeds(pixels: Array, points: "SurfacePoints", light: Array, stride: int) ->
     if min(height, width) < 3:
         return np.empty((0, 2))
     w = misfit(points, light).reshape(height, width, 2)
-    along_y, along_x = np.gradient(w, axis=(0, 1))
+    along_y, along_x = np.asarray(np.gradient(w, axis=0)), np.asarray(np.gradient(w, axis=1))
     determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         step_x = (along_y[..., 1] * w[..., 0] - along_y[..., 0] * w[..., 1]) / determinant

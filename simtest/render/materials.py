@@ -2,7 +2,12 @@
 
 from typing import Any
 
-from simtest.spec.scene import PhongReflectance, PrincipledReflectance, RoughConductorReflectance, RoughPlasticReflectance
+from simtest.spec.scene import (
+    PhongReflectance,
+    PrincipledReflectance,
+    RoughConductorReflectance,
+    RoughPlasticReflectance,
+)
 
 AnyReflectance = PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance
 

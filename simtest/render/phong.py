@@ -27,10 +27,10 @@ def register(mi: Any, variant: str) -> str:
 
 
 @cache
-def _make_class(mi: Any, variant: str) -> Any:
+def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
     import drjit as dr
 
-    class Phong(mi.BSDF):  # type: ignore[misc]
+    class Phong(mi.BSDF):
         """Specular c cos^n(beta) plus a Lambertian base, beta between mirror direction and view [P75].
 
         As published, the specular radiance has no cosine of incidence: f cos(theta) = c cos^n(beta). The normalised

@@ -63,6 +63,8 @@ class Session:
         self.plugin = phong.register(self.mi, self.variant)
         self.rebuilds = 0
         self._built: _Built | None = None
+        self._truth: TruthMaps | None = None
+        self._load_surface(scene)
         self.update(scene)
 
     def update(self, scene: Scene) -> None:
@@ -73,21 +75,29 @@ class Session:
         scene : Scene
             The next scene.
         """
-        same_surface = hasattr(self, "scene") and scene.surface == self.scene.surface
-        if not same_surface:
-            self.surface: SurfaceModel = make_surface(scene.surface)
-            self._shape = self.surface.shape()
-        if not same_surface or scene.camera != self.scene.camera:
-            self._truth: TruthMaps | None = None
-        self.scene = scene
+        if scene.surface != self.scene.surface:
+            self._load_surface(scene)
+        elif scene.camera != self.scene.camera:
+            self._truth = None  # of another camera
+        self.scene: Scene = scene
         self.camera: Camera = scene.camera.model()
         updates = parameter_updates(scene.reflectance, diffuse_only=False)
-        fixed = scene.reflectance if updates is None else (type(updates), scene.reflectance.diffuse, scene.reflectance.colour)
+        fixed = (
+            scene.reflectance
+            if updates is None
+            else (type(updates), scene.reflectance.diffuse, scene.reflectance.colour)
+        )
         normalised = getattr(scene.reflectance, "normalised", None)
         key = (self._shape.key, fixed, normalised, len(scene.rig.lights))
         if self._built is None or self._built.key != key:
             self._built = self._build(key)
         self._apply(self._built)
+
+    def _load_surface(self, scene: Scene) -> None:
+        self.scene = scene
+        self.surface: SurfaceModel = make_surface(scene.surface)
+        self._shape = self.surface.shape()
+        self._truth = None
 
     def _build(self, key: tuple[Any, ...]) -> _Built:
         self.rebuilds += 1
@@ -153,7 +163,9 @@ class Session:
         powers = [light.power for light in self.scene.rig.lights]
         tracer = integrate.Tracer(self.mi, self._built.scene, self._built.diffuse_bsdf, lights, powers, shadows)
         effort = self.scene.render
-        return integrate.render(tracer, self._rays, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed)
+        return integrate.render(
+            tracer, self._rays, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed
+        )
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
@@ -277,4 +289,3 @@ class Session:
 
 def _point(mi: Any, values: Array) -> Any:
     return mi.Point3f(np.ascontiguousarray(values.T, dtype=np.float32))
-

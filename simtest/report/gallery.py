@@ -200,9 +200,7 @@ def _closed(ax: "Axes", points: Any, colour: Any, width: float) -> None:
         ax.plot(*np.vstack([data, data[:1]]).T, color=colour, lw=width)
 
 
-def _arrow(
-    ax: "Axes", item: GalleryItem, foot: tuple[Array, Array], colour: str, width: float, reach: float
-) -> None:
+def _arrow(ax: "Axes", item: GalleryItem, foot: tuple[Array, Array], colour: str, width: float, reach: float) -> None:
     """Draw a normal from its surface point, projected; one that points at the camera is a dot."""
     from matplotlib.patches import FancyArrowPatch
 

@@ -38,7 +38,8 @@ class Group(Spec):
     random: dict[str, Uniform] = Field(default_factory=dict)
     realisations: int | None = Field(None, ge=1, le=10**6, description="default the experiment's")
     isolated: bool = Field(
-        True, description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V"
+        True,
+        description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V",
     )
 
     @model_validator(mode="after")
@@ -99,6 +100,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
     """Fix scene values in a group; a swept or random value of the same path gives way."""
+
     def without(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
         kept = ({k: v for k, v in table.items() if k not in settings} for table in tables)
         return tuple(table for table in kept if table)

@@ -4,13 +4,16 @@ import copy
 import difflib
 import itertools
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from types import NoneType
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
 from simtest.errors import InputError
+from simtest.resources import shown
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -18,9 +21,39 @@ MAX_TOML_BYTES = 1_000_000
 
 
 class Spec(BaseModel):
-    """Base of all specification models: frozen, no unknown keys, no NaN or infinity."""
+    """Base of all specification models: frozen, no unknown keys, no NaN or infinity, no text where a number belongs."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _not_coerced(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse what pydantic would turn into a number or a truth value: "50", true, 1."""
+        kinds = _leaf_types(cls.model_fields[info.field_name or ""].annotation)
+        if kinds <= {int, float, NoneType}:
+            for leaf in _leaves(value):
+                if isinstance(leaf, str | bytes | bool):
+                    raise ValueError(f"must be a number, not {'text' if isinstance(leaf, str | bytes) else 'true or false'}")
+        elif kinds == {bool} and not isinstance(value, bool):
+            raise ValueError("must be true or false")
+        return value
+
+
+@cache
+def _leaf_types(annotation: Any) -> frozenset[Any]:
+    """Give the types at the leaves of an annotation such as ``tuple[float, float] | None``."""
+    if get_origin(annotation) is Annotated:
+        return _leaf_types(get_args(annotation)[0])
+    parts = [part for part in get_args(annotation) if part is not ...]
+    return frozenset({annotation}) if not parts else frozenset().union(*map(_leaf_types, parts))
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _leaves(item)
+    else:
+        yield value
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -40,16 +73,34 @@ def read_toml(path: Path) -> dict[str, Any]:
     InputError
         If the file is missing, too large, not UTF-8 or not TOML.
     """
+    name = shown(path)
     try:
-        if path.stat().st_size > MAX_TOML_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size} bytes; a TOML file of at most {MAX_TOML_BYTES} is allowed")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        # A device or a pipe has no size and might never end.
+        if not path.is_file():
+            raise InputError(f"{name}: is {'a folder' if path.is_dir() else 'no plain file'}; a TOML file is needed")
+        if size > MAX_TOML_BYTES:
+            raise InputError(f"{name}: {size} bytes; a TOML file of at most {MAX_TOML_BYTES} is allowed")
+        return _loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(f"{name}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
+        raise InputError(f"{name}: not a text file in UTF-8 (byte {error.start})") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+        raise InputError(f"{name}: not valid TOML: {error}") from error
+
+
+def _loads(text: str) -> dict[str, Any]:
+    """Parse TOML; what the parser cannot hold (nesting, digits) is a `TOMLDecodeError` too."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError:
+        raise tomllib.TOMLDecodeError("nested too deeply") from None
+    except ValueError:
+        # Python refuses to read integers of more than 4300 digits.
+        raise tomllib.TOMLDecodeError("a number has too many digits") from None
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:
@@ -74,11 +125,13 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     for setting in settings:
         path, equals, value = setting.partition("=")
         if not equals or not path.strip():
-            raise InputError(f"--set {setting}: must be key=value, for example surface.distance_mm=12")
+            raise InputError(f"--set {shown(setting)}: must be key=value, for example surface.distance_mm=12")
         try:
-            parsed[path.strip()] = tomllib.loads(f"value = {value}")["value"]
+            table = _loads(f"value = {value}")
         except tomllib.TOMLDecodeError:
-            parsed[path.strip()] = value
+            table = {}
+        # More keys than one: the value held a line break, so it is text.
+        parsed[path.strip()] = table["value"] if list(table) == ["value"] else value
     return parsed
 
 
@@ -116,19 +169,22 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
         elif isinstance(node, dict):
             node[last] = value
         else:
-            raise InputError(f"{where}: {path}: {'.'.join(parents)} is a plain value, not a table")
+            raise InputError(f"{where}: {shown(path)}: {shown('.'.join(parents))} is a plain value, not a table")
     return result
 
 
 def _step(node: Any, part: str, following: str, path: str, where: str) -> Any:
     """Go down one part of a key path; what is missing is made, a list where the following part is its first index."""
     if isinstance(node, dict):
+        if part not in node and following.isdecimal() and following != "0":
+            raise InputError(f"{where}: {shown(path)}: index {shown(following)} is not allowed; the first item is 0")
         return node.setdefault(part, [{}] if following == "0" else {})
     if isinstance(node, list):
-        if part.isdigit() and int(part) < len(node):
+        if part.isdecimal() and len(part) < 10 and int(part) < len(node):
             return node[int(part)]
-        raise InputError(f"{where}: {path}: index {part} is not allowed; the list has items 0 to {len(node) - 1}")
-    raise InputError(f"{where}: {path}: {part} is below a plain value, not a table")
+        held = f"items 0 to {len(node) - 1}" if node else "no items"
+        raise InputError(f"{where}: {shown(path)}: index {shown(part)} is not allowed; the list has {held}")
+    raise InputError(f"{where}: {shown(path)}: {shown(part)} is below a plain value, not a table")
 
 
 def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
@@ -156,22 +212,46 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         errors = error.errors(include_url=False)
+        # A list whose item is wrong is also reported as too short: once is enough.
+        places = [e["loc"] for e in errors]
+        errors = [
+            e for e in errors
+            if not (e["type"] == "too_short" and any(p != e["loc"] and p[: len(e["loc"])] == e["loc"] for p in places))
+        ]  # fmt: skip
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         raise InputError(f"{where}: {_describe(errors[0], model, data)}{more}") from None
 
 
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
-    location = [str(part) for part in _without_tags(error["loc"], data)]
+    location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
     path = ".".join(location) or "(top level)"
     kind, value = error["type"], error.get("input")
     if kind == "extra_forbidden":
         return f"{path} = {_short(value)}: unknown key{_suggest(error['loc'], model)}"
     if kind == "missing":
         return f"{path}: missing; it must be given"
+    if kind == "union_tag_not_found":
+        return f"{path}.type: missing; allowed: {_tags(error['loc'], model)}"
+    if kind == "union_tag_invalid":
+        return f"{path}.type = {_short(value['type'])}: unknown; allowed: {_tags(error['loc'], model)}"
     if kind == "value_error":
         return f"{path} = {_short(value)}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
-    message = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"{path} = {_short(value)}: must be {message}"
+    return f"{path} = {_short(value)}: must {_demand(error)}"
+
+
+def _demand(error: Any) -> str:
+    """Say what a value must be or hold, in the words of TOML."""
+    kind, limits = error["type"], error.get("ctx", {})
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return "be a table"
+    if kind in ("tuple_type", "list_type"):
+        return "be a list"
+    if kind in ("too_short", "too_long", "string_too_short", "string_too_long"):
+        bound, count = ("least", limits.get("min_length")) if "short" in kind else ("most", limits.get("max_length"))
+        return f"have at {bound} {count} {'character' if 'string' in kind else 'item'}{'s'[: count != 1]}"
+    if kind == "string_pattern_mismatch":
+        return f"match the pattern {limits['pattern']}"
+    return f"be {error['msg'].removeprefix('Input should be ')}"
 
 
 def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
@@ -190,16 +270,24 @@ def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
 
 def _suggest(location: tuple[Any, ...], model: type[BaseModel]) -> str:
     """List the keys that are allowed where an unknown one was found, the closest first."""
-    schema = model.model_json_schema()
-    node: Any = schema
-    for part in location[:-1]:
-        node = _descend(node, part, schema)
-        if node is None:
-            return ""
-    known = list(_resolve(node, schema).get("properties", {}))
+    known = list(_node(location[:-1], model).get("properties", {}))
     close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
     ordered = close + [k for k in known if k not in close]
     return f"; allowed: {', '.join(ordered)}" if ordered else ""
+
+
+def _tags(location: tuple[Any, ...], model: type[BaseModel]) -> str:
+    """List the types that a tagged union allows."""
+    return ", ".join(_node(location, model).get("discriminator", {}).get("mapping", {}))
+
+
+def _node(location: tuple[Any, ...], model: type[BaseModel]) -> Any:
+    """Give the part of a model's JSON schema at a location; empty where it has none."""
+    schema = model.model_json_schema()
+    node: Any = schema
+    for part in location:
+        node = _descend(node, part, schema)
+    return _resolve(node, schema)
 
 
 def _resolve(node: Any, schema: Any) -> Any:
@@ -212,6 +300,8 @@ def _descend(node: Any, part: Any, schema: Any) -> Any:
     node = _resolve(node, schema)
     if isinstance(part, int):
         return node.get("items")
+    if isinstance(node.get("additionalProperties"), dict):
+        return node["additionalProperties"]
     if part in node.get("properties", {}):
         return node["properties"][part]
     mapping = node.get("discriminator", {}).get("mapping", {})
@@ -219,5 +309,9 @@ def _descend(node: Any, part: Any, schema: Any) -> Any:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:
+        # Python refuses to write integers of more than 4300 digits.
+        text = "a number of too many digits"
     return text if len(text) <= 80 else text[:77] + "..."

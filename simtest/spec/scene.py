@@ -27,8 +27,12 @@ class _Placed(Spec):
 
     distance_mm: Millimetres = Field(10.0, description="depth of the anchor point on the optical axis, mm")
     tilt_deg: float = Field(0.0, ge=0, lt=90, description="angle between the anchor's normal and the optical axis, deg")
-    azimuth_deg: float = Field(0.0, ge=-360, le=360, description="image direction towards which the normal leans, deg from x to y")
-    spin_deg: float = Field(0.0, ge=-360, le=360, description="direction of the first principal direction in the tangent plane, deg")
+    azimuth_deg: float = Field(
+        0.0, ge=-360, le=360, description="image direction towards which the normal leans, deg from x to y"
+    )
+    spin_deg: float = Field(
+        0.0, ge=-360, le=360, description="direction of the first principal direction in the tangent plane, deg"
+    )
 
     @property
     def label(self) -> str:
@@ -149,7 +153,9 @@ class LightSpec(Spec):
     Its place is `position_mm`, or `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0.
     """
 
-    position_mm: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="place in the camera frame, mm")
+    position_mm: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="place in the camera frame, mm"
+    )
     offset_mm: float = Field(0.0, ge=0, le=1e6, description="distance from the camera centre, mm")
     azimuth_deg: float = Field(0.0, ge=-360, le=360, description="direction of the offset, deg from x to y")
     power: float = Field(1.0, gt=0, le=1e12, description="radiant intensity, relative")
@@ -262,7 +268,7 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     """
     path = find(name, "scenes")
     data = apply_settings(read_toml(path), settings or {}, str(path))
-    data.setdefault("name", path.stem)
+    data.setdefault("name", path.stem[:80])
     return scene_from_dict(data, str(path))
 
 

@@ -113,9 +113,7 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
             again = " ".join(f"--set {shlex.quote(f'{k}={_toml(v)}')}" for k, v in {**group.set, **values}.items())
             command = f"simtest render {group.scene} {again} --out frame".replace("  ", " ")
             random = dict(group.random)
-            cases.append(
-                Case(label, setting, part, columns, data, str(path), random, count, group.isolated, command)
-            )
+            cases.append(Case(label, setting, part, columns, data, str(path), random, count, group.isolated, command))
     return cases
 
 

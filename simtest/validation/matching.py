@@ -39,7 +39,9 @@ def match(specularities: list[Specularity], truths: list[JudgedHighlight]) -> di
 
 def _holds(specularity: Specularity, point: np.ndarray) -> bool:
     """Tell whether a detection's isophote encloses a point; where it does not close, its region decides."""
-    contour = specularity.patch if isinstance(specularity.patch, Failure) else specularity.patch.isophote(HIGHLIGHT_ISOVALUE)
+    contour = (
+        specularity.patch if isinstance(specularity.patch, Failure) else specularity.patch.isophote(HIGHLIGHT_ISOVALUE)
+    )
     if not isinstance(contour, Failure):
         return encloses(contour, point)
     x, y, width, height = specularity.region.box

@@ -25,7 +25,7 @@ from simtest.validation.metrics import table
 from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
 
-GALLERY_ITEMS = 24
+GALLERY_ITEMS = 18
 PARTS = "parts"
 
 Progress = Callable[[int, int, str], None]
@@ -55,7 +55,11 @@ class Run:
 
 
 def run_experiment(
-    experiment: Experiment, folder: Path, command: str = "", variant: str | None = None, progress: Progress | None = None
+    experiment: Experiment,
+    folder: Path,
+    command: str = "",
+    variant: str | None = None,
+    progress: Progress | None = None,
 ) -> Run:
     """Run an experiment, or go on with an interrupted run of the same.
 
@@ -130,7 +134,9 @@ class _Work:
     def run(self, parts: Path, progress: Progress | None) -> int:
         """Run the cases that are not done yet; gives how many were."""
         total, done, resumed = sum(case.realisations for case in self.cases), 0, 0
-        shown = set(np.linspace(0, len(self.cases) - 1, min(GALLERY_ITEMS, len(self.cases))).round().astype(int).tolist())
+        shown = set(
+            np.linspace(0, len(self.cases) - 1, min(GALLERY_ITEMS, len(self.cases))).round().astype(int).tolist()
+        )
         swept = swept_example(self.cases)
         for index, case in enumerate(self.cases):
             if _part_file(parts, index).exists():
@@ -170,7 +176,9 @@ def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: s
         raise InputError(f"--out {folder}: is a file; must be a folder")
     strangers = [p.name for p in folder.iterdir() if p.name not in mine] if folder.is_dir() else []
     if strangers:
-        raise InputError(f"--out {folder}: holds {strangers[0]}, which is no part of a run; must be empty or hold a run")
+        raise InputError(
+            f"--out {folder}: holds {strangers[0]}, which is no part of a run; must be empty or hold a run"
+        )
     parts = folder / PARTS
     fingerprint = {
         "experiment": experiment.model_dump(mode="json"),

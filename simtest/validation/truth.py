@@ -40,7 +40,9 @@ class JudgedHighlight:
         return not self.why_not
 
 
-def judge(highlights: list[TrueHighlight], radiance: Image, noise_sigma: float, full_scale: float) -> list[JudgedHighlight]:
+def judge(
+    highlights: list[TrueHighlight], radiance: Image, noise_sigma: float, full_scale: float
+) -> list[JudgedHighlight]:
     """Judge each true highlight by the noise-free frame.
 
     Parameters

@@ -1,0 +1,46 @@
+# Two commands for a start: `make demo` and `make test`. Everything runs in a virtual environment of its own.
+PYTHON ?= python3
+VENV ?= .venv
+WORKERS ?= auto
+BIN := $(VENV)/bin
+
+.PHONY: help demo test test-all lint format clean
+
+help:
+	@echo "make demo      install, run the overview experiment, print the page's path"
+	@echo "make test      fast tests (under 5 minutes on 2 cores)"
+	@echo "make test-all  all tests, the slow ones too"
+	@echo "make lint      ruff, mypy, import-linter"
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.tests: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	@touch $@
+
+demo: $(VENV)/.installed
+	$(BIN)/simtest validate overview
+
+test: $(VENV)/.tests
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
+
+test-all: $(VENV)/.tests
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+lint: $(VENV)/.tests
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+format: $(VENV)/.tests
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean:
+	rm -rf $(VENV) reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,232 @@
+"""The direct ellipse fit: exact recovery, invariances, agreement with other implementations, refusals."""
+
+import cv2
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.measure import EllipseModel
+
+from simtest.errors import Failure, Reason
+from simtest.geometry import FittedConic, ellipse_of_conic, fit_ellipse
+
+
+def ellipse_points(centre, a, b, angle, phase):
+    cos, sin = np.cos(angle), np.sin(angle)
+    local = np.stack([a * np.cos(phase), b * np.sin(phase)], axis=1)
+    return np.asarray(centre) + local @ np.array([[cos, sin], [-sin, cos]])
+
+
+def phases(count, start=0.3):
+    return start + 2 * np.pi * np.arange(count) / count
+
+
+def parameters(fitted):
+    """Give centre, half-axes and angle in pixels, through the centred coordinates, which keep their digits."""
+    assert isinstance(fitted, FittedConic), fitted
+    ellipse = ellipse_of_conic(fitted.normalised)
+    T = fitted.normalised_from_image
+    centre = (ellipse.centre - T[:2, 2]) / T[0, 0]
+    return centre, ellipse.semi_major / T[0, 0], ellipse.semi_minor / T[0, 0], ellipse.angle
+
+
+def check(points, centre, a, b, angle, digits):
+    """Compare a fit with the truth; `digits` is the relative error allowed, per half-axis."""
+    found_centre, found_a, found_b, found_angle = parameters(fit_ellipse(points))
+    assert np.abs(found_centre - centre).max() < digits * a
+    assert abs(found_a / a - 1) < digits
+    assert abs(found_b / b - 1) < digits * (a / b)
+    if a / b > 1.01:
+        assert abs((found_angle - angle + np.pi / 2) % np.pi - np.pi / 2) < digits * 10 / (1 - b / a)
+
+
+@settings(max_examples=400, deadline=None, derandomize=True)
+@given(
+    st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(0, 3), st.floats(0.05, 1), st.floats(-1.57, 1.57),
+    st.integers(6, 60), st.floats(0, 6),
+)  # fmt: skip
+def test_exact_points_are_recovered(x, y, log_a, ratio, angle, count, start):
+    a = 10**log_a
+    points = ellipse_points((x, y), a, ratio * a, angle, phases(count, start))
+    # The points themselves are rounded to 1e-16 of their coordinates.
+    check(points, (x, y), a, ratio * a, angle, digits=1e-9 / ratio**2 + 1e-12 * (abs(x) + abs(y)) / a / ratio**2)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.7, 0.3])
+@pytest.mark.parametrize("count", [6, 7, 24])
+def test_small_ellipse_far_from_the_origin(ratio, count):
+    points = ellipse_points((5000, 5000), 3, 3 * ratio, 0.4, phases(count))
+    check(points, (5000, 5000), 3, 3 * ratio, 0.4, digits=1e-11 / ratio**2)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1e6, 1e30, 1e100])
+def test_scale_does_not_matter(scale):
+    points = ellipse_points((2, -1), 3, 1.5, -0.7, phases(20))
+    check(points * scale, np.array([2, -1]) * scale, 3 * scale, 1.5 * scale, -0.7, digits=1e-12)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-3, 3), st.floats(-500, 500), st.floats(-500, 500))
+def test_a_similarity_of_the_points_is_one_of_the_fit(seed, turn, log_scale, shift_x, shift_y):
+    """4 a c - b^2 changes by a factor under a similarity, so the minimum moves along, noise included."""
+    rng = np.random.default_rng(seed)
+    points = ellipse_points((0, 0), 2, 1, 0.5, phases(30)) + 0.05 * rng.normal(size=(30, 2))
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    scale, shift = 10**log_scale, np.array([shift_x, shift_y])
+    centre, a, b, angle = parameters(fit_ellipse(points))
+    moved = parameters(fit_ellipse(scale * points @ rotation.T + shift))
+    digits = 1e-9 + 1e-11 * np.abs(shift).max() / scale
+    np.testing.assert_allclose(moved[0], scale * rotation @ centre + shift, atol=digits * scale, rtol=1e-12)
+    np.testing.assert_allclose(moved[1:3], [scale * a, scale * b], rtol=digits)
+    assert abs((moved[3] - angle - turn + np.pi / 2) % np.pi - np.pi / 2) < 10 * digits
+
+
+def plain_fit(points):
+    """Fit as in the 1999 paper: the 6 x 6 generalised eigenproblem S a = l C a, the one positive l."""
+    x, y = points.T
+    D = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1)
+    C = np.zeros((6, 6))
+    C[0, 2] = C[2, 0] = 2
+    C[1, 1] = -1
+    values, vectors = scipy.linalg.eig(C, D.T @ D)
+    a, b, c, d, e, f = np.real(vectors[:, int(np.argmax(values.real))])
+    return np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, f]])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_agreement_with_other_implementations(seed):
+    rng = np.random.default_rng(seed)
+    a, b, angle = rng.uniform(5, 60), rng.uniform(3, 5), rng.uniform(-1.5, 1.5)
+    # Half of the cases are arcs, where algebraic fits are biased: all must be biased alike.
+    arc = phases(80) if seed % 2 else np.linspace(0, 4, 80)
+    points = ellipse_points((300, 200), a, b, angle, arc) + rng.normal(0, 0.1, (80, 2))
+    centre, found_a, found_b, found_angle = parameters(fit_ellipse(points))
+
+    offset = points.mean(axis=0)
+    other = ellipse_of_conic(plain_fit((points - offset) / 20))
+    np.testing.assert_allclose(other.centre * 20 + offset, centre, atol=1e-7)
+    np.testing.assert_allclose([other.semi_major * 20, other.semi_minor * 20], [found_a, found_b], rtol=1e-8)
+
+    model = EllipseModel.from_estimate(points)
+    np.testing.assert_allclose(model.center, centre, atol=1e-6)
+    np.testing.assert_allclose(sorted(model.axis_lengths), [found_b, found_a], rtol=1e-6)
+
+    (x, y), diameters, degrees = cv2.fitEllipseDirect(points.astype(np.float32))
+    np.testing.assert_allclose((x, y), centre, atol=2e-3 * a)
+    np.testing.assert_allclose(sorted(diameters), [2 * found_b, 2 * found_a], rtol=1e-2)
+    # OpenCV counts the angle of the first diameter from the image's x axis.
+    turned = np.radians(degrees) + (0 if diameters[0] > diameters[1] else np.pi / 2)
+    assert abs((turned - found_angle + np.pi / 2) % np.pi - np.pi / 2) < 0.01
+
+
+def test_conic_in_pixels_vanishes_on_the_points_and_is_positive_outside():
+    points = ellipse_points((40, 30), 12, 5, 1.0, phases(40))
+    conic = fit_ellipse(points).image
+    on = np.column_stack([points, np.ones(40)])
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", on, conic, on), 0, atol=1e-13)
+    assert np.array([90, 90, 1]) @ conic @ [90, 90, 1] > 0
+    assert np.array([40, 30, 1]) @ conic @ [40, 30, 1] < 0
+    ellipse = ellipse_of_conic(-3 * conic)
+    np.testing.assert_allclose(ellipse.centre, [40, 30], atol=1e-9)
+    np.testing.assert_allclose([ellipse.semi_major, ellipse.semi_minor, ellipse.angle], [12, 5, 1.0], atol=1e-9)
+    around = np.column_stack([ellipse.points(30), np.ones(30)])
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", around, conic, around), 0, atol=1e-12)
+
+
+LINE = np.stack([np.arange(20.0), 2 * np.arange(20.0) + 1], axis=1)
+T = np.linspace(-1.5, 1.5, 15)
+REFUSED = {
+    "none": (np.empty((0, 2)), Reason.TOO_FEW_POINTS),
+    "five": (ellipse_points((0, 0), 2, 1, 0, phases(5)), Reason.TOO_FEW_POINTS),
+    "three columns": (np.ones((10, 3)), Reason.TOO_FEW_POINTS),
+    "flat": (np.arange(12.0), Reason.TOO_FEW_POINTS),
+    "collinear": (LINE, None),
+    "collinear, along x": (LINE * [1, 0], None),
+    "collinear, along y": (LINE * [0, 1] + [7, 0], None),
+    "collinear, far": (LINE * 1e-3 + 5000, None),
+    "two points": (np.repeat([[1.0, 2], [3, 4]], 6, axis=0), None),
+    "three points": (np.repeat([[1.0, 2], [3, 4], [0, 7]], 6, axis=0), None),
+    "coincident": (np.full((9, 2), 3.7), Reason.DEGENERATE_CONIC),
+    "coincident, at 0": (np.zeros((9, 2)), Reason.DEGENERATE_CONIC),
+    "nan": (np.where(np.eye(9, 2) > 0, np.nan, 1.0), Reason.NOT_FINITE),
+    "inf": (np.where(np.eye(9, 2) > 0, np.inf, 1.0), Reason.NOT_FINITE),
+    "huge": (ellipse_points((0, 0), 2, 1, 0, phases(9)) * 1e200, None),
+    "largest": (ellipse_points((0, 0), 0.9, 0.5, 0, phases(9)) * 1.7e308, None),
+    "mixed": (ellipse_points((0, 0), 2, 1, 0, phases(9)) * [1e250, 1], None),
+    "tiny": (ellipse_points((0, 0), 2, 1, 0, phases(9)) * 1e-200, None),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_ellipse_is_refused(name):
+    points, reason = REFUSED[name]
+    result = fit_ellipse(points)
+    assert isinstance(result, Failure)
+    assert reason is None or result.reason is reason
+
+
+@pytest.mark.parametrize("branches", [1, 2])
+def test_hyperbolas_give_no_ellipse_through_them(branches):
+    """The direct fit always looks for an ellipse; what it makes of a hyperbola must miss the points by far."""
+    signs = (1, -1)[:branches]
+    hyperbola = np.concatenate([np.stack([s * np.cosh(T), np.sinh(T)], axis=1) for s in signs])
+    for points in (hyperbola, hyperbola * 40 + 300):
+        result = fit_ellipse(points)
+        if isinstance(result, Failure):
+            continue
+        sound(result)
+        normalised = np.column_stack([points, np.ones(len(points))]) @ result.normalised_from_image.T
+        assert np.abs(np.einsum("ni,ij,nj->n", normalised, result.normalised, normalised)).max() > 1e-3
+
+
+def test_a_parabola_gives_a_slender_ellipse_or_a_failure():
+    result = fit_ellipse(np.stack([T, T * T], axis=1))
+    if not isinstance(result, Failure):
+        sound(result)
+        _, a, b, _ = parameters(result)
+        assert a > 100 * b
+
+
+def sound(result):
+    assert np.isfinite(result.normalised).all()
+    assert np.isfinite(result.normalised_from_image).all()
+    np.testing.assert_array_equal(result.normalised, result.normalised.T)
+    values = parameters(result)
+    assert np.isfinite(np.hstack(values)).all()
+    assert values[1] >= values[2] > 0
+
+
+def test_nothing_makes_it_raise():
+    """Thousands of bad inputs: a conic that is an ellipse, or a Failure; no exception, no warning, no NaN."""
+    rng = np.random.default_rng(0)
+    kinds = {"ok": 0, "failure": 0}
+    for i in range(4000):
+        count = int(rng.integers(0, 20))
+        points = rng.normal(size=(count, 2)) * 10.0 ** rng.uniform(-12, 12, 2)
+        match i % 8:
+            case 0:
+                points = np.round(points)
+            case 1 if count:
+                points = points[rng.integers(0, count, count)]  # repeated points
+            case 2:
+                points[:, 1] = points[:, 0] * rng.normal() + 1e-13 * rng.normal(size=count)
+            case 3:
+                points = points + 10.0 ** rng.uniform(0, 18)
+            case 4 if count:
+                points[rng.integers(count), rng.integers(2)] = rng.choice([np.nan, np.inf, -np.inf, 1e308, 1e-308])
+            case 5:
+                t = rng.normal(size=count)
+                points = np.stack([np.cosh(t), np.sinh(t)], axis=1) * 10.0 ** rng.uniform(-3, 3)
+            case 6:
+                points = rng.integers(0, 3, (count, 2)).astype(float)
+            case 7:
+                points = points * 10.0 ** rng.uniform(-300, 290)
+        result = fit_ellipse(points)
+        if isinstance(result, Failure):
+            assert isinstance(result.reason, Reason)
+            kinds["failure"] += 1
+        else:
+            sound(result)
+            kinds["ok"] += 1
+    assert min(kinds.values()) > 500
