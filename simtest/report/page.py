@@ -15,7 +15,7 @@ from simtest.report.surface3d import surface_3d
 from simtest.report.tables import SUMMARY_COLUMNS, heat_maps, summary_rows, surface_figure
 
 _IMAGE_BUDGET = 1_350_000
-_FIRST = 6
+_FIRST = 9
 _MAX_HEAT_MAPS = 18
 
 

@@ -140,8 +140,20 @@ def read_run(path: Path) -> Run:
     files = sorted((path / "gallery").glob("*.npz"))
     count = min(len(files), MAX_GALLERY)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, count).round().astype(int))] if count else []
-    items = tuple(_read_item(file) for file in chosen)
+    items = varied([_read_item(file) for file in chosen])
     return Run(path, _read_results(path / "results.parquet"), _read_summary(path / "summary.json"), items, len(files))
+
+
+def varied(items: list[GalleryItem]) -> tuple[GalleryItem, ...]:
+    """Order frames so that the first ones show every label once: of each label the middle one, then the others."""
+    by_label: dict[str, list[GalleryItem]] = {}
+    for item in items:
+        by_label.setdefault(str(item.meta.get("label")), []).append(item)
+    turns: list[tuple[int, int, GalleryItem]] = []
+    for place, group in enumerate(by_label.values()):
+        group.insert(0, group.pop(len(group) // 2))
+        turns += [(turn, place, item) for turn, item in enumerate(group)]
+    return tuple(item for _, _, item in sorted(turns, key=lambda entry: entry[:2]))
 
 
 def _read_results(path: Path) -> pl.DataFrame:

@@ -1,5 +1,6 @@
 """The experiment: which scenes, which swept parameters, how many realisations, which estimators."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,9 @@ class Group(Spec):
             lengths = {key: len(values) for key, values in table.items()}
             if not lengths or 0 in lengths.values() or len(set(lengths.values())) > 1:
                 raise ValueError(f"lists of one sweep must be equally long and not empty, got lengths {lengths}")
+        keys = [key for table in (*self.sweep, *self.pool) for key in table] + list(self.random)
+        if twice := next((key for key in keys if keys.count(key) > 1), None):
+            raise ValueError(f"{twice}: varied twice; a key may be in one table of sweep, pool and random")
         return self
 
 
@@ -90,7 +94,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
     data = apply_settings(read_toml(path), own, str(path))
-    data.setdefault("name", path.stem)
+    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
     experiment = validate(Experiment, data, str(path))
     if not settings:
         return experiment

@@ -10,7 +10,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
 from simtest.resources import shown
@@ -25,18 +26,21 @@ class Spec(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
 
-    @field_validator("*", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _not_coerced(cls, value: Any, info: ValidationInfo) -> Any:
+    def _not_coerced(cls, data: Any) -> Any:
         """Refuse what pydantic would turn into a number or a truth value: "50", true, 1."""
-        kinds = _leaf_types(cls.model_fields[info.field_name or ""].annotation)
-        if kinds <= {int, float, NoneType}:
-            for leaf in _leaves(value):
-                if isinstance(leaf, str | bytes | bool):
-                    raise ValueError(f"must be a number, not {'text' if isinstance(leaf, str | bytes) else 'true or false'}")
-        elif kinds == {bool} and not isinstance(value, bool):
-            raise ValueError("must be true or false")
-        return value
+        for name, value in data.items() if isinstance(data, Mapping) else ():
+            field: Any = cls.model_fields.get(name)
+            kinds = _leaf_types(field.annotation) if field else frozenset()
+            wrong, numeric = "", bool(kinds) and kinds <= {int, float, NoneType}
+            if numeric and any(isinstance(leaf, str | bytes | bool) for leaf in _leaves(value)):
+                wrong = "numbers" if isinstance(value, list | tuple) else "a number"
+            elif kinds == {bool} and not isinstance(value, bool):
+                wrong = "true or false"
+            if wrong:
+                raise PydanticCustomError("coerced", "must be {wrong}", {"field": name, "got": value, "wrong": wrong})
+        return data
 
 
 @cache
@@ -156,6 +160,7 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
     InputError
         If a path leads through something that is no table or beyond the end of a list.
     """
+    where = shown(where)
     result: dict[str, Any] = copy.deepcopy(dict(data))
     for path, value in settings.items():
         parts = path.split(".")
@@ -219,13 +224,15 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
             if not (e["type"] == "too_short" and any(p != e["loc"] and p[: len(e["loc"])] == e["loc"] for p in places))
         ]  # fmt: skip
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{where}: {_describe(errors[0], model, data)}{more}") from None
+        raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
 
 
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
-    path = ".".join(location) or "(top level)"
     kind, value = error["type"], error.get("input")
+    if kind == "coerced":
+        return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
+    path = ".".join(location) or "(top level)"
     if kind == "extra_forbidden":
         return f"{path} = {_short(value)}: unknown key{_suggest(error['loc'], model)}"
     if kind == "missing":

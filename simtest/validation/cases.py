@@ -1,14 +1,17 @@
 """From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
 
 import itertools
+import math
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from simtest.resources import find
+from simtest.anatomy.recipe import load_recipe
+from simtest.errors import InputError
+from simtest.resources import find, shown
 from simtest.seeds import Stage, generator
-from simtest.spec import Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
+from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Case:
     isolated : bool
         Whether isolated highlights alone count as true ones.
     command : str
-        Renders the scene alone (drawn values at the scene file's).
+        Renders the scene alone, with drawn values at the scene file's and without --out.
     """
 
     label: str
@@ -89,12 +92,33 @@ def expand(experiment: Experiment) -> list[Case]:
     Raises
     ------
     InputError
-        If a scene is missing or malformed, or a swept value does not fit: found before anything is rendered.
+        If a scene is missing or malformed, a swept value or an end of a drawn range does not fit, or two settings
+        share a name: found before anything is rendered.
     """
     cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
+    names: set[str] = set()
     for case in cases:
-        case.scene(experiment, case.numbers()[0])
+        if case.name in names:
+            raise InputError(
+                f"experiment {experiment.name}: two settings are called {shown(case.setting)!r}; "
+                "give the groups different labels, and each value of a sweep once"
+            )
+        names.add(case.name)
+        _check(case, experiment)
     return cases
+
+
+def _check(case: Case, experiment: Experiment) -> None:
+    """Raise `InputError` where a scene of a case would be malformed; a drawn range is tried at both ends."""
+    first, _ = case.scene(experiment, case.numbers()[0])
+    lows = {path: float(d.low) for path, d in case.random.items()}
+    # The upper end itself is never drawn.
+    highs = {path: max(math.nextafter(d.high, -math.inf), d.low) for path, d in case.random.items()}
+    ends = [{path: value} for tried in (lows, highs) for path, value in tried.items()]
+    for values in ends if len(lows) < 2 else (*ends, lows, highs):
+        scene_from_dict(apply_settings(case.data, values, case.where), case.where)
+    if isinstance(first.surface, AnatomySurface) and (file := first.surface.file()).suffix == ".toml":
+        load_recipe(file)
 
 
 def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
@@ -110,8 +134,8 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
             label = group.label or scene_from_dict(data, str(path)).surface.label
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}
-            again = " ".join(f"--set {shlex.quote(f'{k}={_toml(v)}')}" for k, v in {**group.set, **values}.items())
-            command = f"simtest render {group.scene} {again} --out frame".replace("  ", " ")
+            again = ["simtest render", group.scene, set_options({**group.set, **values})]
+            command = " ".join(part for part in again if part)
             random = dict(group.random)
             cases.append(Case(label, setting, part, columns, data, str(path), random, count, group.isolated, command))
     return cases
@@ -127,6 +151,11 @@ def _short(path: str, among: Mapping[str, Any]) -> str:
     """Give the last part of a key path, or all of it where that is not unique."""
     last = path.rsplit(".", 1)[-1]
     return last if sum(key.rsplit(".", 1)[-1] == last for key in among) == 1 else path
+
+
+def set_options(values: Mapping[str, Any]) -> str:
+    """Write values by key path as command-line options that read back the same."""
+    return " ".join(f"--set {shlex.quote(f'{key}={_toml(value)}')}" for key, value in values.items())
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,10 +18,11 @@ from simtest.errors import InputError
 from simtest.estimators import Estimator, load_estimators
 from simtest.files import write_atomically, write_json
 from simtest.render import Session, backend
+from simtest.resources import shown
 from simtest.spec import Experiment, Scene
 from simtest.spec.scene import AnatomySurface
 from simtest.validation import gallery
-from simtest.validation.cases import Case, expand, swept_example
+from simtest.validation.cases import Case, expand, set_options, swept_example
 from simtest.validation.metrics import table
 from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
@@ -156,7 +158,8 @@ class _Work:
                 rows += made.rows
                 if index in shown and number == case.numbers()[0]:
                     item = self.folder / "gallery" / f"{index:04d}.npz"
-                    gallery.save(item, self.session, case, seen, made, case.command)
+                    again = f"{case.command} {set_options(drawn)} --out frame".replace("  ", " ")
+                    gallery.save(item, self.session, case, seen, made, again)
                 done += 1
             write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
         if progress:
@@ -171,14 +174,7 @@ class _Work:
 
 def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: str) -> Path:
     """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
-    mine = {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS}
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: is a file; must be a folder")
-    strangers = [p.name for p in folder.iterdir() if p.name not in mine] if folder.is_dir() else []
-    if strangers:
-        raise InputError(
-            f"--out {folder}: holds {strangers[0]}, which is no part of a run; must be empty or hold a run"
-        )
+    _check_folder(folder)
     parts = folder / PARTS
     fingerprint = {
         "experiment": experiment.model_dump(mode="json"),
@@ -190,17 +186,38 @@ def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: s
     }
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
     record = parts / "fingerprint.json"
-    if not (record.is_file() and json.loads(record.read_text() or "null") == digest):
-        # Results of an earlier run stay until the new ones replace them.
-        _remove(parts)
-        _remove(folder / "gallery")
     try:
+        if not (record.is_file() and record.read_text(encoding="utf-8", errors="replace").strip() == f'"{digest}"'):
+            # Results of an earlier run stay until the new ones replace them.
+            _remove(parts)
+            _remove(folder / "gallery")
         parts.mkdir(parents=True, exist_ok=True)
         (folder / "gallery").mkdir(exist_ok=True)
         write_json(record, digest)
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written ({error.strerror})") from error
+        raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
     return parts
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder that holds something else than a run; what a killed run was writing is removed."""
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
+        held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
+        for name in [name for name in held if re.fullmatch(r"\.(results|summary|index)\.\d+\.part\.\w+", name)]:
+            held.pop(name).unlink()
+    except OSError as error:
+        raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
+    strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
+    # Folders of those names alone may be anyone's, and a run replaces them.
+    if not strangers and not held.keys() & {"results.parquet", PARTS}:
+        strangers = sorted(held)
+    if strangers:
+        stranger = shown(strangers[0])
+        raise InputError(
+            f"--out {shown(folder)}: holds {stranger}, which is no part of a run; must be empty or hold a run"
+        )
 
 
 def _part_file(parts: Path, index: int) -> Path:

@@ -399,7 +399,7 @@ def test_long_gallery_is_thinned(tmp_path):
     make_run(tmp_path, "noise", items=26)
     run = read_run(tmp_path)
     assert (len(run.gallery), run.gallery_total) == (24, 26)
-    assert [run.gallery[0].name, run.gallery[-1].name] == ["item_00", "item_25"]
+    assert {"item_00", "item_25"} <= {item.name for item in run.gallery}
 
 
 def test_colour_frames_and_odd_names_are_drawn(tmp_path):

@@ -1,0 +1,162 @@
+"""Isophotes of analytic images: where they lie, to a hundredth of a pixel, and when there is none."""
+
+import numpy as np
+import pytest
+
+from simtest.errors import Failure, InputError, Reason
+from simtest.geometry import Patch, ellipse_of_conic, fit_ellipse, smooth
+from simtest.geometry.isophotes import encloses, polygon_area
+
+WIDTH, HEIGHT = 90, 70
+CENTRE = np.array([41.3, 33.8])
+SIGMA = 9.0
+
+
+def centres():
+    """Pixel centres: column i, row j lies at (i + 0.5, j + 0.5)."""
+    return np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+
+
+def spot(centre=CENTRE, sigma=SIGMA, stretch=1.0):
+    x, y = centres()
+    squared = ((x - centre[0]) / stretch) ** 2 + (y - centre[1]) ** 2
+    return np.exp(-squared / (2 * sigma**2)).astype(np.float32)
+
+
+def patch_of(image, box=None, peak=None):
+    patch = Patch.cut(image, box or (0, 0, image.shape[1], image.shape[0]), peak)
+    assert isinstance(patch, Patch)
+    return patch
+
+
+@pytest.mark.parametrize("box", [None, (5, 3, 80, 60), (11, 10, 60, 50)])
+@pytest.mark.parametrize("t", [0.3, 0.5, 0.7])
+def test_contour_of_a_radial_image_lies_where_the_formula_says(box, t):
+    """A shift of half a pixel, or x and y exchanged, would be 20 times the tolerance or more."""
+    image = spot()
+    patch = patch_of(image, box)
+    points = patch.isophote(t)
+    radius = SIGMA * np.sqrt(-2 * np.log(t * patch.peak_value))
+    distance = np.linalg.norm(points - CENTRE, axis=1)
+    # Marching squares interpolates linearly: off by f''/(8 f') along the radius and by 1/(8 r) along the contour.
+    assert np.abs(distance - radius).max() < (1 / radius + abs(radius / SIGMA**2 - 1 / radius)) / 8 < 0.025
+    fitted = ellipse_of_conic(fit_ellipse(points[:-1]).image)
+    np.testing.assert_allclose(fitted.centre, CENTRE, atol=1e-3)
+    np.testing.assert_allclose([fitted.semi_major, fitted.semi_minor], radius, atol=0.015)
+    np.testing.assert_array_equal(points[0], points[-1])
+
+
+def test_x_is_the_column():
+    points = patch_of(spot(stretch=1.8)).isophote(0.5)
+    fitted = ellipse_of_conic(fit_ellipse(points[:-1]).image)
+    assert fitted.semi_major / fitted.semi_minor == pytest.approx(1.8, abs=1e-3)
+    assert abs(fitted.angle) < 1e-3
+
+
+@pytest.mark.parametrize("shift", np.linspace(0, 1, 6))
+def test_peak_is_found_between_pixels(shift):
+    centre = CENTRE + [shift, -0.7 * shift]
+    patch = patch_of(spot(centre))
+    np.testing.assert_allclose(patch.peak_px, centre, atol=2e-3)
+    assert patch.peak_value == spot(centre).max()
+    moved = patch_of(spot(centre), (20, 10, 50, 50))
+    np.testing.assert_allclose(moved.peak_px, patch.peak_px, atol=1e-12)
+
+
+def test_peak_at_the_border_keeps_its_pixel():
+    patch = patch_of(spot((0.5, 30.5)))
+    np.testing.assert_allclose(patch.peak_px, [0.5, 30.5], atol=1e-3)
+    assert patch_of(spot((-3, 30.5))).peak_px[0] == 0.5
+
+
+def test_a_given_peak_and_the_brightest_pixel():
+    image = spot((25, 35), 4) + 2 * spot((65, 35), 4)
+    assert patch_of(image).peak_px[0] == pytest.approx(65, abs=0.01)
+    dim = patch_of(image, (0, 0, WIDTH, HEIGHT), (25, 35))
+    assert dim.peak_px[0] == pytest.approx(25, abs=0.01)
+    assert dim.peak_value == pytest.approx(1, abs=0.02)
+    points = dim.isophote(0.5)
+    np.testing.assert_allclose(points.mean(axis=0), [25, 35], atol=0.2)
+
+
+def test_the_enclosing_contour_is_chosen_the_largest_of_several():
+    """A bump beside the peak and a dent at its side make contours that do not enclose it."""
+    image = spot((45, 35), 10) + 0.55 * spot((12, 12), 3)
+    points = patch_of(image).isophote(0.5)
+    assert encloses(points, np.array([45, 35.0]))
+    np.testing.assert_allclose(points.mean(axis=0), [45, 35], atol=0.3)
+    # A ring around the peak: the level is crossed three times, the outermost crossing is the isophote.
+    x, y = centres()
+    radius = np.hypot(x - 45, y - 35)
+    ring = (np.exp(-(radius**2) / 18) + 0.8 * np.exp(-((radius - 15) ** 2) / 8)).astype(np.float32)
+    outermost = patch_of(ring, None, (44, 34)).isophote(0.5)
+    assert np.hypot(*(outermost - [45, 35]).T).min() > 15
+
+
+def test_open_contours_fail():
+    for centre in ((3, 35), (45, 68), (88, 2)):
+        result = patch_of(spot(centre)).isophote(0.5)
+        assert isinstance(result, Failure)
+        assert result.reason is Reason.NO_CLOSED_ISOPHOTE
+    # The same spot closes higher up.
+    near_edge = patch_of(spot((8, 35)))
+    assert isinstance(near_edge.isophote(0.5), Failure)
+    assert not isinstance(near_edge.isophote(0.8), Failure)
+    # Closed in the frame but cut by the region.
+    assert isinstance(patch_of(spot(), (35, 28, 14, 12)).isophote(0.5), Failure)
+
+
+def test_a_region_too_thin_for_a_contour_fails():
+    assert isinstance(patch_of(spot(), (30, 33, 20, 2)).isophote(0.5), Failure)
+
+
+def test_what_has_no_peak_fails():
+    flat = np.full((HEIGHT, WIDTH), 0.3, np.float32)
+    dark = np.zeros((HEIGHT, WIDTH), np.float32)
+    for image, reason in ((flat, Reason.NO_PEAK), (dark, Reason.NO_PEAK), (-spot() - 1, Reason.NO_PEAK)):
+        result = Patch.cut(image, (0, 0, WIDTH, HEIGHT))
+        assert isinstance(result, Failure)
+        assert result.reason is reason
+    holed = spot()
+    holed[40, 40] = np.nan
+    result = Patch.cut(holed, (0, 0, WIDTH, HEIGHT))
+    assert isinstance(result, Failure)
+    assert result.reason is Reason.NOT_FINITE
+    assert isinstance(Patch.cut(holed, (0, 0, 30, 30)), Patch)
+
+
+@pytest.mark.parametrize("box", [(-1, 0, 5, 5), (0, 0, 0, 5), (0, 0, WIDTH + 1, 5), (0, HEIGHT, 1, 1)])
+def test_a_region_outside_the_frame_is_refused(box):
+    with pytest.raises(InputError, match="roi"):
+        Patch.cut(spot(), box)
+
+
+@pytest.mark.parametrize("t", [0.0, 1.0, -0.1, 2.0, float("nan")])
+def test_isovalues_outside_the_open_interval_are_refused(t):
+    with pytest.raises(InputError, match="isovalue"):
+        patch_of(spot()).isophote(t)
+
+
+def test_smoothing_keeps_the_place_and_adds_the_variances():
+    smoothed = smooth(spot(), 3.0)
+    patch = patch_of(smoothed)
+    np.testing.assert_allclose(patch.peak_px, CENTRE, atol=2e-3)
+    radius = np.sqrt((SIGMA**2 + 9) * -2 * np.log(0.5))
+    distance = np.linalg.norm(patch.isophote(0.5) - CENTRE, axis=1)
+    # 0.03: OpenCV cuts its kernel off at 4 standard deviations, and the peak is taken at a pixel's centre.
+    np.testing.assert_allclose(distance.mean(), radius, atol=0.03)
+    np.testing.assert_array_equal(smooth(spot(), 0), spot())
+    assert float(smoothed.sum()) == pytest.approx(float(spot().sum()), rel=1e-4)
+
+
+def test_area_and_even_odd_rule():
+    square = np.array([[0.0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]) + 5000
+    assert polygon_area(square) == pytest.approx(12)
+    assert polygon_area(square[::-1]) == pytest.approx(-12)
+    assert encloses(square, np.array([5001.0, 5001]))
+    assert not encloses(square, np.array([5005.0, 5001]))
+    assert not encloses(square, np.array([4999.0, 5001]))
+    # A U: the notch is outside.
+    u = np.array([[0.0, 0], [5, 0], [5, 5], [4, 5], [4, 1], [1, 1], [1, 5], [0, 5], [0, 0]])
+    assert not encloses(u, np.array([2.5, 3]))
+    assert encloses(u, np.array([0.5, 3]))
