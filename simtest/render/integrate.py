@@ -72,6 +72,9 @@ class Tracer:
             mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)),
         )
         si = self.scene.ray_intersect(ray)
+        # Mitsuba interpolates the hit between the shape's corners; those of the plane lie so far beyond the view that
+        # 1e-3 mm are lost, a per mille of the radiance. The point along the ray keeps the digits of t.
+        si.p = dr.select(si.is_valid(), ray(si.t), si.p)
         total, diffuse = self._direct(si)
         indirect = mi.Spectrum(0)
         if path_depth > 2:

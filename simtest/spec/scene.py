@@ -15,7 +15,7 @@ from simtest.spec.reading import Spec, apply_settings, read_toml, validate
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Millimetres = Annotated[float, Field(gt=0, le=1e6)]
+Millimetres = Annotated[float, Field(ge=1e-3, le=1e6)]
 Curvature = Annotated[float, Field(ge=-10, le=10)]
 
 
@@ -186,8 +186,8 @@ class CameraSpec(Spec):
 
     width: int = Field(406, ge=1, le=16384, description="px")
     height: int = Field(406, ge=1, le=16384, description="px")
-    fx: float = Field(406.0, gt=0, le=1e6, description="focal length along x, px")
-    fy: float = Field(406.0, gt=0, le=1e6, description="focal length along y, px")
+    fx: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along x, px")
+    fy: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along y, px")
     cx: float | None = Field(None, ge=-1e6, le=1e6, description="principal point, px; default the image's centre")
     cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point, px; default the image's centre")
     skew: float = Field(0.0, ge=-1e6, le=1e6, description="px")
