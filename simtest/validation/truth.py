@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
 from simtest.detection import contrast, half_height_component
 from simtest.geometry import smooth
 from simtest.render import TrueHighlight
 
 Image = npt.NDArray[np.float32]
 
-PEAK_WINDOW_PX = 3
-"""The radiance's local maximum is looked for this near to the true BP, which lies between pixels."""
+MAX_CLIMB_PX = 12
+"""Smoothing moves a lopsided highlight's maximum away from its true BP, by no more than this."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,31 @@ def judge(
         In the same order.
     """
     smoothed = smooth(radiance, DEFAULT_SMOOTHING_PX)
-    return [_judge(highlight, smoothed, noise_sigma * full_scale) for highlight in highlights]
+    peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
+    owners = _owners(highlights, peaks)
+    noise = noise_sigma * full_scale
+    return [_judge(h, smoothed, peak, owners[peak] is h, noise) for h, peak in zip(highlights, peaks, strict=True)]
 
 
-def _judge(highlight: TrueHighlight, smoothed: Image, noise: float) -> JudgedHighlight:
+def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:
+    """Give to each maximum of the smoothed frame the true BP nearest to it; smoothing may merge several."""
+    owners: dict[tuple[int, int], TrueHighlight] = {}
+    for highlight, peak in zip(highlights, peaks, strict=True):
+        place = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
+        rival = owners.setdefault(peak, highlight)
+        if np.hypot(*(highlight.bp_px - place)) < np.hypot(*(rival.bp_px - place)):
+            owners[peak] = highlight
+    return owners
+
+
+def _judge(
+    highlight: TrueHighlight, smoothed: Image, peak: tuple[int, int], owns_peak: bool, noise: float
+) -> JudgedHighlight:
     if not highlight.lit:
         return JudgedHighlight(highlight, 0.0, "in shadow")
-    row, column = _peak_pixel(smoothed, highlight)
+    if not owns_peak:
+        return JudgedHighlight(highlight, 0.0, "part of a brighter one")
+    row, column = peak
     component = half_height_component(smoothed, row, column)
     if component is None:
         return JudgedHighlight(highlight, 0.0, "part of a brighter one")
@@ -84,9 +102,14 @@ def _judge(highlight: TrueHighlight, smoothed: Image, noise: float) -> JudgedHig
 
 
 def _peak_pixel(smoothed: Image, highlight: TrueHighlight) -> tuple[int, int]:
-    """Give row and column of the brightest smoothed pixel next to the true BP."""
-    x, y = (int(v) for v in highlight.bp_px)
-    top, left = max(y - PEAK_WINDOW_PX, 0), max(x - PEAK_WINDOW_PX, 0)
-    window = smoothed[top : y + PEAK_WINDOW_PX + 1, left : x + PEAK_WINDOW_PX + 1]
-    row, column = np.unravel_index(int(window.argmax()), window.shape)
-    return int(row) + top, int(column) + left
+    """Give row and column of the local maximum that a climb from the true BP reaches."""
+    column, row = (int(v) for v in highlight.bp_px)
+    row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
+    for _ in range(MAX_CLIMB_PX):
+        top, left = max(row - 1, 0), max(column - 1, 0)
+        window = smoothed[top : row + 2, left : column + 2]
+        step = divmod(int(window.argmax()), window.shape[1])
+        if (step[0] + top, step[1] + left) == (row, column):
+            break
+        row, column = step[0] + top, step[1] + left
+    return row, column

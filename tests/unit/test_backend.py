@@ -1,0 +1,305 @@
+"""The choice of the rendering backend: bad libLLVMs are told apart, none harms the process, and the cache is harmless."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from simtest.cli import main as command_line
+from simtest.errors import BackendError
+from simtest.render import backend
+from simtest.render.backend import Candidate, candidates, choose_library, probe, requested_variant
+
+SYSTEM = Path("/usr/lib/x86_64-linux-gnu")
+MAIN = "from simtest.cli.main import main; main()"
+
+
+def no_file(folder):
+    return folder / "none.so"
+
+
+def empty_file(folder):
+    (folder / "empty.so").touch()
+    return folder / "empty.so"
+
+
+def text_file(folder):
+    (folder / "text.so").write_text("not a library\n")
+    return folder / "text.so"
+
+
+def installed(name):
+    def give(_):
+        if not (SYSTEM / name).is_file():
+            pytest.skip(f"{name} is not installed")
+        return SYSTEM / name
+
+    return give
+
+
+BAD = {
+    "folder": (lambda folder: folder, "is a folder; must be the file libLLVM.so itself"),
+    "missing": (no_file, "no such file"),
+    "empty": (empty_file, "is not a usable libLLVM ("),
+    "text": (text_file, "is not a usable libLLVM ("),
+    "another library": (installed("libm.so.6"), "lacks core API"),
+    "LLVM 14": (installed("libLLVM-14.so.1"), "(14) is too old"),
+    "LLVM 15": (installed("libLLVM-15.so.1"), "aborts when compiling a kernel (signal 6)"),
+}
+
+
+@pytest.fixture(autouse=True)
+def clean(monkeypatch, tmp_path):
+    """Keep the user's cache, variables and loaded renderer out of these tests."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(backend.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.delenv(backend.VARIANT_VARIABLE, raising=False)
+
+
+@pytest.fixture
+def nothing_else(monkeypatch):
+    """Leave nothing in reach but the variable's library."""
+    monkeypatch.setattr(backend, "_packaged_library", lambda: None)
+    monkeypatch.setattr(backend, "_system_libraries", lambda: [])
+    monkeypatch.setattr(backend, "_drjit_loaded", lambda: False)
+
+
+@pytest.fixture
+def no_child(monkeypatch):
+    """Count the child processes instead of starting them; each finds its library usable."""
+    tried = []
+
+    def run(path):
+        tried.append(path)
+        return "ok"
+
+    monkeypatch.setattr(backend, "_run_probe", run)
+    return tried
+
+
+def simtest(*arguments, **variables):
+    environment = {**os.environ, **variables}
+    command = [sys.executable, "-c", MAIN, *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def run_here(monkeypatch, capfd, *arguments):
+    """Run the command in this process; gives exit code, output and error lines."""
+    monkeypatch.setattr(sys, "argv", ["simtest", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        command_line.main()
+    output, errors = capfd.readouterr()
+    return stop.value.code, output, errors.splitlines()
+
+
+# The doctor ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.render
+def test_doctor_says_that_it_renders(tmp_path):
+    bad = no_file(tmp_path)
+    done = simtest("doctor", "--json", DRJIT_LIBLLVM_PATH=str(bad), SIMTEST_VARIANT="llvm_ad_rgb")
+    assert done.stderr == ""
+    report = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert report["can_render"] is True
+    assert report["problem"] is None
+    assert report["variant"] == "llvm_ad_rgb"
+    assert Path(report["library"]).is_file()
+    # A bad variable is reported, and passed over.
+    assert report["candidates"][0] == {"origin": "DRJIT_LIBLLVM_PATH", "path": str(bad), "verdict": "no such file"}
+    assert report["candidates"][-1]["verdict"] == "ok"
+    assert set(report["versions"]) == {"mitsuba", "drjit"}
+
+
+@pytest.mark.render
+def test_doctor_knows_variants():
+    done = simtest("doctor", "--json", SIMTEST_VARIANT="llvm_nope")
+    report = json.loads(done.stdout)
+    assert done.returncode == 1
+    assert report["can_render"] is False
+    assert "variant 'llvm_nope': unknown" in report["problem"]
+    assert "allowed: " in report["problem"]
+    assert "\n" not in report["problem"]
+
+
+# Bad libraries ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("nothing_else")
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_library_gives_its_own_message_and_three_ways_to_mend_it(name, monkeypatch, tmp_path, capfd):
+    make, verdict = BAD[name]
+    library, place = make(tmp_path), tmp_path / "place"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    monkeypatch.setenv(backend.LIBRARY_VARIABLE, str(library))
+    soft, hard = resource.getrlimit(resource.RLIMIT_CORE)
+    resource.setrlimit(resource.RLIMIT_CORE, (hard, hard))
+    try:
+        tried = probe(candidates()[0])
+    finally:
+        resource.setrlimit(resource.RLIMIT_CORE, (soft, hard))
+    assert verdict in tried.verdict
+    assert "\n" not in tried.verdict
+    assert not list(place.iterdir())
+
+    code, output, errors = run_here(monkeypatch, capfd, "doctor")
+    assert (code, errors) == (1, [])
+    assert "rendering   does not work" in output
+    for word in (str(library), verdict, "(1) pip install karellen-llvm-core", "(2) install", "(3) set DRJIT_LIBLLVM"):
+        assert word in output
+
+    code, output, errors = run_here(monkeypatch, capfd, "render", "plane", "--out", str(place))
+    assert (code, output, len(errors)) == (1, "", 1)
+    assert errors[0].startswith("simtest: no usable libLLVM: ")
+    assert "(3) set DRJIT_LIBLLVM_PATH" in errors[0]
+    assert not list(place.iterdir())
+
+    with pytest.raises(BackendError, match="no usable libLLVM: ") as error:
+        backend.load()
+    assert verdict in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("nothing_else")
+def test_no_library_at_all(monkeypatch):
+    assert candidates() == []
+    with pytest.raises(BackendError, match=r"no usable libLLVM: none found. To mend it: \(1\)"):
+        backend.load()
+    # Nothing to choose, and nothing changed.
+    assert backend.LIBRARY_VARIABLE not in os.environ
+    monkeypatch.setenv(backend.LIBRARY_VARIABLE, "")
+    assert candidates() == []
+
+
+def test_a_probe_that_hangs_is_given_up_and_not_remembered(monkeypatch, tmp_path):
+    monkeypatch.setattr(backend, "PROBE_TIMEOUT_S", 0.01)
+    library = text_file(tmp_path)
+    assert probe(Candidate("test", str(library))).verdict == "could not be tried (TimeoutExpired)"
+    assert not backend._cache_file().exists()
+
+
+# Candidates ------------------------------------------------------------------------------------------------------
+
+
+def test_candidates_come_in_order_and_an_empty_variable_counts_as_unset(monkeypatch):
+    monkeypatch.setattr(backend, "_packaged_library", lambda: "/packaged")
+    monkeypatch.setattr(backend, "_system_libraries", lambda: ["/new", "/old"])
+    others = [("pip package karellen-llvm-core", "/packaged"), ("system", "/new"), ("system", "/old")]
+    assert [(c.origin, c.path) for c in candidates()] == others
+    monkeypatch.setenv(backend.LIBRARY_VARIABLE, "")
+    assert [(c.origin, c.path) for c in candidates()] == others
+    assert backend.library_in_use() is None
+    monkeypatch.setenv(backend.LIBRARY_VARIABLE, "/mine")
+    assert [(c.origin, c.path) for c in candidates()] == [("DRJIT_LIBLLVM_PATH", "/mine"), *others]
+
+
+def test_the_first_that_works_is_chosen_and_the_rest_is_not_tried(monkeypatch, tmp_path, no_child):
+    first, second = tmp_path / "first.so", tmp_path / "second.so"
+    for file in (first, second):
+        file.write_text("x")
+    monkeypatch.setattr(backend, "_packaged_library", lambda: str(tmp_path))
+    monkeypatch.setattr(backend, "_system_libraries", lambda: [str(first), str(second)])
+    chosen, tried = choose_library()
+    assert chosen == Candidate("system", str(first), "ok")
+    assert [candidate.verdict for candidate in tried] == ["is a folder; must be the file libLLVM.so itself", "ok"]
+    assert no_child == [str(first)]
+
+
+def test_the_packaged_library_is_a_file():
+    packaged = backend._packaged_library()
+    assert packaged is None or Path(packaged).is_file()
+
+
+def test_system_libraries_are_files_and_each_comes_once():
+    found = backend._system_libraries()
+    assert len(set(found)) == len(found)
+    assert all(Path(path).is_file() for path in found)
+
+
+# The cache -------------------------------------------------------------------------------------------------------
+
+
+def test_a_verdict_is_kept_by_path_size_and_time(tmp_path, no_child):
+    library = tmp_path / "library.so"
+    library.write_text("one")
+    os.utime(library, ns=(1, 1))
+    assert probe(Candidate("test", str(library))).verdict == "ok"
+    assert probe(Candidate("test", str(library))).verdict == "ok"
+    assert len(no_child) == 1
+    file = tmp_path / "cache" / "simtest" / "libllvm.json"
+    (key,) = json.loads(file.read_text())
+    assert key.startswith(f"{library}|3|1|drjit ")
+    for change in (
+        lambda: os.utime(library, ns=(2, 2)),
+        lambda: (library.write_text("three"), os.utime(library, ns=(2, 2))),
+        lambda: library.rename(tmp_path / "other.so"),
+    ):
+        before = len(no_child)
+        change()
+        path = next(path for path in (library, tmp_path / "other.so") if path.exists())
+        probe(Candidate("test", str(path)))
+        assert len(no_child) == before + 1
+    assert [path.name for path in file.parent.iterdir()] == ["libllvm.json"]
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b'"text"', b"null", b"\xff\xfe\x00", b"{}"])
+def test_a_corrupt_cache_does_no_harm(tmp_path, no_child, content):
+    library = text_file(tmp_path)
+    file = tmp_path / "cache" / "simtest" / "libllvm.json"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    assert probe(Candidate("test", str(library))).verdict == "ok"
+    assert len(no_child) == 1
+    assert list(json.loads(file.read_text()).values()) == ["ok"]
+
+
+def test_a_cache_that_cannot_be_written_costs_only_time(tmp_path, no_child):
+    library = text_file(tmp_path)
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    for _ in range(2):
+        assert probe(Candidate("test", str(library))).verdict == "ok"
+    assert len(no_child) == 2
+
+
+# Variants --------------------------------------------------------------------------------------------------------
+
+
+def test_the_variant_is_the_argument_or_the_variable_or_the_default(monkeypatch):
+    assert requested_variant() == "llvm_ad_mono"
+    monkeypatch.setenv(backend.VARIANT_VARIABLE, "")
+    assert requested_variant() == "llvm_ad_mono"
+    monkeypatch.setenv(backend.VARIANT_VARIABLE, "llvm_ad_rgb")
+    assert requested_variant() == "llvm_ad_rgb"
+    assert requested_variant("cuda_ad_mono") == "cuda_ad_mono"
+
+
+@pytest.mark.parametrize("name", ["nope", "scalar_mono", "LLVM_AD_MONO"])
+def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
+    for given in (name, None):
+        monkeypatch.setenv(backend.VARIANT_VARIABLE, name)
+        with pytest.raises(BackendError) as error:
+            backend.load(given)
+        text = str(error.value)
+        assert text.startswith(f"variant '{name}': unknown to this Mitsuba; allowed: ")
+        assert "llvm_ad_mono" in text
+        assert "cuda_ad_mono" in text
+        assert "\n" not in text
+
+
+# Importing -------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_set_or_loaded_at_import():
+    code = (
+        "import os, sys; before = dict(os.environ)\n"
+        "import simtest.render, simtest.render.backend, simtest.render.doctor, simtest.render.session\n"
+        "assert dict(os.environ) == before\n"
+        "assert not {'mitsuba', 'drjit'} & set(sys.modules), 'loaded'\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

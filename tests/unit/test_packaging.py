@@ -1,0 +1,47 @@
+"""The wheel holds the scenes, experiments and recipes, and they are found by name from any folder."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+FIND = """
+from simtest.resources import find
+from simtest.spec import load_experiment, load_scene
+import simtest
+assert "site" in simtest.__file__, simtest.__file__
+load_scene("cylinder"); load_experiment("overview")
+print(find("colon", "meshes"))
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    return next(folder.glob("*.whl"))
+
+
+def test_wheel_holds_data_and_marker(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    shipped = [*ROOT.glob("scenes/**/*.toml"), *ROOT.glob("meshes/*.toml")]
+    assert len(shipped) >= 10
+    for file in shipped:
+        assert f"simtest/_data/{file.relative_to(ROOT)}" in names
+    assert {"simtest/py.typed", "simtest/report/template.html.j2"} <= names
+    assert not [name for name in names if name.startswith(("tests/", "docs/"))]
+
+
+def test_data_are_found_by_name_from_another_folder(wheel, tmp_path):
+    site = tmp_path / "site"
+    zipfile.ZipFile(wheel).extractall(site)
+    child = subprocess.run(
+        [sys.executable, "-c", FIND], cwd=tmp_path, env={"PYTHONPATH": str(site)}, capture_output=True, text=True
+    )
+    assert child.returncode == 0, child.stderr
+    assert str(site) in child.stdout
