@@ -4,16 +4,14 @@ The misfit w between normal and bisector is a two-vector field over the image; i
 from the pixels whose own step lands next to them (theory.md sections 3 and 6).
 """
 
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
-from simtest.anatomy.base import tangent_basis
+from simtest.anatomy.base import SurfacePoints, tangent_basis
+from simtest.geometry.camera import Camera
 from simtest.render.frames import Array, Radiance, TrueHighlight
-
-if TYPE_CHECKING:
-    from simtest.anatomy import SurfacePoints
-    from simtest.render.session import Session
+from simtest.spec.scene import Scene
 
 MIN_GAIN = 0.05
 """Where abs(1 + d k) is smaller the point is no point but a streak; seeds there are not followed."""
@@ -26,7 +24,20 @@ MAX_STEP_PX = 4.0
 MAX_SEEDS = 4000
 
 
-def misfit(points: "SurfacePoints", light: Array) -> Array:
+class Caster(Protocol):
+    """What the search needs of a rendering session."""
+
+    scene: Scene
+    camera: Camera
+
+    def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
+        """Give the exact points on the rays of pixels (see `Session.cast`)."""
+
+    def lit(self, positions: Array, light: int) -> Any:
+        """Tell which points a light reaches (see `Session.lit`)."""
+
+
+def misfit(points: SurfacePoints, light: Array) -> Array:
     """Give the normal minus the bisector of the directions to light and camera, across the sightline.
 
     Parameters
@@ -52,12 +63,12 @@ def misfit(points: "SurfacePoints", light: Array) -> Array:
     return np.stack([np.sum(first * gap, axis=1), np.sum(second * gap, axis=1)], axis=1)
 
 
-def find(session: "Session", radiance: Radiance, stride: int) -> list[TrueHighlight]:
+def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight]:
     """Find the true highlights of all lights in view.
 
     Parameters
     ----------
-    session : Session
+    session : Caster
         Casts exact rays.
     radiance : Radiance
         Of the same frame.
@@ -82,14 +93,14 @@ def find(session: "Session", radiance: Radiance, stride: int) -> list[TrueHighli
     return sorted(found, key=lambda highlight: -highlight.radiance)
 
 
-def _seed_grid(session: "Session", stride: int) -> tuple[Array, "SurfacePoints"]:
+def _seed_grid(session: Caster, stride: int) -> tuple[Array, SurfacePoints]:
     """Give pixel centres on a grid, shape (h, w, 2), with their exact points, flattened."""
     camera = session.camera
     pixels = camera.pixel_centres()[stride // 2 :: stride, stride // 2 :: stride]
     return pixels, session.cast(pixels.reshape(-1, 2))[0]
 
 
-def _seeds(pixels: Array, points: "SurfacePoints", light: Array, stride: int) -> Array:
+def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> Array:
     """Give the grid points whose own Newton step lands within two cells, shape (N, 2), px."""
     height, width = pixels.shape[:2]
     if min(height, width) < 3:
@@ -107,7 +118,7 @@ def _seeds(pixels: Array, points: "SurfacePoints", light: Array, stride: int) ->
     return _distinct(seeds)[:MAX_SEEDS]
 
 
-def _newton(session: "Session", seeds: Array, light: Array) -> Array:
+def _newton(session: Caster, seeds: Array, light: Array) -> Array:
     """Refine seeds to zeros of the misfit; gives those that converged, shape (M, 2), px."""
     position = seeds.copy()
     step_length = np.full(len(position), np.inf)
@@ -148,7 +159,7 @@ def _distinct(points: Array) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _describe(session: "Session", radiance: Radiance, solutions: Array, light: int) -> list[TrueHighlight]:
+def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[TrueHighlight]:
     points, _, _ = session.cast(solutions)
     lit = session.lit(points.position, light)
     total = radiance.total if radiance.total.ndim == 2 else radiance.total.mean(axis=2)

@@ -29,7 +29,7 @@ def test_round_trips(fx, fy, cx, cy, skew, pixels):
 
 
 def test_projection_is_k_times_the_point():
-    points = np.random.default_rng(0).normal(size=(50, 3)) + [0, 0, 8]
+    points = np.array([0, 0, 8]) + np.random.default_rng(0).normal(size=(50, 3))
     by_hand = points @ np.array([[500.0, 17, 331.2], [0, 430, 225.7], [0, 0, 1]]).T
     np.testing.assert_allclose(CAMERA.project(points), by_hand[:, :2] / by_hand[:, 2:], rtol=1e-14)
     np.testing.assert_array_equal(CAMERA.K, [[500, 17, 331.2], [0, 430, 225.7], [0, 0, 1]])

@@ -55,7 +55,7 @@ def test_x_is_the_column():
 
 @pytest.mark.parametrize("shift", np.linspace(0, 1, 6))
 def test_peak_is_found_between_pixels(shift):
-    centre = CENTRE + [shift, -0.7 * shift]
+    centre = CENTRE + np.array([shift, -0.7 * shift])
     patch = patch_of(spot(centre))
     np.testing.assert_allclose(patch.peak_px, centre, atol=2e-3)
     assert patch.peak_value == spot(centre).max()

@@ -1,0 +1,414 @@
+"""The command line: what it prints, how it fails, and that a stopped run goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import polars as pl
+import pytest
+
+import simtest.report
+from simtest import api
+from simtest.cli import main as command_line
+from simtest.spec import load_experiment
+from simtest.validation import runner
+
+MAIN = "from simtest.cli.main import main; main()"
+SLOW_MODULES = {
+    "mitsuba",
+    "drjit",
+    "vtk",
+    "vtkmodules",
+    "torch",
+    "pyvista",
+    "polars",
+    "matplotlib",
+    "plotly",
+    "cv2",
+    "igl",
+}
+SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
+SET_SMALL = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
+
+EXPERIMENT = """
+realisations = 4
+[[groups]]
+scene = "plane"
+set = { "camera.width" = 96, "camera.height" = 96, "camera.fx" = 96.0, "camera.fy" = 96.0 }
+sweep = [{ "surface.tilt_deg" = [0.0, 2.0, 4.0, 6.0, 8.0] }]
+[groups.random]
+"surface.azimuth_deg" = { low = 0.0, high = 360.0 }
+"""
+
+pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Keep the user's cache out of these tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture
+def here(monkeypatch, capfd, tmp_path):
+    """Run a command in this process, in an empty folder; gives exit code, output and error lines."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["simtest", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            command_line.main()
+        output, errors = capfd.readouterr()
+        return stop.value.code, output, errors.splitlines()
+
+    return run
+
+
+def child(*arguments, folder=None):
+    command = [sys.executable, "-c", MAIN, *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def without_bar(lines):
+    """Leave out the progress bar's lines."""
+    return [line for line in lines if "━" not in line]
+
+
+# Speed -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import simtest",
+        "import simtest; dir(simtest); simtest.__version__",
+        "import simtest; simtest.InputError, simtest.Failure",
+        "import sys; sys.argv = ['simtest', '--help']; from simtest.cli.main import main; main()",
+        "import sys; sys.argv = ['simtest', 'render', '--help']; from simtest.cli.main import main; main()",
+        "import sys; sys.argv = ['simtest', 'schema', 'scene']; from simtest.cli.main import main; main()",
+    ],
+)
+def test_light_commands_load_nothing_heavy(statement):
+    code = (
+        "import atexit, sys\n"
+        "atexit.register(lambda: print('LOADED', *sorted({name.split('.')[0] for name in sys.modules}), file=sys.stderr))\n"
+        f"{statement}\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    loaded = set(done.stderr.split("LOADED ")[1].split())
+    assert "simtest" in loaded
+    assert not SLOW_MODULES & loaded
+
+
+def test_the_installed_command_answers():
+    from importlib.metadata import entry_points, version
+
+    (point,) = entry_points(group="console_scripts", name="simtest")
+    assert point.load() is command_line.main
+    done = child("--version")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, version("simtest"), "")
+
+
+# Bad use ---------------------------------------------------------------------------------------------------------
+
+BAD_USE = {
+    "frobnicate": 'Unknown command "frobnicate". Available commands: ',
+    "render": 'Command "render" parameter SCENE requires an argument',
+    "render plane": 'Command "render" parameter --out requires an argument',
+    "render plane --out": "--out requires an argument",
+    "render plane --out x --frob 3": "Unknown option: --frob",
+    "render plane --out x extra": "Unused Tokens: ['extra']",
+    "render plain --out x": "plain: no such file; shipped by name: anatomy, cylinder, plane",
+    "render plane --out x --set tilt": "--set tilt: must be key=value, for example surface.distance_mm=12",
+    "render plane --out x --set =3": "--set =3: must be key=value",
+    "render plane --out x --set surface.tilt_deg=95": "plane.toml: surface.tilt_deg = 95: must be less than 90",
+    "render plane --out x --set surface.typo=1": "surface.typo = 1: unknown key; allowed: type, distance_mm",
+    "render plane --out x --set surface.tilt_deg=steep": "surface.tilt_deg = 'steep': must be a number",
+    "render plane --out x --set rig.lights.3.power=2": "index 3 is not allowed; the first item is 0",
+    "render plane --out x --set surface.tilt_deg.x=1": "surface.tilt_deg is a plain value, not a table",
+    "schema kidney": 'Invalid value "kidney" for OF. Choose from: "scene", "experiment", "camera"',
+    "doctor extra": "Unused Tokens: ['extra']",
+    "validate": 'Command "validate" parameter EXPERIMENT requires an argument',
+    "validate plain": "plain: no such file; shipped by name: anatomy, curvature, grid",
+    "validate overview --realisations many": 'Invalid value for --realisations: unable to convert "many" into int',
+    "validate overview --realisations 0": "overview.toml: realisations = 0: must be greater than or equal to 1",
+    "validate overview --seed -1": "overview.toml: seed = -1: must be greater than or equal to 0",
+    "validate overview --estimator magic": "estimator 'magic': not installed; allowed: ",
+    "validate overview --set surface.typo=1": "surface.typo = 1: unknown key; allowed: ",
+    "validate overview --set typo": "--set typo: must be key=value",
+    "reconstruct": 'Command "reconstruct" parameter IMAGE requires an argument',
+    "reconstruct none.png --fov 60 --out x": "none.png: ",
+    "reconstruct none.png --out x": "--camera or --fov: exactly one of them must be given",
+}
+
+
+@pytest.mark.parametrize("line", BAD_USE)
+def test_bad_use_exits_2_with_one_line(here, tmp_path, line):
+    code, output, errors = here(*line.split())
+    assert code == 2
+    assert output == ""
+    (message,) = without_bar(errors)
+    assert message.startswith("simtest: ")
+    assert BAD_USE[line] in message
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_use_in_a_process_of_its_own():
+    done = child("render", "plane", "--out", "x", "--set", "surface.tilt_deg=95")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("simtest: ")
+
+
+def test_an_unexpected_error_gives_one_line(here, monkeypatch):
+    def fails(*_, **__):
+        raise RuntimeError("first line\nsecond line")
+
+    monkeypatch.setattr(api, "render", fails)
+    code, output, errors = here("render", "plane", "--out", "x")
+    assert (code, output) == (1, "")
+    assert errors == [
+        "simtest: internal error, please report it (RuntimeError: first line second line); --traceback shows where"
+    ]
+
+
+# Schemas ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("of", "keys"),
+    [
+        ("scene", {"surface", "reflectance", "rig", "camera", "sensor", "render"}),
+        ("experiment", {"groups", "realisations", "seed", "estimators"}),
+        ("camera", {"width", "height", "fx", "fy", "cx", "cy", "skew"}),
+    ],
+)
+def test_schemas_are_json(here, of, keys):
+    code, output, errors = here("schema", of)
+    assert (code, errors) == (0, [])
+    schema = json.loads(output)
+    assert schema["type"] == "object"
+    assert keys <= set(schema["properties"])
+    # Unknown keys are refused, by an editor too.
+    assert schema["additionalProperties"] is False
+
+
+def test_the_default_schema_is_the_scenes(here):
+    assert here("schema")[1] == here("schema", "scene")[1]
+
+
+# Rendering -------------------------------------------------------------------------------------------------------
+
+TRUTH = {
+    "depth_mm": (), "position_mm": (3,), "normal": (3,), "shading_normal": (3,), "geometric_normal": (3,),
+    "curvature": (2,), "direction_min": (3,), "direction_max": (3,), "radiance_specular": (), "radiance_diffuse": (),
+    "radiance_indirect": (), "mask": (),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Give the folders of one scene rendered by two processes."""
+    folder = tmp_path_factory.mktemp("frames")
+    command = [sys.executable, "-c", MAIN, "render", "sphere", *SET_SMALL, "--out"]
+    children = [
+        subprocess.Popen([*command, name], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for name in ("first", "second")
+    ]
+    for process, name in zip(children, ("first", "second"), strict=True):
+        output, errors = process.communicate(timeout=120)
+        assert (process.returncode, errors) == (0, "")
+        assert output.split() == [f"{name}/{file}" for file in ("frame.png", "radiance.exr", "truth.npz", "frame.json")]
+    return folder / "first", folder / "second"
+
+
+@pytest.mark.render
+def test_render_writes_four_files_with_the_documented_keys(frames):
+    first, _ = frames
+    assert {path.name for path in first.iterdir()} == {"frame.png", "radiance.exr", "truth.npz", "frame.json"}
+    assert (first / "frame.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    with np.load(first / "truth.npz", allow_pickle=False) as truth:
+        assert set(truth.files) == set(TRUTH)
+        for name, tail in TRUTH.items():
+            assert truth[name].shape == (96, 96, *tail)
+            assert truth[name].dtype == (bool if name == "mask" else np.float32)
+        mask, normal = truth["mask"], truth["normal"]
+        assert mask.any()
+        assert not mask.all()
+        assert np.isnan(truth["depth_mm"][~mask]).all()
+        np.testing.assert_allclose(np.linalg.norm(normal[mask], axis=-1), 1, atol=1e-6)
+        assert (np.einsum("ni,ni->n", normal[mask], truth["position_mm"][mask]) < 0).all()
+    described = json.loads((first / "frame.json").read_text())
+    assert {"scene", "camera", "full_scale", "highlights", "fields", "provenance"} <= set(described)
+    assert described["camera"]["K"] == [[96, 0, 48], [0, 96, 48], [0, 0, 1]]
+    assert described["scene"]["surface"]["type"] == "sphere"
+    (highlight,) = described["highlights"]
+    assert highlight["isolated"] is True
+    for key in TRUTH:
+        assert any(key in field.split(", ") for field in described["fields"])
+
+
+@pytest.mark.render
+def test_render_gives_the_same_bytes_twice(frames):
+    first, second = frames
+    assert (first / "frame.png").read_bytes() == (second / "frame.png").read_bytes()
+    with np.load(first / "truth.npz") as one, np.load(second / "truth.npz") as other:
+        for name in one.files:
+            assert one[name].tobytes() == other[name].tobytes()
+
+
+@pytest.mark.render
+def test_an_out_that_cannot_be_written(here, tmp_path):
+    plain = tmp_path / "plain"
+    plain.write_text("mine")
+    for out in (plain, plain / "below"):
+        code, output, errors = here("render", "plane", *SET_SMALL, "--out", out)
+        assert (code, output, len(errors)) == (2, "", 1)
+        assert errors[0].startswith(f"simtest: --out {out}: cannot be written (")
+    assert [path.name for path in tmp_path.iterdir()] == ["plain"]
+    assert plain.read_text() == "mine"
+
+
+@pytest.mark.render
+def test_a_scene_out_of_sight(here):
+    code, output, errors = here("render", "sphere", *SET_SMALL, "--set", "camera.cx=1e6", "--out", "x")
+    assert (code, output) == (2, "")
+    assert errors == ["simtest: scene sphere: no pixel sees the surface; move it, or widen the field of view"]
+
+
+@pytest.mark.render
+@pytest.mark.xfail(strict=True, reason="Session._hits casts no rays at all: Dr.Jit ends the process")
+def test_the_smallest_camera_renders(tmp_path):
+    done = child(
+        "render", "plane", "--set", "camera.width=1", "--set", "camera.height=1", "--out", "x", folder=tmp_path
+    )
+    assert done.returncode == 0
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("variable", [False, True])
+def test_an_unknown_variant_exits_1(here, monkeypatch, variable):
+    if variable:
+        monkeypatch.setenv("SIMTEST_VARIANT", "scalar_mono")
+    given = [] if variable else ["--variant", "scalar_mono"]
+    code, output, errors = here("render", "plane", *SET_SMALL, "--out", "x", *given)
+    assert (code, output, len(errors)) == (1, "", 1)
+    assert "variant 'scalar_mono': unknown to this Mitsuba; allowed: " in errors[0]
+
+
+# Validation ------------------------------------------------------------------------------------------------------
+
+
+def test_validate_refuses_what_it_has_not_made(here, tmp_path):
+    plain, other = tmp_path / "plain", tmp_path / "other"
+    plain.write_text("mine")
+    other.mkdir()
+    (other / "notes.txt").write_text("mine")
+    for out, reason in (
+        (plain, "is a file; must be a folder"),
+        (plain / "below", "cannot be written (Not a directory)"),
+        (other, "holds notes.txt, which is no part of a run; must be empty or hold a run"),
+    ):
+        code, output, errors = here("validate", "overview", "--out", out)
+        assert (code, output) == (2, "")
+        assert without_bar(errors) == [f"simtest: --out {out}: {reason}"]
+    assert [path.name for path in other.iterdir()] == ["notes.txt"]
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """Stop a run after its first case; gives its folder, its experiment, and what the process said."""
+    folder = tmp_path_factory.mktemp("stopped")
+    (folder / "tiny.toml").write_text(EXPERIMENT)
+    out = folder / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-c", MAIN, "validate", "tiny.toml", "--out", str(out)],
+        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    end = time.monotonic() + 60
+    while not (out / "parts" / "case-00000.parquet").exists() and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    return out, folder / "tiny.toml", process.returncode, output, errors
+
+
+@pytest.mark.render
+def test_a_stopped_run_keeps_its_finished_cases(stopped):
+    out, _, code, output, errors = stopped
+    assert (code, output) == (130, "")
+    assert "Traceback" not in errors
+    assert not (out / "results.parquet").exists()
+    held = {path.name for path in (out / "parts").iterdir()}
+    assert {"fingerprint.json", "case-00000.parquet"} <= held
+    assert "case-00004.parquet" not in held
+    # No half-written file stays behind.
+    assert not [name for name in held if name.startswith(".")]
+
+
+@pytest.mark.render
+@pytest.mark.xfail(strict=True, reason="cyclopts swallows the KeyboardInterrupt: suppress_keyboard_interrupt=False")
+def test_a_stopped_run_says_that_it_goes_on(stopped):
+    *_, errors = stopped
+    assert without_bar(errors.splitlines()) == [
+        "simtest: stopped; what is finished is kept, and the same command goes on from there"
+    ]
+
+
+@pytest.mark.render
+def test_the_same_command_goes_on_and_gives_the_same_results(here, monkeypatch, stopped, tmp_path):
+    out, experiment, *_ = stopped
+    runs = []
+    run_experiment = runner.run_experiment
+
+    def spy(*arguments, **options):
+        runs.append(run_experiment(*arguments, **options))
+        return runs[-1]
+
+    monkeypatch.setattr(runner, "run_experiment", spy)
+    # The report has its own tests and takes longer than the run.
+    monkeypatch.setattr(simtest.report, "write_report", lambda folder: folder / "index.html")
+    monkeypatch.chdir(experiment.parent)
+    # What a killed run was writing is no obstacle.
+    (out / ".results.99999.part.parquet").write_bytes(b"half")
+    code, output, errors = here("validate", experiment.name, "--out", out)
+    assert code == 0, errors
+    assert output.strip() == str(out / "index.html")
+    assert runs[0].resumed >= 1
+    assert {path.name for path in out.iterdir()} == {"results.parquet", "summary.json", "gallery"}
+
+    undisturbed = run_experiment(load_experiment(experiment), tmp_path / "run")
+    assert undisturbed.resumed == 0
+    one, other = (pl.read_parquet(folder / "results.parquet") for folder in (out, tmp_path / "run"))
+    assert one.height == 5 * 4 * 3
+    assert one["status"].unique().to_list() == ["ok"]
+    assert one.equals(other)
+    assert (out / "results.parquet").read_bytes() == (tmp_path / "run" / "results.parquet").read_bytes()
+
+
+@pytest.mark.render
+def test_a_corrupt_record_starts_the_run_again(tmp_path, stopped):
+    _, experiment, *_ = stopped
+    described = load_experiment(experiment, {"surface.tilt_deg": 0.0, "realisations": 1})
+    parts = tmp_path / "run" / "parts"
+    parts.mkdir(parents=True)
+    for content in (b"{", b"\xff\xfe", b"", b'"0"'):
+        (parts / "fingerprint.json").write_bytes(content)
+        (parts / "case-00000.parquet").write_bytes(b"of another run")
+        assert runner.run_experiment(described, tmp_path / "run").resumed == 0
+        parts.mkdir()
+
+
+def test_a_reader_that_has_gone_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-c", MAIN, "schema", "scene"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")

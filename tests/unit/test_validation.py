@@ -1,0 +1,402 @@
+"""Matching, rows, summary figures, seeds, cases, and that a row can be made again alone."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy import stats
+
+from simtest.detection import Region
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate, load_estimators
+from simtest.geometry import Camera, Patch
+from simtest.reconstruction import Specularity, reconstruct
+from simtest.render import Session
+from simtest.render.frames import TrueHighlight
+from simtest.seeds import Stage, generator, integer, key, sequence
+from simtest.spec import Experiment, load_experiment, scene_from_dict
+from simtest.validation.cases import expand, swept_example
+from simtest.validation.matching import match
+from simtest.validation.metrics import SCHEMA, RowContext, angle_deg, rows, table
+from simtest.validation.realise import realise, view
+from simtest.validation.runner import run_experiment
+from simtest.validation.statistics import figures, mean_interval, summarise
+from simtest.validation.truth import JudgedHighlight
+
+CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+NORTH = np.array([0.0, 0.0, -1.0])
+
+
+def truth_at(x, y, normal=NORTH, light=0):
+    highlight = TrueHighlight(light, np.array([x, y]), np.array([0, 0, 10.0]), normal, 10.0, 0.2, 0.5, True, 1.0)
+    return JudgedHighlight(highlight, 50.0, "")
+
+
+def detection(x, y, width, height, peak, estimates=None):
+    """Give a detection whose isophote does not close, so that its region decides."""
+    failure = Failure(Reason.NO_CLOSED_ISOPHOTE)
+    return Specularity(Region((x, y, width, height), peak, 1.0), failure, estimates or {})
+
+
+def spots(*centres, sigma=5.0):
+    x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    return sum(a * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * sigma**2)) for u, v, a in centres).astype(np.float32)
+
+
+# Matching ------------------------------------------------------------------------------------------------------------
+
+
+def test_each_detection_takes_the_truth_inside_its_isophote():
+    found = reconstruct(spots((40, 40, 1.0), (100, 70, 0.7)), CAMERA, {})
+    assert [s.region.peak for s in found] == [(39, 39), (99, 69)]
+    truths = [truth_at(100.4, 69.2), truth_at(41, 40)]
+    assert match(found, truths) == {0: 1, 1: 0}
+    # The isophote at t = 0.5 of a spot of 5 px has a radius of 5.9 px; the smoothing of 2 px makes it 6.3.
+    assert match(found, [truth_at(46.0, 40)]) == {0: 0}
+    assert match(found, [truth_at(47.0, 40)]) == {}
+
+
+def test_the_nearest_truth_wins_and_the_others_stay_unmatched():
+    wide = detection(0, 0, 50, 50, (20, 20))
+    assert match([wide], [truth_at(30, 20), truth_at(22, 20), truth_at(10, 20)]) == {0: 1}
+    assert match([wide], [truth_at(60, 20)]) == {}
+    # The peak's pixel (20, 20) has its centre at 20.5: 20.9 is nearer than 20.0.
+    assert match([wide], [truth_at(20.0, 20.5), truth_at(20.9, 20.5)]) == {0: 1}
+
+
+def test_a_truth_is_given_to_one_detection_only():
+    far, near = detection(0, 0, 50, 50, (5, 5)), detection(10, 10, 50, 50, (24, 24))
+    assert match([far, near], [truth_at(25, 25)]) == {1: 0}
+    # The second best pair is kept where it does not collide.
+    assert match([far, near], [truth_at(25, 25), truth_at(12, 12)]) == {1: 0, 0: 1}
+    assert match([], [truth_at(1, 1)]) == {}
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def estimate(normal, candidates=None, look=(80.0, 60.0)):
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    candidates = normal[None] if candidates is None else np.asarray(candidates, float)
+    return Estimate(normal, candidates, np.array(look))
+
+
+def context(look_normal=NORTH):
+    """Give a row's context whose surface has one normal wherever an estimate looks."""
+    seen = SimpleNamespace(valid=np.array([True]), normal=look_normal[None])
+    described = scene_from_dict({"surface": {"type": "plane"}})
+    session = SimpleNamespace(scene=described, cast=lambda points: (seen, None, None))
+    return RowContext(session, {"experiment": "e", "setting": "s", "realisation": 3, "seed": 11})
+
+
+def leaned(degrees, towards=0.0):
+    a, t = np.radians([degrees, towards])
+    return np.array([np.sin(a) * np.cos(t), np.sin(a) * np.sin(t), -np.cos(a)])
+
+
+def test_rows_count_matched_false_and_missed():
+    found = [
+        detection(0, 0, 50, 50, (20, 20), {"a": estimate(leaned(3)), "b": Failure(Reason.NOT_AN_ELLIPSE, "why")}),
+        detection(100, 80, 20, 20, (110, 90), {"a": estimate(NORTH), "b": estimate(NORTH)}),
+    ]
+    truths = [truth_at(21, 21), truth_at(75, 100)]
+    made = rows(context(), found, truths, match(found, truths), ["a", "b"])
+    frame = table(made, {})
+    assert frame.columns == list(SCHEMA)
+    assert len(frame) == 6
+    matched = frame.filter(pl.col("specularity") == 0)
+    assert matched["true_id"].to_list() == [0, 0]
+    assert matched["status"].to_list() == ["ok", "not_an_ellipse"]
+    assert matched["error_deg"][0] == pytest.approx(3)
+    assert matched["error_deg"][1] is None
+    assert matched["flags"][1] == "why"
+    false = frame.filter(pl.col("specularity") == 1)
+    assert false["true_id"].to_list() == [None, None]
+    assert false["status"].to_list() == ["ok", "ok"]
+    assert false["error_deg"].to_list() == [None, None]
+    missed = frame.filter(pl.col("specularity").is_null())
+    assert missed["status"].to_list() == ["missed", "missed"]
+    assert missed["true_id"].to_list() == [1, 1]
+    assert missed["estimator"].to_list() == ["a", "b"]
+    assert frame["realisation"].to_list() == [3] * 6
+    assert frame.filter(pl.col("true_id").is_not_null())["kd_max"].unique().to_list() == [0.5]
+
+
+def test_errors_of_a_row():
+    """The proposed candidate, the better one, and the surface where the estimate looks."""
+    result = estimate(leaned(5), [leaned(5), leaned(1, 180)])
+    found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
+    (row,) = rows(context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, ["a"])
+    assert row["error_deg"] == pytest.approx(5)
+    assert row["error_oracle_deg"] == pytest.approx(1)
+    assert row["error_look_deg"] == pytest.approx(2)
+    assert row["rank_correct"] == 1
+    assert row["n_candidates"] == 2
+
+
+def test_angles_are_exact_near_zero_and_near_180_deg():
+    for degrees in (0.0, 1e-9, 1e-4, 30.0, 179.9999999):
+        assert float(angle_deg(NORTH, leaned(degrees))) == pytest.approx(degrees, rel=1e-6, abs=1e-15)
+    np.testing.assert_allclose(angle_deg(np.stack([leaned(2), leaned(4)]), NORTH), [2, 4])
+
+
+# Figures -------------------------------------------------------------------------------------------------------------
+
+
+def hand_made():
+    """Two ok, one failed, one missed, one false of estimator a; three ok of b."""
+    lines = [
+        ("s1", "a", 0, "ok", 1.0, 0.5, 2.0),
+        ("s1", "a", 1, "ok", 3.0, 3.0, 8.0),
+        ("s1", "a", 2, "not_an_ellipse", None, None, None),
+        ("s1", "a", 3, "missed", None, None, None),
+        ("s1", "a", None, "ok", None, None, None),
+        ("s1", "a", None, "no_closed_isophote", None, None, None),
+        ("s1", "b", 0, "ok", 2.0, 2.0, None),
+        ("s1", "b", 1, "ok", 2.0, 2.0, None),
+        ("s1", "b", 2, "ok", 5.0, 5.0, None),
+        ("s0", "a", 0, "missed", None, None, None),
+    ]
+    names = ("setting", "estimator", "true_id", "status", "error_deg", "error_oracle_deg", "mahalanobis2")
+    return table([dict(zip(names, line, strict=True)) for line in lines], {})
+
+
+def test_summary_of_a_hand_made_table():
+    summary = summarise(hand_made())
+    assert list(summary) == ["s1", "s0"]
+    a = summary["s1"]["a"]
+    assert (a["n"], a["n_ok"], a["n_missed"], a["n_false"]) == (4, 2, 1, 1)
+    assert a["n_failed_by_reason"] == {"not_an_ellipse": 1}
+    assert a["mean_deg"] == pytest.approx(2.0)
+    assert a["mean_oracle_deg"] == pytest.approx(1.75)
+    assert a["rms_deg"] == pytest.approx(np.sqrt(5))
+    assert a["std_deg"] == pytest.approx(np.sqrt(2))
+    assert a["median_deg"] == pytest.approx(2.0)
+    assert a["p95_deg"] == pytest.approx(2.9)
+    assert a["max_deg"] == pytest.approx(3.0)
+    # (1 + 3 + 90 + 90) / 4: the failed and the missed count 90 deg each, the false none.
+    assert a["mean_penalised_deg"] == pytest.approx(46.0)
+    # Student's t with 1 degree of freedom: 12.706 standard errors of 1.
+    assert a["ci95_deg"] == pytest.approx([2 - 12.7062, 2 + 12.7062], abs=1e-4)
+    assert a["coverage95"] == pytest.approx(0.5)  # chi-square of 2 at 95 %: 5.99
+    b = summary["s1"]["b"]
+    assert (b["n"], b["n_ok"], b["n_missed"], b["n_false"]) == (3, 3, 0, 0)
+    assert b["mean_penalised_deg"] == b["mean_deg"] == pytest.approx(3.0)
+    assert b["ci95_deg"] == pytest.approx([3 - 4.302653, 3 + 4.302653], abs=1e-5)
+    assert b["coverage95"] is None
+
+
+def test_summary_where_nothing_answered():
+    figure = summarise(hand_made())["s0"]["a"]
+    assert figure["n"] == figure["n_missed"] == 1
+    assert figure["mean_deg"] is None
+    assert figure["ci95_deg"] == [None, None]
+    assert figure["mean_penalised_deg"] == 90
+    assert figures(hand_made().clear())["mean_penalised_deg"] is None
+
+
+def test_the_interval_covers_the_mean_in_95_of_100_samples():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(1000):
+        low, high = mean_interval(rng.normal(3, 2, 6))
+        covered += low < 3 < high
+    assert stats.binomtest(covered, 1000, 0.95).pvalue > 0.01
+    assert mean_interval(np.array([1.0])) == (None, None)
+
+
+# Seeds ---------------------------------------------------------------------------------------------------------------
+
+
+def test_seeds_do_not_change_from_version_to_version():
+    assert key("plane") == 7486435753795864637
+    assert key("") == 13020603013274838756
+    first = (0, "overview", "plane | part 0", 0, Stage.SENSOR)
+    assert integer(*first) == 1130079574
+    assert generator(*first).integers(2**63, size=2).tolist() == [4976117887560075625, 1653885339742518633]
+    second = (5, "anatomy", "colon | part 3", 7, Stage.SWEEP)
+    assert integer(*second) == 3707930917
+    assert generator(*second).standard_normal() == pytest.approx(-0.020281610121228436, rel=1e-12)
+
+
+def test_every_branch_of_the_seed_tree_is_another():
+    branches = [
+        (seed, experiment, case, realisation, stage)
+        for seed in (0, 1)
+        for experiment in ("a", "b")
+        for case in ("a", "b", "a | part 1")
+        for realisation in range(20)
+        for stage in Stage
+    ]
+    states = {sequence(*branch).generate_state(4).tobytes() for branch in branches}
+    assert len(states) == len(branches)
+    assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4]
+
+
+# Cases ---------------------------------------------------------------------------------------------------------------
+
+
+def experiment(*groups, **settings):
+    return Experiment.model_validate({"name": "test", "realisations": 3, "groups": list(groups), **settings})
+
+
+def test_lists_of_one_table_vary_together_and_tables_are_multiplied_out():
+    group = {
+        "scene": "saddle",
+        "sweep": [
+            {"surface.k1_per_mm": [0.01, 0.02], "surface.k2_per_mm": [-0.01, -0.02]},
+            {"reflectance.exponent": [50.0, 100.0, 200.0]},
+        ],
+    }
+    cases = expand(experiment(group))
+    seen = [(c.swept["surface.k1_per_mm"], c.swept["surface.k2_per_mm"], c.swept["reflectance.exponent"]) for c in cases]
+    assert seen == [(k, -k, n) for k in (0.01, 0.02) for n in (50, 100, 200)]
+    assert cases[1].setting == "quadric, k1_per_mm=0.01, k2_per_mm=-0.01, exponent=100.0"
+    assert len({case.name for case in cases}) == 6
+    scene, drawn = cases[5].scene(experiment(group), 0)
+    assert (scene.surface.k1_per_mm, scene.surface.k2_per_mm, scene.reflectance.exponent) == (0.02, -0.02, 200)
+    assert drawn == {}
+    assert [list(case.numbers()) for case in cases] == [[0, 1, 2]] * 6
+
+
+def test_pooled_values_share_a_setting_and_number_on():
+    group = {"scene": "sphere", "label": "ball", "pool": [{"surface.radius_mm": [5.0, 6.0]}], "realisations": 4}
+    cases = expand(experiment(group))
+    assert [case.setting for case in cases] == ["ball", "ball"]
+    assert [list(case.numbers()) for case in cases] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert cases[0].name != cases[1].name
+    assert [case.swept["surface.radius_mm"] for case in cases] == [5, 6]
+
+
+def test_random_values_are_drawn_anew_for_each_realisation_and_the_same_again():
+    drawn_path = "rig.lights.0.azimuth_deg"
+    group = {"scene": "plane", "random": {drawn_path: {"low": 10.0, "high": 350.0}}}
+    described = experiment(group, realisations=200)
+    (case,) = expand(described)
+    values = [case.scene(described, number)[1][drawn_path] for number in range(200)]
+    assert len(set(values)) == 200
+    assert all(10 <= value < 350 for value in values)
+    assert stats.kstest(values, stats.uniform(10, 340).cdf).pvalue > 0.01
+    scene, drawn = case.scene(described, 17)
+    assert drawn[drawn_path] == values[17] == scene.rig.lights[0].azimuth_deg
+    other = experiment(group, realisations=200, seed=1)
+    assert case.scene(other, 17)[1][drawn_path] != values[17]
+    assert swept_example([case]) == {drawn_path: 0.0}
+
+
+def test_settings_take_the_place_of_sweeps_pools_and_draws(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        """
+realisations = 2
+[[groups]]
+scene = "cylinder"
+set = { "surface.tilt_deg" = 3.0 }
+sweep = [{ "surface.radius_mm" = [5.0, 6.0] }, { "reflectance.exponent" = [50.0, 60.0] }]
+pool = [{ "surface.spin_deg" = [0.0, 10.0] }]
+[groups.random]
+"surface.azimuth_deg" = { low = 0.0, high = 90.0 }
+"""
+    )
+    plain = expand(load_experiment(path))
+    assert len(plain) == 8
+    assert plain[0].scene(load_experiment(path), 0)[0].surface.tilt_deg == 3
+    settings = {"surface.radius_mm": 7.0, "surface.spin_deg": 20.0, "surface.azimuth_deg": 45.0, "realisations": 9, "seed": 4}
+    fixed = load_experiment(path, settings)
+    assert (fixed.name, fixed.realisations, fixed.seed) == ("mine", 9, 4)
+    cases = expand(fixed)
+    assert [case.setting for case in cases] == ["cylinder, exponent=50.0", "cylinder, exponent=60.0"]
+    for case in cases:
+        scene, drawn = case.scene(fixed, 0)
+        surface = scene.surface
+        assert (surface.radius_mm, surface.spin_deg, surface.azimuth_deg, surface.tilt_deg) == (7, 20, 45, 3)
+        assert drawn == {}
+    tilted = expand(load_experiment(path, {"surface.tilt_deg": 1.0}))[0]
+    assert tilted.data["surface"]["tilt_deg"] == 1
+
+
+def test_malformed_groups_are_refused_before_anything_is_rendered(tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text('[[groups]]\nscene = "plane"\nsweep = [{ "a.b" = [1.0, 2.0], "c.d" = [1.0] }]\n')
+    with pytest.raises(InputError, match="equally long"):
+        load_experiment(path)
+    with pytest.raises(InputError, match="radius_mm"):
+        expand(experiment({"scene": "sphere", "sweep": [{"surface.radius_mm": [5.0, -1.0]}]}))
+    with pytest.raises(InputError, match="nowhere"):
+        expand(experiment({"scene": "nowhere"}))
+
+
+# Whole runs ----------------------------------------------------------------------------------------------------------
+
+SMALL = {"camera.width": 120, "camera.height": 100, "camera.fx": 130.0, "camera.fy": 130.0}
+FIXED = {"scene": "plane", "set": SMALL, "isolated": False}
+DRAWN = {
+    "scene": "cylinder",
+    "set": SMALL,
+    "isolated": False,
+    "sweep": [{"surface.radius_mm": [8.0, 30.0]}],
+    "random": {"surface.spin_deg": {"low": 0.0, "high": 180.0}},
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return run_experiment(experiment(FIXED, DRAWN, realisations=4), tmp_path_factory.mktemp("runs") / "whole")
+
+
+def sorted_rows(results):
+    return results.sort("setting", "realisation", "estimator", "specularity", nulls_last=True)
+
+
+@pytest.mark.render
+def test_a_run_has_a_row_for_each_estimator_and_realisation(whole):
+    results = whole.results
+    assert len(results) == 3 * 4 * 3
+    assert results["status"].unique().to_list() == ["ok"]
+    for setting, estimators in whole.summary["experiments"]["test"]["settings"].items():
+        part = results.filter(pl.col("setting") == setting)
+        for name, figure in estimators.items():
+            assert figure["n"] == figure["n_ok"] == 4
+            assert figure["mean_deg"] == pytest.approx(part.filter(pl.col("estimator") == name)["error_deg"].mean())
+    assert results.filter(pl.col("estimator") == "cone_axis")["error_deg"].max() < 0.2
+    assert results["seed"].n_unique() == 12
+    assert pl.read_parquet(whole.folder / "results.parquet").equals(results)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("index", [0, 2])
+def test_a_realisation_alone_gives_the_rows_of_the_whole_run(whole, index):
+    described = experiment(FIXED, DRAWN, realisations=4)
+    case = expand(described)[index]
+    scene, drawn = case.scene(described, 3)
+    session = Session(scene)
+    estimators = load_estimators(described.estimators)
+    made = realise(session, described, case, 3, view(session, scene), drawn, estimators)
+    alone = table(made.rows, swept_example(expand(described)))
+    in_run = whole.results.filter((pl.col("setting") == case.setting) & (pl.col("realisation") == 3))
+    assert len(alone) == 3
+    assert sorted_rows(alone).equals(sorted_rows(in_run))
+    other = realise(session, described, case, 2, view(session, scene), drawn, estimators)
+    assert other.frame.tobytes() != made.frame.tobytes()
+
+
+@pytest.mark.render
+def test_the_order_of_the_groups_changes_no_row(whole, tmp_path):
+    turned = run_experiment(experiment(DRAWN, FIXED, realisations=4), tmp_path / "turned").results
+    columns = whole.results.columns
+    assert sorted_rows(turned.select(columns)).equals(sorted_rows(whole.results))
+
+
+@pytest.mark.render
+def test_a_patch_survives_where_estimators_fail(whole):
+    """A frame of noise alone: nothing is detected, and what is there is missed, not dropped."""
+    dark = {**FIXED, "set": {**SMALL, "sensor.noise_sigma": 1.0}, "isolated": False}
+    described = experiment(dark, realisations=1)
+    (case,) = expand(described)
+    scene, drawn = case.scene(described, 0)
+    session = Session(scene)
+    made = realise(session, described, case, 0, view(session, scene), drawn, load_estimators(["cone_axis"]))
+    statuses = [row.get("status") for row in made.rows if row.get("true_id") is not None]
+    assert statuses == ["missed"]
+    assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)
