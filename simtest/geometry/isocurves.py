@@ -1,0 +1,162 @@
+"""Specular isocurves on a plane [MB, sections 2.1 and 2.2]: the quartic Q, and its two circles in endoscopy.
+
+The plane is z = 0, p = (x, y) a point of it, P = (x, y, 0); the camera centre V and the light L lie at z > 0. With the
+mirrored light R = (L_X, L_Y, -L_Z), the angle beta between view and mirror direction obeys
+cos(beta) = -(R - P) . (V - P) / (abs(R - P) abs(V - P)).
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+def cosine_of_isovalue(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, scale: npt.ArrayLike = 1.0) -> Array:
+    """Give tau = (t / c)^(1/n), the cosine of beta on the isophote at t [MB, section 2.1].
+
+    Parameters
+    ----------
+    isovalue : array_like
+        t in (0, c).
+    exponent : array_like
+        Roughness exponent n > 0.
+    scale : array_like
+        c > 0.
+
+    Returns
+    -------
+    ndarray
+        tau in (0, 1).
+
+    Raises
+    ------
+    InputError
+        If a value is out of range.
+    """
+    t, n, c = (np.asarray(value, dtype=float) for value in (isovalue, exponent, scale))
+    if not (np.all(n > 0) and np.all(c > 0)):
+        raise InputError(f"exponent n = {exponent}, scale c = {scale}: both must be > 0")
+    if not (np.all(t > 0) and np.all(t < c)):
+        raise InputError(f"isovalue t = {isovalue}: must be inside (0, c), c = {scale}")
+    return np.asarray((t / c) ** (1 / n))
+
+
+def kappa(tau: npt.ArrayLike) -> Array:
+    """Give kappa = 1 - tau^2 [MB, section 2.2]; for tau in (0, 1) it lies in (0, 1)."""
+    return np.asarray(1 - np.asarray(tau, dtype=float) ** 2)
+
+
+def cosine_beta(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> Array:
+    """Give cos(beta) at points of the plane: the specular term is c max(0, cos beta)^n.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 2)
+        p on the plane z = 0.
+    light, camera : array_like, shape (3,) or (..., 3)
+        L and V.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    to_mirrored, to_camera = _directions(points, light, camera)
+    lengths = np.linalg.norm(to_mirrored, axis=-1) * np.linalg.norm(to_camera, axis=-1)
+    return np.asarray(-np.sum(to_mirrored * to_camera, axis=-1) / lengths)
+
+
+def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike, tau: npt.ArrayLike) -> Array:
+    """Give Q(p) = ((R-P).(V-P))^2 - tau^2 abs(R-P)^2 abs(V-P)^2 [MB, section 2.1, Proposition 1].
+
+    Its zeros are the quartic that holds the isophote; it has two branches, cos(beta) = tau, which is the isophote, and
+    cos(beta) = -tau, which is none (see `on_isophote_branch`).
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 2)
+        p on the plane z = 0.
+    light, camera : array_like, shape (3,) or (..., 3)
+        L and V.
+    tau : array_like
+        See `cosine_of_isovalue`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Fourth power of the length unit.
+    """
+    to_mirrored, to_camera = _directions(points, light, camera)
+    product = np.sum(to_mirrored * to_camera, axis=-1)
+    lengths = np.sum(to_mirrored**2, axis=-1) * np.sum(to_camera**2, axis=-1)
+    return np.asarray(product**2 - np.asarray(tau, dtype=float) ** 2 * lengths)
+
+
+def on_isophote_branch(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Tell which points lie where cos(beta) > 0: the part of the quartic that is the isophote."""
+    to_mirrored, to_camera = _directions(points, light, camera)
+    return np.asarray(np.sum(to_mirrored * to_camera, axis=-1) < 0)
+
+
+def _directions(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> tuple[Array, Array]:
+    p, L, V = (np.asarray(value, dtype=float) for value in (points, light, camera))
+    P = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], axis=-1)
+    return L * [1.0, 1.0, -1.0] - P, V - P
+
+
+def endoscopic_isocurve(points: npt.ArrayLike, camera: npt.ArrayLike, kappa_value: npt.ArrayLike) -> Array:
+    """Give E(p) = kappa rho^4 + 2 V_Z^2 (kappa - 2) rho^2 + kappa V_Z^4, Q with L = V [MB, section 2.2, Proposition 2].
+
+    rho is the distance from the camera's foot. E = kappa q+ q- with the circles q+- = rho^2 - r+-^2 (`isocurve_radii`);
+    the article's factorisation omits the factor kappa.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 2)
+        p on the plane z = 0.
+    camera : array_like, shape (3,)
+        V = L.
+    kappa_value : array_like
+        See `kappa`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    p, V, k = (np.asarray(value, dtype=float) for value in (points, camera, kappa_value))
+    squared, height = np.sum((p - V[..., :2]) ** 2, axis=-1), V[..., 2] ** 2
+    return np.asarray(k * squared**2 + 2 * height * (k - 2) * squared + k * height**2)
+
+
+def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[Array, Array]:
+    """Give the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2].
+
+    r+- = abs(V_Z) sqrt((2-kappa)/kappa +- sqrt(((2-kappa)/kappa)^2 - 1)). The isophote is r-; r+ is the branch
+    cos(beta) = -tau; r+ r- = V_Z^2. Computed in the form r- = abs(V_Z) tan(acos(tau)/2), which does not cancel.
+
+    Parameters
+    ----------
+    kappa_value : array_like
+        kappa in (0, 1).
+    height : array_like
+        V_Z, not 0.
+
+    Returns
+    -------
+    inner, outer : ndarray
+        r- and r+, in the unit of V_Z.
+
+    Raises
+    ------
+    InputError
+        If kappa is outside (0, 1) or V_Z is 0.
+    """
+    k, z = np.asarray(kappa_value, dtype=float), np.abs(np.asarray(height, dtype=float))
+    if not (np.all(k > 0) and np.all(k < 1)):
+        raise InputError(f"kappa = {kappa_value}: must be inside (0, 1)")
+    if not np.all(z > 0):
+        raise InputError(f"V_Z = {height}: must not be 0, else the camera lies in the plane")
+    # tan(acos(tau) / 2) = sqrt(kappa) / (1 + tau)
+    ratio = np.sqrt(k) / (1 + np.sqrt(1 - k))
+    return np.asarray(z * ratio), np.asarray(z / ratio)
