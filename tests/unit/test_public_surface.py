@@ -1,0 +1,106 @@
+"""The public names: what is promised, where it comes from, and what importing it must not load."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import simtest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+PUBLIC = {
+    "BackendError": "simtest.errors",
+    "Camera": "simtest.geometry.camera",
+    "Estimate": "simtest.estimators.base",
+    "Experiment": "simtest.spec.experiment",
+    "Failure": "simtest.errors",
+    "InputError": "simtest.errors",
+    "LabelledFrame": "simtest.dataset.frame",
+    "Patch": "simtest.geometry.isophotes",
+    "Reason": "simtest.errors",
+    "Scene": "simtest.spec.scene",
+    "SimtestError": "simtest.errors",
+    "Specularity": "simtest.reconstruction",
+    "load_camera": "simtest.spec.scene",
+    "load_experiment": "simtest.spec.experiment",
+    "load_scene": "simtest.spec.scene",
+    "reconstruct": "simtest.reconstruction",
+    "render": "simtest.api",
+    "validate": "simtest.api",
+}
+"""Public name and the module that defines it. A change here is a change of the interface."""
+
+
+def child(code):
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def test_public_names():
+    assert simtest.__all__ == sorted(PUBLIC)
+    assert set(PUBLIC) | {"__version__"} == set(dir(simtest))
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_each_is_loaded_on_demand_from_its_home(name):
+    value = getattr(simtest, name)
+    assert value.__module__ == PUBLIC[name]
+    assert getattr(simtest, name) is value
+
+
+def test_the_function_render_is_not_hidden_by_the_subpackage_of_its_name():
+    """Whatever is imported first; `from simtest.render import Session` goes on to work."""
+    orders = [
+        "simtest.validate; simtest.render",
+        "__import__('simtest.render.session'); simtest.render",
+        "simtest.render; __import__('simtest.render.session')",
+    ]
+    for order in orders:
+        code = (
+            f"import simtest, json; {order}; from simtest import render; from simtest.render import Session, backend;"
+            "print(json.dumps([type(simtest.render).__name__, type(render).__name__, Session.__module__]))"
+        )
+        assert child(code) == ["function", "function", "simtest.render.session"], order
+
+
+def test_unknown_names_are_attribute_errors():
+    with pytest.raises(AttributeError, match="module 'simtest' has no attribute 'nothing'"):
+        _ = simtest.nothing
+
+
+def test_version_is_that_of_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert simtest.__version__ == project["version"]
+
+
+def test_importing_the_package_loads_no_library():
+    heavy = child(
+        "import simtest, sys, json; dir(simtest);"
+        "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib', 'numpy', 'pydantic', 'cv2'})))"
+    )
+    assert heavy == []
+
+
+def test_reconstructing_loads_neither_renderer_nor_viewer():
+    loaded = child(
+        "import simtest, sys, json; simtest.reconstruct; simtest.Camera; simtest.load_camera;"
+        "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib'})))"
+    )
+    assert loaded == []
+
+
+def test_estimators_that_are_registered():
+    from simtest.estimators.registry import GROUP, available
+    from simtest.reconstruction import DEFAULT_ESTIMATORS
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {"circle_pose", "brightest_point", "cone_axis"} <= set(project["entry-points"][GROUP])
+    assert set(project["entry-points"][GROUP]) <= set(available())
+    assert DEFAULT_ESTIMATORS == ("circle_pose", "brightest_point", "cone_axis")
