@@ -9,7 +9,9 @@ import polars as pl
 def main() -> None:
     results = pl.read_parquet(Path(sys.argv[1]) / "results.parquet")
     for _, rows in results.group_by("setting", maintain_order=True):
-        by = {name: rows.filter(pl.col("estimator") == name) for name in ("circle_pose", "brightest_point", "cone_axis")}
+        by = {
+            name: rows.filter(pl.col("estimator") == name) for name in ("circle_pose", "brightest_point", "cone_axis")
+        }
         low, high = float(rows["kd_min"].mean()), float(rows["kd_max"].mean())
         kd = f"{low:.2f}, {high:.2f}" if low * high < -1e-6 else f"{high if abs(high) >= abs(low) else low:.2f}"
         cells = [

@@ -165,7 +165,7 @@ class Quadric(_Analytic):
         a = np.sum(k * directions**2, axis=1) / 2
         b = directions[:, 2] + np.sum(k * origins * directions, axis=1)
         c = origins[:, 2] + np.sum(k * origins**2, axis=1) / 2
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             root = np.sqrt(b**2 - 4 * a * c)
             q = -(b + np.copysign(root, b)) / 2
             roots = np.stack([c / q, q / a])

@@ -16,6 +16,8 @@ APP = App(
     help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
     version_flags=["--version"],
     version=lambda: _version(),
+    # Ours says what is kept.
+    suppress_keyboard_interrupt=False,
 )
 APP.command("simtest.cli.doctor:doctor")
 APP.command("simtest.cli.schema:schema")
@@ -71,5 +73,5 @@ def main() -> None:
 
 
 def _say(text: str, code: int) -> int:
-    print(f"simtest: {text}", file=sys.stderr)
+    print(f"simtest: {' '.join(text.split())}", file=sys.stderr)
     return code

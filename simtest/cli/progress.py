@@ -1,7 +1,33 @@
-"""A progress bar with time left, on the error stream."""
+"""A progress bar with time left, on the error stream, and a stop between two steps."""
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+
+@contextmanager
+def stop_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back until the callable that is given is called; a second Ctrl-C stops at once.
+
+    Raised anywhere, KeyboardInterrupt can be lost in a callback, or break the renderer while it is being imported.
+    """
+    presses = 0
+
+    def press(*_: object) -> None:
+        nonlocal presses
+        presses += 1
+        if presses > 1:
+            raise KeyboardInterrupt
+
+    def check() -> None:
+        if presses:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -21,10 +47,18 @@ def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
         BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("starting", total=None)
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task("starting", total=None)
+    with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
+            check()
+            # Not before the first step: bad input is told in one line.
+            bar.start()
             bar.update(task, completed=done, total=total, description="writing the report" if done == total else what)
 
-        yield move
+        try:
+            yield move
+        finally:
+            if bar.live.is_started:
+                bar.stop()

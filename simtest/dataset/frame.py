@@ -12,8 +12,8 @@ from simtest import provenance
 from simtest.errors import InputError
 from simtest.files import write_atomically, write_json
 from simtest.geometry import Camera
-from simtest.render import Radiance, Session, TruthMaps
-from simtest.render.bitmap import write_exr
+from simtest.rendering import Radiance, Session, TruthMaps
+from simtest.rendering.bitmap import write_exr
 from simtest.seeds import Stage, generator
 from simtest.sensor import expose, to_uint8
 from simtest.spec import Scene

@@ -44,11 +44,12 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if int(value) != value or value < 1:
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise InputError(f"camera.{name} = {value!r}: must be an integer >= 1")
         for name in ("fx", "fy", "cx", "cy", "skew"):
-            if not np.isfinite(getattr(self, name)):
-                raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be finite")
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+                raise InputError(f"camera.{name} = {value!r}: must be a finite number")
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be > 0, else K is singular")
@@ -69,12 +70,16 @@ class Camera:
         InputError
             If K has another shape, is not upper triangular or is singular.
         """
-        K = np.asarray(matrix, dtype=float)
+        try:
+            K = np.asarray(matrix, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError("K: must be a (3, 3) array of numbers") from None
         if K.shape != (3, 3):
             raise InputError(f"K has shape {K.shape}: must be (3, 3)")
         if not np.allclose([K[1, 0], K[2, 0], K[2, 1], K[2, 2]], [0, 0, 0, 1]):
             raise InputError(f"K = {K.tolist()}: must be upper triangular with K[2][2] = 1")
-        return cls(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1])
+        fx, fy, cx, cy, skew = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1)))
+        return cls(width, height, fx, fy, cx, cy, skew)
 
     @classmethod
     def from_fov(cls, fov_deg: float, width: int, height: int) -> "Camera":
@@ -85,9 +90,9 @@ class Camera:
         InputError
             If the angle is out of range.
         """
-        if not 0 < fov_deg < 180:
+        if isinstance(fov_deg, bool) or not isinstance(fov_deg, int | float) or not 0 < fov_deg < 180:
             raise InputError(f"fov = {fov_deg!r}: must be between 0 and 180 deg")
-        focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
+        focal = float(width / 2 / np.tan(np.radians(fov_deg) / 2))
         return cls(width, height, focal, focal, width / 2, height / 2)
 
     @cached_property

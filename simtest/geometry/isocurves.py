@@ -37,9 +37,9 @@ def cosine_of_isovalue(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, scale: 
     """
     t, n, c = (np.asarray(value, dtype=float) for value in (isovalue, exponent, scale))
     if not (np.all(n > 0) and np.all(c > 0)):
-        raise InputError(f"exponent n = {exponent}, scale c = {scale}: both must be > 0")
+        raise InputError(f"exponent n = {exponent!r}, scale c = {scale!r}: both must be > 0")
     if not (np.all(t > 0) and np.all(t < c)):
-        raise InputError(f"isovalue t = {isovalue}: must be inside (0, c), c = {scale}")
+        raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, c), c = {scale!r}")
     return np.asarray((t / c) ** (1 / n))
 
 
@@ -154,9 +154,9 @@ def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[A
     """
     k, z = np.asarray(kappa_value, dtype=float), np.abs(np.asarray(height, dtype=float))
     if not (np.all(k > 0) and np.all(k < 1)):
-        raise InputError(f"kappa = {kappa_value}: must be inside (0, 1)")
+        raise InputError(f"kappa = {kappa_value!r}: must be inside (0, 1)")
     if not np.all(z > 0):
-        raise InputError(f"V_Z = {height}: must not be 0, else the camera lies in the plane")
+        raise InputError(f"V_Z = {height!r}: must not be 0, else the camera lies in the plane")
     # tan(acos(tau) / 2) = sqrt(kappa) / (1 + tau)
     ratio = np.sqrt(k) / (1 + np.sqrt(1 - k))
     return np.asarray(z * ratio), np.asarray(z / ratio)

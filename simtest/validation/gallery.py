@@ -9,7 +9,7 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.files import write_atomically
-from simtest.render import Session
+from simtest.rendering import Session
 from simtest.validation.cases import Case
 from simtest.validation.metrics import angle_deg
 from simtest.validation.realise import Realisation, View

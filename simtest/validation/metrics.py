@@ -9,8 +9,8 @@ import polars as pl
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.reconstruction import Specularity
-from simtest.render import Session
-from simtest.render.frames import Array
+from simtest.rendering import Session
+from simtest.rendering.frames import Array
 from simtest.spec.scene import PhongReflectance, Scene
 from simtest.validation import laws
 from simtest.validation.truth import JudgedHighlight

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from simtest.estimators import Estimator
 from simtest.reconstruction import Specularity, reconstruct
-from simtest.render import Radiance, Session
+from simtest.rendering import Radiance, Session
 from simtest.seeds import Stage, generator, integer
 from simtest.sensor import expose
 from simtest.spec import Experiment, Scene

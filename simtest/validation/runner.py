@@ -17,7 +17,7 @@ from simtest import provenance
 from simtest.errors import InputError
 from simtest.estimators import Estimator, load_estimators
 from simtest.files import write_atomically, write_json
-from simtest.render import Session, backend
+from simtest.rendering import Session, backend
 from simtest.resources import shown
 from simtest.spec import Experiment, Scene
 from simtest.spec.scene import AnatomySurface

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
 from simtest.detection import contrast, half_height_component
 from simtest.geometry import smooth
-from simtest.render import TrueHighlight
+from simtest.rendering import TrueHighlight
 
 Image = npt.NDArray[np.float32]
 

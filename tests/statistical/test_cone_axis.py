@@ -9,7 +9,7 @@ from scipy import ndimage, stats
 from simtest.detection import estimate_noise
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct
-from simtest.render import Session
+from simtest.rendering import Session
 from simtest.seeds import Stage, generator
 from simtest.sensor import expose
 from simtest.spec import scene_from_dict

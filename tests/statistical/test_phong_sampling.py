@@ -5,7 +5,7 @@ Family-wise alpha 0.01 over all cases, by Sidak's correction, which Mitsuba's te
 
 import pytest
 
-from simtest.render import backend, phong
+from simtest.rendering import backend, phong
 
 pytestmark = pytest.mark.render
 

@@ -11,8 +11,8 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.errors import BackendError
-from simtest.render import backend
-from simtest.render.backend import Candidate, candidates, choose_library, probe, requested_variant
+from simtest.rendering import backend
+from simtest.rendering.backend import Candidate, candidates, choose_library, probe, requested_variant
 
 SYSTEM = Path("/usr/lib/x86_64-linux-gnu")
 MAIN = "from simtest.cli.main import main; main()"
@@ -48,7 +48,7 @@ BAD = {
     "text": (text_file, "is not a usable libLLVM ("),
     "another library": (installed("libm.so.6"), "lacks core API"),
     "LLVM 14": (installed("libLLVM-14.so.1"), "(14) is too old"),
-    "LLVM 15": (installed("libLLVM-15.so.1"), "aborts when compiling a kernel (signal 6)"),
+    "LLVM 15": (installed("libLLVM-15.so.1"), "aborts the process when a kernel is compiled"),
 }
 
 
@@ -260,7 +260,6 @@ def test_a_corrupt_cache_does_no_harm(tmp_path, no_child, content):
     assert list(json.loads(file.read_text()).values()) == ["ok"]
 
 
-@pytest.mark.xfail(strict=True, raises=NotADirectoryError, reason="_write_cache unlinks its part file unguarded")
 def test_a_cache_that_cannot_be_written_costs_only_time(tmp_path, no_child):
     library = text_file(tmp_path)
     (tmp_path / "cache").write_text("a file where the folder should be")
@@ -300,7 +299,7 @@ def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
 def test_nothing_is_set_or_loaded_at_import():
     code = (
         "import cv2, os, sys; before = dict(os.environ)\n"  # OpenCV sets LD_LIBRARY_PATH
-        "import simtest.render, simtest.render.backend, simtest.render.doctor, simtest.render.session\n"
+        "import simtest.rendering, simtest.rendering.backend, simtest.rendering.doctor, simtest.rendering.session\n"
         "assert dict(os.environ) == before\n"
         "assert not {'mitsuba', 'drjit'} & set(sys.modules), 'loaded'\n"
     )

@@ -426,8 +426,8 @@ MATRICES = {
     "4 x 4": (np.eye(4), "K has shape (4, 4): must be (3, 3)"),
     "transposed": (np.transpose(K), "must be upper triangular with K[2][2] = 1"),
     "all NaN": (np.full((3, 3), np.nan), "must be upper triangular"),
-    "one NaN": ([[40.0, 0.0, np.nan], *K[1:]], "camera.cx = ", "must be finite"),
-    "infinite": ([[np.inf, 0.0, 16.0], *K[1:]], "camera.fx = ", "must be finite"),
+    "one NaN": ([[40.0, 0.0, np.nan], *K[1:]], "camera.cx = ", "must be a finite number"),
+    "infinite": ([[np.inf, 0.0, 16.0], *K[1:]], "camera.fx = ", "must be a finite number"),
 }
 
 

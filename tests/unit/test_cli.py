@@ -271,7 +271,6 @@ def test_a_scene_out_of_sight(here):
 
 
 @pytest.mark.render
-@pytest.mark.xfail(strict=True, reason="Session._hits casts no rays at all: Dr.Jit ends the process")
 def test_the_smallest_camera_renders(tmp_path):
     done = child(
         "render", "plane", "--set", "camera.width=1", "--set", "camera.height=1", "--out", "x", folder=tmp_path
@@ -341,7 +340,6 @@ def test_a_stopped_run_keeps_its_finished_cases(stopped):
 
 
 @pytest.mark.render
-@pytest.mark.xfail(strict=True, reason="cyclopts swallows the KeyboardInterrupt: suppress_keyboard_interrupt=False")
 def test_a_stopped_run_says_that_it_goes_on(stopped):
     *_, errors = stopped
     assert without_bar(errors.splitlines()) == [

@@ -5,7 +5,7 @@ import pytest
 from skimage.measure import find_contours
 
 from simtest.geometry import isocurves
-from simtest.render import Session
+from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 
 pytestmark = pytest.mark.render

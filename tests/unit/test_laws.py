@@ -5,7 +5,7 @@ import pytest
 
 from simtest.geometry import circle_pose
 from simtest.reconstruction import reconstruct
-from simtest.render import Session
+from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
 from simtest.validation.metrics import angle_deg

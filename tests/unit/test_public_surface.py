@@ -53,21 +53,6 @@ def test_each_is_loaded_on_demand_from_its_home(name):
     assert getattr(simtest, name) is value
 
 
-def test_the_function_render_is_not_hidden_by_the_subpackage_of_its_name():
-    """Whatever is imported first; `from simtest.render import Session` goes on to work."""
-    orders = [
-        "simtest.validate; simtest.render",
-        "__import__('simtest.render.session'); simtest.render",
-        "simtest.render; __import__('simtest.render.session')",
-    ]
-    for order in orders:
-        code = (
-            f"import simtest, json; {order}; from simtest import render; from simtest.render import Session, backend;"
-            "print(json.dumps([type(simtest.render).__name__, type(render).__name__, Session.__module__]))"
-        )
-        assert child(code) == ["function", "function", "simtest.render.session"], order
-
-
 def test_unknown_names_are_attribute_errors():
     with pytest.raises(AttributeError, match="module 'simtest' has no attribute 'nothing'"):
         _ = simtest.nothing

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from simtest.anatomy import Shape, TriangleMesh
-from simtest.render import Session
-from simtest.render.materials import bsdf_dict
-from simtest.render.shapes import make_shape
+from simtest.rendering import Session
+from simtest.rendering.materials import bsdf_dict
+from simtest.rendering.shapes import make_shape
 from simtest.spec import scene_from_dict
 
 pytestmark = pytest.mark.render

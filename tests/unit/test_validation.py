@@ -12,8 +12,8 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction import Specularity, reconstruct
-from simtest.render import Session
-from simtest.render.frames import TrueHighlight
+from simtest.rendering import Session
+from simtest.rendering.frames import TrueHighlight
 from simtest.seeds import Stage, generator, integer, key, sequence
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example

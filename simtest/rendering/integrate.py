@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simtest.geometry.camera import Camera
-from simtest.render.frames import Array, Radiance
+from simtest.rendering.frames import Array, Radiance
 
 Rays = Callable[[Array], tuple[Array, Array]]
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
 from simtest.geometry.camera import Camera
-from simtest.render import backend, highlights, integrate, phong
-from simtest.render.frames import Array, Radiance, TrueHighlight, TruthMaps
-from simtest.render.materials import bsdf_dict, parameter_updates
-from simtest.render.shapes import make_shape
+from simtest.rendering import backend, highlights, integrate, phong
+from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps
+from simtest.rendering.materials import bsdf_dict, parameter_updates
+from simtest.rendering.shapes import make_shape
 from simtest.spec.scene import AnatomySurface, Scene
 
 COLOCATED_MM = 1e-9
@@ -42,7 +42,7 @@ class Session:
     scene : Scene
         The first scene.
     variant : str, optional
-        Mitsuba variant; default by `simtest.render.backend.requested_variant`.
+        Mitsuba variant; default by `simtest.rendering.backend.requested_variant`.
 
     Attributes
     ----------
@@ -204,6 +204,10 @@ class Session:
 
     def _hits(self, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
         assert self._built is not None
+        if not len(origins):
+            # Dr.Jit ends the process on a kernel without rays.
+            none = np.empty((0, 3))
+            return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
         mi = self.mi
         ray = mi.Ray3f(_point(mi, origins), mi.Vector3f(_point(mi, directions)))
         preliminary = self._built.scene.ray_intersect_preliminary(ray)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from typing import Any
 
-from simtest.render import backend
+from simtest.rendering import backend
 
 RENDER_TIMEOUT_S = 180
 
@@ -16,7 +16,7 @@ def examine(variant: str | None = None) -> dict[str, Any]:
     Parameters
     ----------
     variant : str, optional
-        See `simtest.render.backend.requested_variant`.
+        See `simtest.rendering.backend.requested_variant`.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def examine(variant: str | None = None) -> dict[str, Any]:
 
 def _try_rendering(variant: str) -> str | None:
     """Render a plane in a child process; gives the problem, or None."""
-    command = [sys.executable, "-m", "simtest.render.doctor", variant]
+    command = [sys.executable, "-m", "simtest.rendering.doctor", variant]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S)
     except subprocess.TimeoutExpired:
@@ -47,7 +47,7 @@ def _try_rendering(variant: str) -> str | None:
 
 def _main() -> int:
     from simtest.errors import SimtestError
-    from simtest.render.session import Session
+    from simtest.rendering.session import Session
     from simtest.spec import scene_from_dict
 
     scene = scene_from_dict({"surface": {"type": "plane"}, "camera": {"width": 17, "height": 17, "fx": 17, "fy": 17}})

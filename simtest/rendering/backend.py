@@ -4,11 +4,13 @@ A bad libLLVM can abort the process at its first kernel, so each candidate compi
 child process before the real one uses it. Nothing is set when this module is imported.
 """
 
+import contextlib
 import ctypes.util
 import importlib.metadata
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -25,6 +27,9 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "SIMTEST_VARIANT"
 PIP_PACKAGE = "karellen-llvm-core"
 PROBE_TIMEOUT_S = 120
+
+UNTRIED = "could not be tried"
+"""Begins a verdict that says nothing about the library (no time, no memory): it is not remembered."""
 
 # The kernel holds a `max`: libLLVM 15 compiles everything up to it and then aborts the process.
 _PROBE = """
@@ -133,7 +138,7 @@ def probe(candidate: Candidate) -> Candidate:
         key = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|drjit {versions}"
         cache = _read_cache()
         verdict = cache.get(key) or _run_probe(str(path))
-        if cache.get(key) != verdict and not verdict.startswith("could not be tried"):
+        if cache.get(key) != verdict and not verdict.startswith(UNTRIED):
             _write_cache({**cache, key: verdict})
     return Candidate(candidate.origin, candidate.path, verdict)
 
@@ -145,12 +150,14 @@ def _run_probe(path: str) -> str:
             [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return f"could not be tried ({type(error).__name__})"
+        return f"{UNTRIED} ({type(error).__name__})"
     if "simtest-probe-ok" in child.stdout:
         return "ok"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    if child.returncode == -signal.SIGABRT:
+        return "aborts the process when a kernel is compiled; too old for Dr.Jit"
     if child.returncode < 0:
-        return f"aborts when compiling a kernel (signal {-child.returncode}); too old for Dr.Jit"
+        return f"{UNTRIED} (signal {-child.returncode} ended the attempt)"
     said = next((line for line in lines if "LLVM" in line and "Traceback" not in line), lines[-1] if lines else "")
     return f"is not a usable libLLVM ({said[:160]})"
 
@@ -164,7 +171,8 @@ def _read_cache() -> dict[str, str]:
         cache = json.loads(_cache_file().read_text())
     except (OSError, ValueError):
         return {}
-    return cache if isinstance(cache, dict) else {}
+    items = cache.items() if isinstance(cache, dict) else ()
+    return {key: verdict for key, verdict in items if isinstance(verdict, str)}
 
 
 def _write_cache(cache: dict[str, str]) -> None:
@@ -176,7 +184,8 @@ def _write_cache(cache: dict[str, str]) -> None:
         part.write_text(json.dumps(cache))
         os.replace(part, file)
     except OSError:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def choose_library() -> tuple[Candidate | None, list[Candidate]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from simtest.anatomy.base import SurfacePoints, tangent_basis
 from simtest.geometry.camera import Camera
-from simtest.render.frames import Array, Radiance, TrueHighlight
+from simtest.rendering.frames import Array, Radiance, TrueHighlight
 from simtest.spec.scene import Scene
 
 MIN_GAIN = 0.05

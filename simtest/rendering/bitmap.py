@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.render import backend
-from simtest.render.frames import FloatImage
+from simtest.rendering import backend
+from simtest.rendering.frames import FloatImage
 
 
 def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None:
