@@ -1,0 +1,4 @@
+"""The published validation protocol [MB, section 3.1]: a plane's texture seen slanted by a camera that is not at V.
+
+It tests the conic pipeline, not the imaging of a camera with its own light; the rendered experiments do that.
+"""

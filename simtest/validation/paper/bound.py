@@ -1,0 +1,78 @@
+"""The Cramer-Rao bound of the published protocol: how well any unbiased method could do on its frames."""
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.validation.paper.protocol import PaperSetting
+
+Array = npt.NDArray[np.float64]
+
+_STEPS = np.array([1e-5, 1e-5, 1e-2, 1e-2, 1e-4, 1e-2, 1e-3])
+"""Central-difference steps of the parameters: tilts (rad), BP (px), log scale, n, c."""
+
+
+def cramer_rao_bound(setting: PaperSetting) -> float:
+    """Give the bound on the RMS angle between estimated and true normal (theory.md section 2).
+
+    The frame is c max(0, cos beta)^n on the slanted plane with white noise; unknown are two tilts, the BP (two), the
+    scale of the scene, n and c. Scale and n are nearly degenerate, which does not touch the normal. Light at V.
+
+    Parameters
+    ----------
+    setting : PaperSetting
+        Its `eps`, `isovalue` and `smoothing_px` do not enter.
+
+    Returns
+    -------
+    float
+        rad; 0 without noise.
+    """
+    if setting.sigma == 0:
+        return 0.0
+    nominal = np.array([0.0, 0.0, 0.0, 0.0, 0.0, setting.exponent, 1.0])
+    inside = _inside_window(setting)
+    columns = []
+    for index, step in enumerate(_STEPS):
+        change = np.zeros(len(nominal))
+        change[index] = step
+        difference = _model(setting, nominal + change) - _model(setting, nominal - change)
+        columns.append((difference / (2 * step))[inside])
+    J = np.stack(columns, axis=1)
+    information = J.T @ J / setting.sigma**2
+    # Scaled to unit diagonal: the parameters' units differ by orders of magnitude.
+    scale = 1 / np.sqrt(np.diag(information))
+    covariance = np.linalg.inv(information * scale[:, None] * scale) * scale[:, None] * scale
+    return float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
+
+
+def _sightlines(setting: PaperSetting) -> Array:
+    """Give the sightlines of all pixels at unit depth, shape (M, M, 3)."""
+    pixels = setting.camera.pixel_centres()
+    xy = (pixels - setting.size / 2) / setting.size
+    return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
+
+
+def _model(setting: PaperSetting, parameters: Array) -> Array:
+    """Give the frame of a plane through V_Z times the BP's sightline; the tilts turn its normal."""
+    tilt_x, tilt_y, bp_x, bp_y, log_scale, exponent, peak = parameters
+    first = np.array([1.0, 0.0, 0.0])
+    normal = setting.normal + tilt_x * first + tilt_y * np.cross(setting.normal, first)
+    normal /= np.linalg.norm(normal)
+    foot = setting.height * np.array([bp_x / setting.size, bp_y / setting.size, 1.0])
+    rays = _sightlines(setting)
+    points = rays * ((normal @ foot) / (rays @ normal))[..., None]
+    squared = np.sum((points - foot) ** 2, axis=-1)
+    height2 = (setting.height * np.exp(log_scale)) ** 2
+    cosine = (height2 - squared) / (height2 + squared)
+    return np.asarray(peak * np.maximum(cosine, 0) ** exponent)
+
+
+def _inside_window(setting: PaperSetting) -> npt.NDArray[np.bool_]:
+    """Tell which pixels see the texture's window in front of the camera, shape (M, M)."""
+    rays = _sightlines(setting)
+    theta, centre = np.radians(setting.theta_deg), np.array([0.0, 0.0, setting.height])
+    depth = (setting.normal @ centre) / (rays @ setting.normal)
+    points = rays * depth[..., None] - centre
+    half = setting.size / 2
+    y = points @ np.array([0.0, np.cos(theta), np.sin(theta)])
+    return np.asarray((depth > 0) & (np.abs(points[..., 0]) < half) & (np.abs(y) < half))

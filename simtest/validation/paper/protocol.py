@@ -1,0 +1,163 @@
+"""The picture of the published protocol: texture of the specular term, slanted view, all noise-free.
+
+Choices that the article does not state: the plane's centre lies at distance V_Z from the imaging camera; one texture
+sample is one length unit; the tilt is about the image's x axis; the texture's centre maps to (M/2, M/2) with pixel
+centres at + 0.5; the camera has f = M.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.geometry.isocurves import cosine_beta
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+MIN_SIZE = 16
+MAX_SIZE = 4096
+MAX_SMOOTHING_PX = 50.0
+
+
+@dataclass(frozen=True)
+class PaperSetting:
+    """One setting of the published protocol; the defaults are the article's.
+
+    Parameters
+    ----------
+    eps : float
+        Light offset, texture units, >= 0: L = V + eps (cos a, sin a, b).
+    size : int
+        M, px and texture samples along a side, 16 to 4096.
+    height : float
+        V_Z, texture units, > 0.
+    exponent : float
+        Roughness exponent n > 0.
+    sigma : float
+        Standard deviation of the noise, share of the noise-free peak, in [0, 1].
+    isovalue : float
+        t in (0, 1).
+    theta_deg : float
+        Slant, deg, in [0, 90).
+    smoothing_px : float
+        Standard deviation of the Gaussian smoothing, px, in [0, 50].
+    recentre : bool
+        Centre the texture's window at the BP, as published for the eps sweep; else at the camera's foot.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range.
+    """
+
+    eps: float = 0.0
+    size: int = 406
+    height: float = 1000.0
+    exponent: float = 50.0
+    sigma: float = 0.05
+    isovalue: float = 0.1
+    theta_deg: float = 58.0
+    smoothing_px: float = DEFAULT_SMOOTHING_PX
+    recentre: bool = True
+
+    def __post_init__(self) -> None:
+        for name, good, allowed in (
+            ("eps", self.eps >= 0, ">= 0"),
+            ("size", MIN_SIZE <= self.size <= MAX_SIZE, f"{MIN_SIZE} to {MAX_SIZE}"),
+            ("height", self.height > 0, "> 0"),
+            ("exponent", self.exponent > 0, "> 0"),
+            ("sigma", 0 <= self.sigma <= 1, "in [0, 1]"),
+            ("isovalue", 0 < self.isovalue < 1, "inside (0, 1)"),
+            ("theta_deg", 0 <= self.theta_deg < 90, "in [0, 90)"),
+            ("smoothing_px", 0 <= self.smoothing_px <= MAX_SMOOTHING_PX, f"in [0, {MAX_SMOOTHING_PX:g}]"),
+        ):
+            if not (good and np.isfinite(getattr(self, name))):
+                raise InputError(f"paper.{name} = {getattr(self, name)!r}: must be {allowed}")
+
+    @property
+    def camera(self) -> Camera:
+        """The imaging camera: f = M, c = M/2."""
+        size = self.size
+        return Camera(size, size, float(size), float(size), size / 2, size / 2)
+
+    @property
+    def normal(self) -> Array:
+        """The plane's normal in the imaging camera's frame, facing it, shape (3,)."""
+        theta = np.radians(self.theta_deg)
+        return np.array([0.0, np.sin(theta), -np.cos(theta)])
+
+
+def brightest_point(light: Array, camera: Array) -> Array:
+    """Give the BP on the plane z = 0, shape (2,): where the mirrored light, the point and the camera are in line.
+
+    Parameters
+    ----------
+    light, camera : ndarray, shape (3,)
+        L and V, at z > 0.
+    """
+    share = camera[2] / (camera[2] + light[2])
+    return np.asarray(camera[:2] + share * (light[:2] - camera[:2]))
+
+
+def draw_light(setting: PaperSetting, rng: np.random.Generator) -> Array:
+    """Draw the light L = V + eps (cos a, sin a, b), a ~ U[0, 2 pi), b ~ U[-0.5, 0.5], shape (3,)."""
+    a, b = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5)
+    return np.array([0.0, 0.0, setting.height]) + setting.eps * np.array([np.cos(a), np.sin(a), b])
+
+
+def plane_from_image(setting: PaperSetting) -> Array:
+    """Give the homography from pixels to plane coordinates about the window's centre, shape (3, 3), texture units.
+
+    The plane's point x (1, 0, 0) + y (0, cos theta, sin theta) + (0, 0, V_Z) is seen at K times it.
+    """
+    theta = np.radians(setting.theta_deg)
+    camera_from_plane = np.array([[1, 0, 0], [0, np.cos(theta), 0], [0, np.sin(theta), setting.height]])
+    return np.asarray(np.linalg.inv(setting.camera.K @ camera_from_plane))
+
+
+def texture(setting: PaperSetting, light: Array) -> Image:
+    """Give the M x M texture of the specular term max(0, cos beta)^n, its largest sample 1 at most.
+
+    Parameters
+    ----------
+    setting : PaperSetting
+        For M, V_Z, n and the window.
+    light : ndarray, shape (3,)
+        L, texture units, the camera's foot at the origin.
+
+    Returns
+    -------
+    ndarray of float32, shape (M, M)
+    """
+    camera = np.array([0.0, 0.0, setting.height])
+    side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
+    points = np.stack(np.meshgrid(side, side), axis=-1) + window_centre(setting, light)
+    return np.asarray(np.maximum(cosine_beta(points, light, camera), 0) ** setting.exponent, dtype=np.float32)
+
+
+def window_centre(setting: PaperSetting, light: Array) -> Array:
+    """Give the plane point at the texture's centre, shape (2,)."""
+    camera = np.array([0.0, 0.0, setting.height])
+    return brightest_point(light, camera) if setting.recentre else np.zeros(2)
+
+
+def picture(setting: PaperSetting, light: Array) -> Image:
+    """Give the noise-free picture of the texture seen slanted: the texture warped by the homography, bilinear.
+
+    Returns
+    -------
+    ndarray of float32, shape (M, M)
+        0 where the window ends; the peak is the texture's.
+    """
+    # cv2 counts pixels from their centres: half a pixel off on either side.
+    to_corner = np.array([[1, 0, PIXEL_CENTRE], [0, 1, PIXEL_CENTRE], [0, 0, 1]])
+    to_window = np.array([[1, 0, setting.size / 2], [0, 1, setting.size / 2], [0, 0, 1]])
+    texture_from_image = np.linalg.inv(to_corner) @ to_window @ plane_from_image(setting) @ to_corner
+    size = (setting.size, setting.size)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(texture(setting, light), texture_from_image, size, flags=flags))
