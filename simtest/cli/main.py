@@ -19,11 +19,16 @@ APP = App(
     # Ours says what is kept.
     suppress_keyboard_interrupt=False,
 )
-APP.command("simtest.cli.doctor:doctor")
-APP.command("simtest.cli.schema:schema")
-APP.command("simtest.cli.render:render")
-APP.command("simtest.cli.reconstruct:reconstruct")
-APP.command("simtest.cli.validate:validate")
+# Told here, since a sub-command's own text is loaded with it.
+_COMMANDS = {
+    "doctor": "Check the rendering backend.",
+    "schema": "Print the JSON schema of a scene, experiment or camera file.",
+    "render": "Render a scene with its ground truth.",
+    "reconstruct": "Reconstruct the normals at the specularities of a picture.",
+    "validate": "Run an experiment and write its report.",
+}
+for _name, _help in _COMMANDS.items():
+    APP.command(f"simtest.cli.{_name}:{_name}", help=_help)
 
 INTERRUPTED = 130
 BAD_USE = 2
