@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection import Region, detect, estimate_noise
-from simtest.errors import Failure, InputError, Reason
+from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
+from simtest.estimators.checked import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.resources import shown
 
@@ -140,21 +141,3 @@ def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
     except (TypeError, ValueError):
         raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
     return x, y, width, height
-
-
-def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimate | Failure:
-    """Run an estimator on a patch; what it raises or gives in the wrong form becomes a Failure with its text."""
-    if isinstance(patch, Failure):
-        return patch
-    try:
-        result = estimator(patch, camera)
-    except Exception as error:
-        # An estimator of another package may fail in any way; one highlight must not end a run of thousands.
-        return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
-    if isinstance(result, Failure):
-        return result
-    if not isinstance(result, Estimate):
-        return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
-    if not (np.isfinite(result.normal).all() and abs(np.linalg.norm(result.normal) - 1) < 1e-6):
-        return Failure(Reason.NOT_FINITE, f"normal {np.asarray(result.normal).tolist()} is not a unit vector")
-    return result

@@ -17,7 +17,6 @@ class Stage(IntEnum):
     RENDER = 1
     SENSOR = 2
     VIEWPOINT = 3
-    BOOTSTRAP = 4
 
 
 def key(text: str) -> int:
@@ -63,5 +62,10 @@ def generator(seed: int, experiment: str, case: str, realisation: int, stage: St
 
 
 def integer(seed: int, experiment: str, case: str, realisation: int, stage: Stage) -> int:
-    """Give a 32-bit integer seed of one stage of one realisation (see `sequence` for the parameters)."""
-    return int(sequence(seed, experiment, case, realisation, stage).generate_state(1, np.uint32)[0])
+    """Give a seed in [0, 2^63) of one stage of one realisation (see `sequence` for the parameters)."""
+    return int(sequence(seed, experiment, case, realisation, stage).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def from_integer(seed: int) -> np.random.Generator:
+    """Give the generator of a seed made by `integer`, or of any other, >= 0."""
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed)))

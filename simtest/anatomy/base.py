@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from simtest.geometry.vectors import tangent_basis
+
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -183,20 +185,6 @@ def pack_points(
         direction_max=only_valid(direction_max),
         valid=valid,
     )
-
-
-def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """Give two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
-
-    The branch-free construction of Duff et al. 2017 (J. Comput. Graph. Tech. 6(1)).
-    """
-    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
-    sign = np.where(z >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    second = np.stack([b, sign + y * y * a, -y], axis=1)
-    return first, second
 
 
 def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from simtest.files import write_atomically, write_json
 from simtest.geometry import Camera
 from simtest.rendering import Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
-from simtest.seeds import Stage, generator
+from simtest.seeds import from_integer
 from simtest.sensor import expose, to_uint8
 from simtest.spec import Scene
 from simtest.validation.realise import view
@@ -61,7 +61,7 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
     Parameters
     ----------
     scene : Scene
-        The scene; its sensor's noise hangs on ``render.seed``.
+        The scene; its noise hangs on ``sensor.seed``.
     variant : str, optional
         Mitsuba variant.
 
@@ -81,8 +81,7 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
     truth = session.truth()
     if not truth.mask.any():
         raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")
-    rng = generator(scene.render.seed, "frame", scene.name, 0, Stage.SENSOR)
-    image = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, rng)
+    image = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, from_integer(scene.sensor.seed))
     return LabelledFrame(
         scene, session.camera, image, seen.radiance, truth, seen.truths, seen.full_scale, session.variant
     )

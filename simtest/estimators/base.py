@@ -53,7 +53,7 @@ class Estimate:
     choice_margin : float, optional
         How clearly the proposed candidate won, in standard deviations.
     covariance : ndarray, shape (2, 2), optional
-        Of the normal in its tangent plane, rad^2.
+        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
     flags : tuple of str
         Warnings.
     """

@@ -51,3 +51,10 @@ def load_estimators(names: Sequence[str]) -> dict[str, Estimator]:
             raise InputError(f"estimator {name!r}: {points[name].value} is not callable")
         loaded[name] = estimator
     return loaded
+
+
+def distributions(names: Sequence[str]) -> dict[str, str]:
+    """Give the package and version that each estimator comes from, by "estimator NAME"."""
+    points = _entry_points()
+    found = {name: points[name].dist for name in names if name in points}
+    return {f"estimator {name}": f"{dist.name} {dist.version}" if dist else "" for name, dist in found.items()}

@@ -5,7 +5,6 @@ child process before the real one uses it. Nothing is set when this module is im
 """
 
 import contextlib
-import ctypes.util
 import importlib.metadata
 import json
 import os
@@ -21,6 +20,7 @@ from typing import Any
 import platformdirs
 
 from simtest.errors import BackendError
+from simtest.files import write_json
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -109,8 +109,6 @@ def _system_libraries() -> list[str]:
                 version = tuple(int(part) for part in numbers.strip(".").split("."))
                 resolved = str(path.resolve())
                 versions[resolved] = max(version, versions.get(resolved, (0,)))
-    if not versions and (name := ctypes.util.find_library("LLVM")):
-        versions[name] = (0,)
     return sorted(versions, key=lambda path: versions[path], reverse=True)
 
 
@@ -177,15 +175,9 @@ def _read_cache() -> dict[str, str]:
 
 def _write_cache(cache: dict[str, str]) -> None:
     """Store the verdicts; a cache that cannot be written costs only time."""
-    file = _cache_file()
-    part = file.with_suffix(f".{os.getpid()}.part")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(cache))
-        os.replace(part, file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        _cache_file().parent.mkdir(parents=True, exist_ok=True)
+        write_json(_cache_file(), cache)
 
 
 def choose_library() -> tuple[Candidate | None, list[Candidate]]:
@@ -225,7 +217,7 @@ def load(variant: str | None = None) -> Any:
         If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
-    if name.startswith("llvm") and not _drjit_loaded():
+    if name.startswith("llvm") and not _llvm_active():
         chosen, tried = choose_library()
         if chosen is None:
             raise BackendError(no_library_message(tried))
@@ -235,9 +227,9 @@ def load(variant: str | None = None) -> Any:
         os.environ[LIBRARY_VARIABLE] = chosen.path
     import mitsuba
 
-    if name not in mitsuba.variants():
-        usable = ", ".join(v for v in mitsuba.variants() if "_ad_" in v and "polarized" not in v)
-        raise BackendError(f"variant {name!r}: unknown to this Mitsuba; allowed: {usable}")
+    usable = [v for v in mitsuba.variants() if re.fullmatch(r"(llvm|cuda)_ad_(mono|rgb)", v)]
+    if name not in usable:
+        raise BackendError(f"variant {name!r}: cannot be used; allowed: {', '.join(usable)}")
     if mitsuba.variant() != name:
         try:
             mitsuba.set_variant(name)
@@ -246,8 +238,10 @@ def load(variant: str | None = None) -> Any:
     return mitsuba
 
 
-def _drjit_loaded() -> bool:
-    return "drjit" in sys.modules and "mitsuba" in sys.modules and sys.modules["mitsuba"].variant() is not None
+def _llvm_active() -> bool:
+    """Tell whether Dr.Jit has loaded its libLLVM already: then there is nothing left to choose."""
+    active = sys.modules["mitsuba"].variant() if "mitsuba" in sys.modules else None
+    return bool(active and active.startswith("llvm"))
 
 
 def library_in_use() -> str | None:

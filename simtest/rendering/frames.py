@@ -29,6 +29,16 @@ class Radiance:
         """Sum of the parts, shape (H, W) or (H, W, 3)."""
         return self.specular + self.diffuse + self.indirect
 
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return 1 if self.specular.ndim == 2 else self.specular.shape[2]
+
+    @property
+    def intensity(self) -> FloatImage:
+        """Mean of the channels, shape (H, W): what estimators see."""
+        return self.total if self.channels == 1 else self.total.mean(axis=2, dtype=np.float32)
+
 
 @dataclass(frozen=True)
 class TruthMaps:

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from simtest.anatomy.base import SurfacePoints, tangent_basis
+from simtest.anatomy.base import SurfacePoints
 from simtest.geometry.camera import Camera
+from simtest.geometry.vectors import tangent_basis
 from simtest.rendering.frames import Array, Radiance, TrueHighlight
 from simtest.spec.scene import Scene
 
@@ -162,7 +163,7 @@ def _distinct(points: Array) -> Array:
 def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[TrueHighlight]:
     points, _, _ = session.cast(solutions)
     lit = session.lit(points.position, light)
-    total = radiance.total if radiance.total.ndim == 2 else radiance.total.mean(axis=2)
+    total = radiance.intensity
     columns = np.clip(solutions[:, 0].astype(int), 0, session.camera.width - 1)
     rows = np.clip(solutions[:, 1].astype(int), 0, session.camera.height - 1)
     return [

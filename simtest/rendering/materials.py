@@ -69,7 +69,7 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
             }
 
 
-def parameter_updates(reflectance: AnyReflectance, diffuse_only: bool) -> dict[str, float] | None:
+def parameter_updates(reflectance: AnyReflectance) -> dict[str, float] | None:
     """Give the parameters that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
 
     Returns
@@ -78,5 +78,5 @@ def parameter_updates(reflectance: AnyReflectance, diffuse_only: bool) -> dict[s
         None where the material has to be rebuilt.
     """
     if isinstance(reflectance, PhongReflectance):
-        return {"exponent": reflectance.exponent, "specular": 0.0 if diffuse_only else reflectance.specular}
+        return {"exponent": reflectance.exponent, "specular": reflectance.specular}
     return None

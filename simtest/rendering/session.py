@@ -81,7 +81,7 @@ class Session:
             self._truth = None  # of another camera
         self.scene: Scene = scene
         self.camera: Camera = scene.camera.model()
-        updates = parameter_updates(scene.reflectance, diffuse_only=False)
+        updates = parameter_updates(scene.reflectance)
         fixed = (
             scene.reflectance
             if updates is None
@@ -94,9 +94,11 @@ class Session:
         self._apply(self._built)
 
     def _load_surface(self, scene: Scene) -> None:
+        # A malformed surface raises here and leaves the session at its scene.
+        surface = make_surface(scene.surface)
+        self._shape = surface.shape()
+        self.surface: SurfaceModel = surface
         self.scene = scene
-        self.surface: SurfaceModel = make_surface(scene.surface)
-        self._shape = self.surface.shape()
         self._truth = None
 
     def _build(self, key: tuple[Any, ...]) -> _Built:
@@ -123,7 +125,7 @@ class Session:
             place = self.to_model(np.array([light.place_mm]))[0]
             self._set(parameters, f"light_{i}.position", self.mi.Point3f(*place.tolist()))
             self._set(parameters, f"light_{i}.intensity.value", light.power)
-        for name, value in (parameter_updates(self.scene.reflectance, diffuse_only=False) or {}).items():
+        for name, value in (parameter_updates(self.scene.reflectance) or {}).items():
             self._set(parameters, f"bsdf.{name}", value)
         parameters.update()
 

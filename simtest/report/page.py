@@ -2,11 +2,11 @@
 
 import base64
 import io
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from simtest.files import write_atomically
 from simtest.report import static, style, words
 from simtest.report.gallery import isophote_colour
 from simtest.report.run import Run, read_run
@@ -47,9 +47,7 @@ def write_report(run: Path) -> Path:
         sections, charts = _sections(data, colours, folder)
     html = _render(data, colours, sections, charts)
     page = data.path / "index.html"
-    part = page.with_name(page.name + ".part")
-    part.write_text(html, encoding="utf-8")
-    os.replace(part, page)
+    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 

@@ -1,6 +1,7 @@
 """Reads a run directory: results.parquet, summary.json and the gallery."""
 
 import json
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,7 +138,7 @@ def read_run(path: Path) -> Run:
         If a file is missing or malformed; the message names it.
     """
     path = Path(path)
-    files = sorted((path / "gallery").glob("*.npz"))
+    files = sorted((path / "gallery").glob("[!.]*.npz"))
     count = min(len(files), MAX_GALLERY)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, count).round().astype(int))] if count else []
     items = varied([_read_item(file) for file in chosen])
@@ -201,6 +202,6 @@ def _read_item(path: Path) -> GalleryItem:
             meta = json.loads(str(data["meta"][()]))
             frame, position, normal = (np.asarray(data[k], np.float32) for k in ("frame", "position", "normal"))
         camera = Camera(**meta["camera"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
     return GalleryItem(path.stem, frame, position, normal, camera, meta)

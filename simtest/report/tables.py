@@ -151,13 +151,12 @@ def surface_figure(run: Run, has_lines: bool) -> SurfaceFigure | None:
 
 
 def _surface_row(own: pl.DataFrame, hits: pl.Series, surface: str, estimator: str) -> dict[str, Any]:
-    ok = own["ok"]
     detected = own.filter(pl.col("true_id").is_not_null())
     return {
         "surface": surface, "estimator": estimator,
         "n": detected.height, "ok": int(detected["ok"].sum()),
         "missed": own.filter(pl.col("status") == "missed").height,
-        "failed": own.filter(~ok & (pl.col("status") != "missed")).height,
+        "failed": detected.filter(~pl.col("ok") & (pl.col("status") != "missed")).height,
         "false": own.filter(pl.col("true_id").is_null()).height,
         "mean": hits.mean(), "median": hits.median(), "p95": hits.quantile(0.95, "linear"), "max": hits.max(),
     }  # fmt: skip

@@ -77,7 +77,7 @@ def _plural(word: str, count: int) -> str:
 def _counts(rows: pl.DataFrame) -> str:
     false = rows["true_id"].is_null() & (rows["status"] != "missed").fill_null(True)
     missed = (rows["status"] == "missed").fill_null(False)
-    failed = rows.filter((pl.col("status") != "ok") & (pl.col("status") != "missed"))
+    failed = rows.filter((pl.col("status") != "ok") & (pl.col("status") != "missed") & ~false)
     total = rows.height
     reasons = failed["status"].value_counts(sort=True).iter_rows()
     detail = f" ({', '.join(f'{name} {count}' for name, count in reasons)})" if failed.height else ""

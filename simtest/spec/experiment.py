@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
+from simtest.errors import InputError
 from simtest.resources import find
 from simtest.spec.reading import Spec, apply_settings, read_toml, validate
 
@@ -78,8 +79,8 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     name : str or Path
         A path, or the name of a shipped experiment.
     settings : mapping, optional
-        Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced; all other paths
-        are those of the scene and apply to each group, in place of a sweep over the same path.
+        Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced, realisations in all
+        groups; all other paths are those of the scene and apply to each group, in place of a sweep over them.
 
     Returns
     -------
@@ -96,24 +97,32 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     data = apply_settings(read_toml(path), own, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
     experiment = validate(Experiment, data, str(path))
-    if not settings:
-        return experiment
     groups = tuple(_override(group, settings) for group in experiment.groups)
+    if "realisations" in own:
+        groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
     return experiment.model_copy(update={"groups": groups})
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
-    """Fix scene values in a group; a swept or random value of the same path gives way."""
+    """Fix scene values in a group; a swept or random value of the same path, or below it, gives way."""
+    varied = [*group.random, *(key for table in (*group.sweep, *group.pool) for key in table)]
+    for path in settings:
+        for key in varied:
+            if path.startswith(f"{key}."):
+                raise InputError(f"--set {path}: the experiment varies {key} as a whole; set {key} itself instead")
+
+    def kept(key: str) -> bool:
+        return not any(key == path or key.startswith(f"{path}.") for path in settings)
 
     def without(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
-        kept = ({k: v for k, v in table.items() if k not in settings} for table in tables)
-        return tuple(table for table in kept if table)
+        thinned = ({key: values for key, values in table.items() if kept(key)} for table in tables)
+        return tuple(table for table in thinned if table)
 
     return group.model_copy(
         update={
             "set": {**group.set, **settings},
             "sweep": without(group.sweep),
             "pool": without(group.pool),
-            "random": {k: v for k, v in group.random.items() if k not in settings},
+            "random": {key: value for key, value in group.random.items() if kept(key)},
         }
     )

@@ -52,12 +52,21 @@ class _Round(_Placed):
 
     @model_validator(mode="after")
     def _camera_inside(self) -> "_Round":
-        if self.side == "inside" and self.distance_mm >= 2 * self.radius_mm * math.cos(math.radians(self.tilt_deg)):
+        if self.side == "inside" and self._camera_from_centre() >= self.radius_mm:
             raise ValueError(
                 f"distance_mm = {self.distance_mm:g} puts the camera outside a radius of {self.radius_mm:g} mm; "
-                "must be below 2 radius_mm cos(tilt) when side is inside"
+                "must be small enough for the camera to lie inside when side is inside"
             )
         return self
+
+    def _camera_from_centre(self) -> float:
+        """Distance of the camera from the centre, for side inside, mm: across the axis for a cylinder."""
+        tilt = math.radians(self.tilt_deg)
+        return math.hypot(self.radius_mm - self.distance_mm * math.cos(tilt), self._sideways() * math.sin(tilt))
+
+    def _sideways(self) -> float:
+        """Part of the camera's distance from the anchor that counts when it is seen aslant, mm."""
+        return self.distance_mm
 
 
 class SphereSurface(_Round):
@@ -70,6 +79,9 @@ class CylinderSurface(_Round):
     """A cylinder; at spin 0 it is curved along image x and straight along image y."""
 
     type: Literal["cylinder"] = "cylinder"
+
+    def _sideways(self) -> float:
+        return self.distance_mm * math.cos(math.radians(self.azimuth_deg - self.spin_deg))
 
 
 class QuadricSurface(_Placed):
@@ -203,6 +215,7 @@ class Sensor(Spec):
     """Noise of the frame."""
 
     noise_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of the noise, share of full scale")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of the noise; experiments draw one for each realisation")
 
 
 class Effort(Spec):

@@ -1,6 +1,7 @@
 """From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
 
 import itertools
+import json
 import math
 import shlex
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from typing import Any
 from simtest.anatomy.recipe import load_recipe
 from simtest.errors import InputError
 from simtest.resources import find, shown
-from simtest.seeds import Stage, generator
+from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
 
 
@@ -38,8 +39,10 @@ class Case:
         How many.
     isolated : bool
         Whether isolated highlights alone count as true ones.
-    command : str
-        Renders the scene alone, with drawn values at the scene file's and without --out.
+    source : str
+        Name or path of the base scene, as the experiment gives it.
+    settings : dict
+        Value by key path of all that differs from the base scene, drawn values apart.
     """
 
     label: str
@@ -51,7 +54,8 @@ class Case:
     random: dict[str, Any]
     realisations: int
     isolated: bool
-    command: str
+    source: str
+    settings: dict[str, Any]
 
     @property
     def name(self) -> str:
@@ -73,7 +77,23 @@ class Case:
         rng = generator(experiment.seed, experiment.name, self.name, realisation, Stage.SWEEP)
         drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
         data = apply_settings(self.data, drawn, self.where) if drawn else self.data
-        return scene_from_dict(data, self.where), drawn
+        scene = scene_from_dict(data, self.where)
+        if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
+            seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
+            scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
+        return scene, drawn
+
+    def noise_seed(self, experiment: Experiment, realisation: int) -> int:
+        """Give the seed of a realisation's noise: the `seed` column, and ``sensor.seed`` of a scene made alone."""
+        return integer(experiment.seed, experiment.name, self.name, realisation, Stage.SENSOR)
+
+    def again(self, experiment: Experiment, realisation: int) -> str:
+        """Give the command that makes a realisation's frame again alone, less its --out."""
+        scene, drawn = self.scene(experiment, realisation)
+        values = {**self.settings, **drawn, "sensor.seed": self.noise_seed(experiment, realisation)}
+        if scene.render.seed != self.data.get("render", {}).get("seed", 0):
+            values["render.seed"] = scene.render.seed
+        return f"simtest render {shlex.quote(self.source)} {set_options(values)}"
 
 
 def expand(experiment: Experiment) -> list[Case]:
@@ -134,10 +154,11 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
             label = group.label or scene_from_dict(data, str(path)).surface.label
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}
-            again = ["simtest render", group.scene, set_options({**group.set, **values})]
-            command = " ".join(part for part in again if part)
-            random = dict(group.random)
-            cases.append(Case(label, setting, part, columns, data, str(path), random, count, group.isolated, command))
+            settings = {**group.set, **values}
+            random, isolated = dict(group.random), group.isolated
+            cases.append(
+                Case(label, setting, part, columns, data, str(path), random, count, isolated, group.scene, settings)
+            )
     return cases
 
 
@@ -175,7 +196,8 @@ def _toml(value: Any) -> str:
 
 
 def _quoted(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else _toml(value)
+    # A JSON string is a TOML basic string.
+    return json.dumps(value) if isinstance(value, str) else _toml(value)
 
 
 def swept_example(cases: list[Case]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.files import write_atomically
@@ -80,7 +81,7 @@ def _truth(j: int, judged: Any) -> dict[str, Any]:
 def _estimates(i: int, made: Realisation) -> list[dict[str, Any]]:
     specularity = made.specularities[i]
     true_id = made.matched.get(i)
-    peak = [v + 0.5 for v in specularity.region.peak]
+    peak = [v + PIXEL_CENTRE for v in specularity.region.peak]
     if not isinstance(specularity.patch, Failure):
         peak = specularity.patch.peak_px.tolist()
     entries = []

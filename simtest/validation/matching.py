@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.geometry.isophotes import encloses
 from simtest.reconstruction import Specularity
@@ -28,13 +28,20 @@ def match(specularities: list[Specularity], truths: list[JudgedHighlight]) -> di
     for i, specularity in enumerate(specularities):
         for j, truth in enumerate(truths):
             if _holds(specularity, truth.highlight.bp_px):
-                peak = np.array(specularity.region.peak) + 0.5
+                peak = _peak(specularity)
                 pairs.append((float(np.hypot(*(truth.highlight.bp_px - peak))), i, j))
     matched: dict[int, int] = {}
     for _, i, j in sorted(pairs):
         if i not in matched and j not in matched.values():
             matched[i] = j
     return matched
+
+
+def _peak(specularity: Specularity) -> np.ndarray:
+    """Give a detection's peak, px: sub-pixel where there is a patch."""
+    if isinstance(specularity.patch, Failure):
+        return np.array(specularity.region.peak) + PIXEL_CENTRE
+    return specularity.patch.peak_px
 
 
 def _holds(specularity: Specularity, point: np.ndarray) -> bool:

@@ -8,6 +8,7 @@ import polars as pl
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session
 from simtest.rendering.frames import Array
@@ -160,7 +161,16 @@ def _errors(context: RowContext, estimate: Estimate, truth: JudgedHighlight) -> 
         "error_look_deg": float(angle_deg(estimate.normal, look.normal[0])) if seen and look is not None else None,
         "error_law_deg": law_deg(context.scene, estimate, truth),
         "rank_correct": int(to_truth.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, truth.highlight.normal),
     }
+
+
+def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
+    """Give the squared Mahalanobis distance of the true normal, unit, shape (3,); None without a usable covariance."""
+    if estimate.covariance is None or np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
+        return None
+    miss = tangent_coordinates(estimate.normal, truth)
+    return float(miss @ np.linalg.solve(estimate.covariance, miss))
 
 
 def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:

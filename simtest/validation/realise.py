@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.estimators import Estimator
 from simtest.reconstruction import Specularity, reconstruct
 from simtest.rendering import Radiance, Session
-from simtest.seeds import Stage, generator, integer
+from simtest.seeds import from_integer
 from simtest.sensor import expose
 from simtest.spec import Experiment, Scene
 from simtest.validation.cases import Case
@@ -81,13 +81,15 @@ def view(session: Session, scene: Scene) -> View:
     """
     session.update(scene)
     radiance = session.radiance()
-    total = radiance.total if radiance.total.ndim == 2 else radiance.total.mean(axis=2)
+    total = radiance.intensity
     peak = float(total.max())
     highlights = session.highlights(radiance)
     # Exposure is set on the brightest isolated highlight, which is judged without noise first.
     isolated = [judged.highlight.radiance for judged in judge(highlights, total, 0.0, peak) if judged.isolated]
     full_scale = max(isolated, default=peak)
-    return View(scene, radiance, judge(highlights, total, scene.sensor.noise_sigma, full_scale), full_scale)
+    # Noise is independent in each channel; estimators see the channels' mean.
+    sigma = scene.sensor.noise_sigma / np.sqrt(radiance.channels)
+    return View(scene, radiance, judge(highlights, total, float(sigma), full_scale), full_scale)
 
 
 def realise(
@@ -118,8 +120,8 @@ def realise(
     Realisation
     """
     scene = seen.scene
-    rng = generator(experiment.seed, experiment.name, case.name, number, Stage.SENSOR)
-    frame = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, rng)
+    seed = case.noise_seed(experiment, number)
+    frame = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, from_integer(seed))
     specularities = reconstruct(frame, session.camera, estimators, isolated=case.isolated)
     truths = [truth for truth in seen.truths if truth.isolated or not case.isolated]
     matched = match(specularities, truths)
@@ -128,7 +130,7 @@ def realise(
         "label": case.label,
         "setting": case.setting,
         "realisation": number,
-        "seed": integer(experiment.seed, experiment.name, case.name, number, Stage.SENSOR),
+        "seed": seed,
         **case.swept,
         **drawn,
     }

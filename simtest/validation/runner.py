@@ -16,13 +16,14 @@ import polars as pl
 from simtest import provenance
 from simtest.errors import InputError
 from simtest.estimators import Estimator, load_estimators
+from simtest.estimators.registry import distributions
 from simtest.files import write_atomically, write_json
 from simtest.rendering import Session, backend
 from simtest.resources import shown
 from simtest.spec import Experiment, Scene
 from simtest.spec.scene import AnatomySurface
 from simtest.validation import gallery
-from simtest.validation.cases import Case, expand, set_options, swept_example
+from simtest.validation.cases import Case, expand, swept_example
 from simtest.validation.metrics import table
 from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
@@ -158,7 +159,7 @@ class _Work:
                 rows += made.rows
                 if index in shown and number == case.numbers()[0]:
                     item = self.folder / "gallery" / f"{index:04d}.npz"
-                    again = f"{case.command} {set_options(drawn)} --out frame".replace("  ", " ")
+                    again = f"{case.again(self.experiment, number)} --out frame"
                     gallery.save(item, self.session, case, seen, made, again)
                 done += 1
             write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
@@ -180,7 +181,7 @@ def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: s
         "experiment": experiment.model_dump(mode="json"),
         "scenes": [case.data for case in cases],
         "inputs": _inputs(cases),
-        "versions": provenance.versions(),
+        "versions": provenance.versions() | distributions(experiment.estimators),
         "source": provenance.source_hash(),
         "variant": variant,
     }
@@ -207,6 +208,8 @@ def _check_folder(folder: Path) -> None:
         held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
         for name in [name for name in held if re.fullmatch(r"\.(results|summary|index)\.\d+\.part\.\w+", name)]:
             held.pop(name).unlink()
+        for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
+            left.unlink()
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})

@@ -34,7 +34,7 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, dict[str, Any]]]:
 def figures(rows: pl.DataFrame) -> dict[str, Any]:
     """Give the figures of the rows of one setting and estimator.
 
-    `n` counts true highlights (answered, failed or missed); false detections are counted apart.
+    `n` counts true highlights (answered, failed or missed); false detections, answered or not, are counted apart.
     """
     true = rows.filter(pl.col("true_id").is_not_null())
     answered = true.filter(pl.col("status") == "ok")
@@ -48,7 +48,7 @@ def figures(rows: pl.DataFrame) -> dict[str, Any]:
         "n_ok": len(errors),
         "n_failed_by_reason": dict(sorted(failed.iter_rows())),
         "n_missed": true.filter(pl.col("status") == "missed").height,
-        "n_false": rows.filter(pl.col("true_id").is_null() & (pl.col("status") == "ok")).height,
+        "n_false": rows.filter(pl.col("true_id").is_null()).height,
         "mean_deg": _or_none(np.mean, errors),
         "mean_oracle_deg": _or_none(np.mean, answered["error_oracle_deg"].to_numpy()),
         "rms_deg": _or_none(lambda e: np.sqrt(np.mean(e**2)), errors),

@@ -65,13 +65,15 @@ def judge(
     peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
     owners = _owners(highlights, peaks)
     noise = noise_sigma * full_scale
-    return [_judge(h, smoothed, peak, owners[peak] is h, noise) for h, peak in zip(highlights, peaks, strict=True)]
+    return [_judge(h, smoothed, peak, owners.get(peak) is h, noise) for h, peak in zip(highlights, peaks, strict=True)]
 
 
 def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:
-    """Give to each maximum of the smoothed frame the true BP nearest to it; smoothing may merge several."""
+    """Give to each maximum of the smoothed frame the lit true BP nearest to it; smoothing may merge several."""
     owners: dict[tuple[int, int], TrueHighlight] = {}
     for highlight, peak in zip(highlights, peaks, strict=True):
+        if not highlight.lit:
+            continue
         place = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
         rival = owners.setdefault(peak, highlight)
         if np.hypot(*(highlight.bp_px - place)) < np.hypot(*(rival.bp_px - place)):

@@ -65,7 +65,7 @@ def nothing_else(monkeypatch):
     """Leave nothing in reach but the variable's library."""
     monkeypatch.setattr(backend, "_packaged_library", lambda: None)
     monkeypatch.setattr(backend, "_system_libraries", lambda: [])
-    monkeypatch.setattr(backend, "_drjit_loaded", lambda: False)
+    monkeypatch.setattr(backend, "_llvm_active", lambda: False)
 
 
 @pytest.fixture
@@ -280,14 +280,14 @@ def test_the_variant_is_the_argument_or_the_variable_or_the_default(monkeypatch)
     assert requested_variant("cuda_ad_mono") == "cuda_ad_mono"
 
 
-@pytest.mark.parametrize("name", ["nope", "scalar_mono", "LLVM_AD_MONO"])
+@pytest.mark.parametrize("name", ["nope", "scalar_mono", "LLVM_AD_MONO", "scalar_rgb", "llvm_ad_spectral"])
 def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
     for given in (name, None):
         monkeypatch.setenv(backend.VARIANT_VARIABLE, name)
         with pytest.raises(BackendError) as error:
             backend.load(given)
         text = str(error.value)
-        assert text.startswith(f"variant '{name}': unknown to this Mitsuba; allowed: ")
+        assert text.startswith(f"variant '{name}': cannot be used; allowed: ")
         assert "llvm_ad_mono" in text
         assert "cuda_ad_mono" in text
         assert "\n" not in text

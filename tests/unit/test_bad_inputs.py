@@ -70,11 +70,11 @@ SCENES = {
     "unknown side": (SPHERE + 'side = "left"', "surface.side = 'left': must be 'outside' or 'inside'"),
     "camera outside": (
         SPHERE + 'side = "inside"\nradius_mm = 5\ndistance_mm = 10',
-        "distance_mm = 10 puts the camera outside a radius of 5 mm; must be below 2 radius_mm cos(tilt)",
+        "distance_mm = 10 puts the camera outside a radius of 5 mm; must be small enough",
     ),
     "camera outside by tilt": (
         SPHERE.replace("sphere", "cylinder") + 'side = "inside"\nradius_mm = 6\ndistance_mm = 10\ntilt_deg = 60',
-        "must be below 2 radius_mm cos(tilt)",
+        "must be small enough for the camera to lie inside",
     ),
     "curvature": ('[surface]\ntype = "quadric"\nk1_per_mm = 11\nk2_per_mm = 0', "k1_per_mm = 11: must be less than"),
     "viewpoint negative": (ANATOMY + "viewpoint = -1", "surface.viewpoint = -1: must be greater than or equal to 0"),

@@ -286,7 +286,7 @@ def test_an_unknown_variant_exits_1(here, monkeypatch, variable):
     given = [] if variable else ["--variant", "scalar_mono"]
     code, output, errors = here("render", "plane", *SET_SMALL, "--out", "x", *given)
     assert (code, output, len(errors)) == (1, "", 1)
-    assert "variant 'scalar_mono': unknown to this Mitsuba; allowed: " in errors[0]
+    assert "variant 'scalar_mono': cannot be used; allowed: " in errors[0]
 
 
 # Validation ------------------------------------------------------------------------------------------------------

@@ -1,0 +1,71 @@
+"""Running an estimator, of this package or another, so that whatever it does is an `Estimate` or a `Failure`."""
+
+import numpy as np
+
+from simtest.errors import Failure, Reason
+from simtest.estimators.base import Estimate, Estimator
+from simtest.geometry import Camera, Patch
+
+UNIT_TOLERANCE = 1e-6
+
+
+def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimate | Failure:
+    """Run an estimator on a patch.
+
+    Parameters
+    ----------
+    estimator : callable
+        See `Estimator`.
+    patch : Patch or Failure
+        A Failure is passed on.
+    camera : Camera
+        Calibration.
+
+    Returns
+    -------
+    Estimate or Failure
+        What the estimator raises, or gives in another form than `Estimate` describes, is a Failure
+        ``estimator_error`` (one highlight must not end a run of thousands); values that are not finite ``not_finite``.
+    """
+    if isinstance(patch, Failure):
+        return patch
+    try:
+        result = estimator(patch, camera)
+        if isinstance(result, Failure):
+            return result
+        if not isinstance(result, Estimate):
+            return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
+        return _problem(result, patch, camera) or result
+    except Exception as error:
+        return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+
+
+def _problem(estimate: Estimate, patch: Patch, camera: Camera) -> Failure | None:
+    """Tell what is wrong with an estimate, or None."""
+    shapes = (
+        ("normal", estimate.normal, (3,)),
+        ("candidates", estimate.candidates, (max(len(estimate.candidates), 1), 3)),
+        ("look_px", estimate.look_px, (2,)),
+        ("covariance", estimate.covariance, (2, 2)),
+    )
+    for name, value, shape in shapes:
+        if name == "covariance" and value is None:
+            continue
+        if not isinstance(value, np.ndarray) or value.shape != shape:
+            return Failure(Reason.ESTIMATOR_ERROR, f"{name}: must be an array of shape {shape}")
+        if name != "look_px" and not np.isfinite(value).all():
+            return Failure(Reason.NOT_FINITE, f"{name} holds NaN or infinity")
+    for name, number in (("axis_ratio", estimate.axis_ratio), ("choice_margin", estimate.choice_margin)):
+        if number is not None and not np.isfinite(number):
+            return Failure(Reason.NOT_FINITE, f"{name} is {number}")
+    lengths = np.linalg.norm(np.concatenate([estimate.normal[None], estimate.candidates]), axis=1)
+    if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
+        return Failure(Reason.ESTIMATOR_ERROR, f"normal or candidate of length {lengths.max():g}: must be unit vectors")
+    if np.abs(estimate.candidates[0] - estimate.normal).max() > UNIT_TOLERANCE:
+        return Failure(Reason.ESTIMATOR_ERROR, "the first candidate must be the proposed normal")
+    if not isinstance(estimate.flags, tuple) or not all(isinstance(flag, str) for flag in estimate.flags):
+        return Failure(Reason.ESTIMATOR_ERROR, "flags: must be a tuple of text")
+    look = estimate.look_px if np.isfinite(estimate.look_px).all() else patch.peak_px
+    if estimate.normal @ camera.unproject(look) >= 0:
+        return Failure(Reason.ESTIMATOR_ERROR, "the normal faces away from the camera")
+    return None

@@ -1,0 +1,41 @@
+"""Unit vectors: tangent bases and the difference of two directions."""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def tangent_basis(normal: Array) -> tuple[Array, Array]:
+    """Give two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
+
+    The branch-free construction of Duff et al. 2017 (J. Comput. Graph. Tech. 6(1)). Covariances of normals are given
+    in this basis.
+    """
+    x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    return first, second
+
+
+def tangent_coordinates(normal: Array, other: Array) -> Array:
+    """Give the rotation from one unit vector to another as a vector of the first one's tangent basis, rad.
+
+    Parameters
+    ----------
+    normal, other : ndarray, shape (3,)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Its length is the angle between the two.
+    """
+    first, second = (basis[0] for basis in tangent_basis(normal[None]))
+    across = np.array([first @ other, second @ other])
+    sine = float(np.hypot(*across))
+    angle = float(np.arctan2(sine, normal @ other))
+    return across * (angle / sine) if sine > 0 else across

@@ -1,0 +1,185 @@
+"""Faults that the harness once had: each has its test."""
+
+import shlex
+from types import SimpleNamespace
+
+import numpy as np
+import polars as pl
+import pytest
+
+import simtest
+from simtest.errors import Failure, InputError
+from simtest.estimators import Estimate
+from simtest.estimators.checked import run
+from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.vectors import tangent_basis, tangent_coordinates
+from simtest.rendering import Session
+from simtest.rendering.frames import TrueHighlight
+from simtest.report import write_report
+from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
+from simtest.validation.cases import expand
+from simtest.validation.metrics import mahalanobis2
+from simtest.validation.realise import realise, view
+from simtest.validation.runner import run_experiment
+from simtest.validation.truth import judge
+
+CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
+GOOD = {"normal": np.array([0, 0, -1.0]), "candidates": np.array([[0, 0, -1.0]]), "look_px": np.array([40.0, 30.0])}
+
+
+def patch():
+    y, x = np.mgrid[:60, :80]
+    return Patch.cut(smooth(np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 100), 1.0), (0, 0, 80, 60))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"normal": [0.0, 0.0, -1.0]},
+        {"normal": np.array([0, 0, -1.0]), "candidates": np.array([0, 0, -1.0])},
+        {"candidates": np.empty((0, 3))},
+        {"candidates": np.array([[0, 0, -1.0], [np.nan, 0, -1.0]])},
+        {"candidates": np.array([[0, 0.6, -0.8]])},
+        {"normal": np.array([0.0, -1.0])},
+        {"look_px": None},
+        {"look_px": (40.0, 30.0)},
+        {"covariance": [[1.0, 0.0], [0.0, 1.0]]},
+        {"covariance": np.full((2, 2), np.nan)},
+        {"axis_ratio": np.nan},
+        {"flags": "abc"},
+        {"normal": np.array([0, 0, 1.0]), "candidates": np.array([[0, 0, 1.0]])},
+        {"normal": np.array([0, 0, -2.0]), "candidates": np.array([[0, 0, -2.0]])},
+    ],
+)
+def test_a_malformed_estimate_is_a_failure(change):
+    result = run(lambda *_: Estimate(**{**GOOD, **change}), patch(), CAMERA)
+    assert isinstance(result, Failure)
+    assert result.reason in ("estimator_error", "not_finite")
+
+
+def test_a_good_estimate_passes():
+    assert isinstance(run(lambda *_: Estimate(**GOOD), patch(), CAMERA), Estimate)
+
+
+def small_experiment(**more):
+    tables = {"scene": "plane", "isolated": False, "set": {"camera.width": 120, "camera.height": 120}, **more}
+    return Experiment(name="small", realisations=2, estimators=("cone_axis",), groups=[tables])
+
+
+@pytest.mark.render
+def test_what_a_killed_run_left_is_swept_away(tmp_path):
+    experiment = small_experiment()
+    run_experiment(experiment, tmp_path)
+    write_report(tmp_path)
+    leftovers = [tmp_path / ".index.12.part.html", tmp_path / "gallery" / ".0000.12.part.npz"]
+    for file in leftovers:
+        file.write_bytes(b"half")
+    write_report(tmp_path)  # a half-written gallery item is no item
+    run_experiment(experiment, tmp_path)
+    write_report(tmp_path)
+    assert not any(file.exists() for file in leftovers)
+
+
+def test_a_set_value_below_a_swept_table_is_refused():
+    with pytest.raises(InputError, match=r"--set reflectance.diffuse: the experiment varies reflectance as a whole"):
+        load_experiment("reflectance", {"reflectance.diffuse": 0.2})
+
+
+def test_a_set_table_takes_the_place_of_sweeps_below_it():
+    experiment = load_experiment("grid", {"rig.lights": [{"offset_mm": 1.0}]})
+    cases = expand(experiment)
+    assert {case.data["rig"]["lights"][0]["offset_mm"] for case in cases} == {1.0}
+    assert len(cases) == 6
+
+
+def test_realisations_reach_every_group():
+    cases = expand(load_experiment("overview", {"realisations": 2}))
+    assert {case.realisations for case in cases} == {2}
+
+
+def spot(x, lit):
+    place = np.array([0, 0, 10.0])
+    return TrueHighlight(0, np.array([x, 30.0]), place, np.array([0, 0, -1.0]), 10.0, 0.2, 0.5, lit, 1.0)
+
+
+def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
+    y, x = np.mgrid[:60, :80] + 0.5
+    radiance = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 50).astype(np.float32)
+    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, 0.0, 1.0)
+    assert [j.why_not for j in judged] == ["in shadow", ""]
+
+
+def test_mahalanobis_distance_is_that_of_the_tangent_plane():
+    rng = np.random.default_rng(1)
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    first, second = (basis[0] for basis in tangent_basis(normal[None]))
+    truth = normal + 0.03 * first - 0.04 * second
+    truth /= np.linalg.norm(truth)
+    np.testing.assert_allclose(tangent_coordinates(normal, truth), [0.03, -0.04], rtol=2e-3)
+    covariance = np.diag([0.03**2, 0.02**2])
+    estimate = Estimate(normal, normal[None], np.zeros(2), covariance=covariance)
+    assert mahalanobis2(estimate, truth) == pytest.approx(1 + 4, rel=5e-3)
+    assert mahalanobis2(Estimate(normal, normal[None], np.zeros(2)), truth) is None
+    assert mahalanobis2(SimpleNamespace(normal=normal, covariance=np.zeros((2, 2))), truth) is None
+
+
+def test_a_cylinder_seen_along_its_axis_from_inside_is_allowed():
+    surface = {"type": "cylinder", "side": "inside", "radius_mm": 10.0, "distance_mm": 15.0, "tilt_deg": 50.0}
+    scene_from_dict({"surface": {**surface, "azimuth_deg": 90.0}})
+    with pytest.raises(InputError, match="puts the camera outside"):
+        scene_from_dict({"surface": {**surface, "azimuth_deg": 0.0}})
+
+
+@pytest.mark.render
+def test_the_command_of_a_frame_makes_the_same_frame():
+    experiment = small_experiment(
+        random={"surface.azimuth_deg": {"low": 0.0, "high": 360.0}}, sweep=[{"rig.lights.0.offset_mm": [0.0, 1.0]}]
+    )
+    case = expand(experiment)[1]
+    scene, drawn = case.scene(experiment, 1)
+    session = Session(scene)
+    made = realise(session, experiment, case, 1, view(session, scene), drawn, {})
+    name, *words = shlex.split(case.again(experiment, 1).removeprefix("simtest render "))
+    alone = simtest.render(name, parse_settings([word for word in words if word != "--set"]))
+    np.testing.assert_array_equal(alone.image, made.frame)
+
+
+@pytest.mark.render
+def test_random_paths_hang_on_the_run_s_seed():
+    values = {"render.path_depth": 3, "reflectance.diffuse": 0.5, "camera.width": 32, "camera.height": 32}
+    seeds = set()
+    for seed in (0, 1):
+        experiment = small_experiment(set=values).model_copy(update={"seed": seed})
+        (case,) = expand(experiment)
+        seeds.add(case.scene(experiment, 0)[0].render.seed)
+        # The noise differs between realisations, the rendered scene does not.
+        assert case.scene(experiment, 0)[0] == case.scene(experiment, 1)[0]
+    assert len(seeds) == 2
+
+
+@pytest.mark.render
+def test_colour_frames_are_judged_by_the_noise_of_their_mean():
+    scene = scene_from_dict(
+        {
+            "surface": {"type": "plane"},
+            "sensor": {"noise_sigma": 0.03},
+            "camera": {"width": 80, "height": 80, "fx": 120, "fy": 120},
+        }
+    )
+    mono, colour = (view(Session(scene, variant), scene).truths[0] for variant in ("llvm_ad_mono", "llvm_ad_rgb"))
+    assert colour.peak_snr == pytest.approx(np.sqrt(3) * mono.peak_snr, rel=1e-3)
+
+
+def test_false_detections_that_failed_are_counted():
+    from simtest.validation.statistics import figures
+
+    rows = pl.DataFrame(
+        {
+            "true_id": [None, None], "status": ["ok", "no_peak"], "error_deg": [None, None],
+            "error_oracle_deg": [None, None], "mahalanobis2": [None, None],
+        },
+        schema_overrides={"true_id": pl.Int64, "error_deg": pl.Float64, "mahalanobis2": pl.Float64},
+    )  # fmt: skip
+    assert figures(rows)["n_false"] == 2
+    assert figures(rows)["n"] == 0
