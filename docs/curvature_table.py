@@ -7,6 +7,7 @@ import polars as pl
 
 
 def main() -> None:
+    """Print a row for each setting."""
     results = pl.read_parquet(Path(sys.argv[1]) / "results.parquet")
     for _, rows in results.group_by("setting", maintain_order=True):
         by = {

@@ -6,6 +6,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from simtest.errors import InputError
+from simtest.resources import shown
+
+
+def refuse_file(folder: Path) -> None:
+    """Raise `InputError` where a folder for results is wanted and a file stands."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results; raise `InputError` where that cannot be."""
+    refuse_file(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
+
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it into place.

@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 from simtest import provenance
 from simtest.errors import Failure, InputError
-from simtest.files import write_atomically, write_json
+from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera
 from simtest.reconstruction import DEFAULT_ESTIMATORS, Specularity, reconstruct
+from simtest.sensor import from_srgb
 from simtest.spec import load_camera
 
 MAX_PIXELS = 100_000_000
@@ -24,7 +25,7 @@ MAX_PIXELS = 100_000_000
 def read_picture(path: Path) -> npt.NDArray[np.float32]:
     """Read a picture of 8 or 16 bits as intensities in [0, 1].
 
-    The values are left as they are encoded: a response curve moves an isophote's isovalue, not its place.
+    The values are as they are encoded.
 
     Parameters
     ----------
@@ -63,11 +64,12 @@ def read_picture(path: Path) -> npt.NDArray[np.float32]:
 def reconstruct_picture(
     image: Path,
     out: Path,
-    camera_file: Path | None,
-    fov_deg: float | None,
-    estimators: Sequence[str] | None,
-    roi: str | None,
-) -> list[Path]:
+    camera_file: Path | None = None,
+    fov_deg: float | None = None,
+    estimators: Sequence[str] | None = None,
+    roi: str | None = None,
+    encoding: str = "srgb",
+) -> tuple[int, list[Path]]:
     """Reconstruct the normals of a picture and write them.
 
     Parameters
@@ -76,18 +78,22 @@ def reconstruct_picture(
         The picture.
     out : Path
         Folder, made if need be.
-    camera_file : Path or None
+    camera_file : Path, optional
         Calibration; this or `fov_deg` must be given, not both.
-    fov_deg : float or None
+    fov_deg : float, optional
         Horizontal field of view, deg.
-    estimators : sequence of str or None
+    estimators : sequence of str, optional
         Names; default all three of the package.
-    roi : str or None
+    roi : str, optional
         "x,y,w,h" in px; default: detected.
+    encoding : {"srgb", "linear"}
+        How the picture's values are encoded. Isophotes are those of linear values.
 
     Returns
     -------
-    list of Path
+    count : int
+        Specularities found.
+    files : list of Path
         normals.json, normals.csv, normals.ply, overlay.png.
 
     Raises
@@ -108,7 +114,11 @@ def reconstruct_picture(
         cautions.append(f"no calibration: all angles depend on the field of view of {fov_deg:g} deg being right")
         warnings.warn(cautions[-1], stacklevel=2)
     names = list(estimators or DEFAULT_ESTIMATORS)
-    found = reconstruct(picture, camera, names, roi=_parse_roi(roi) if roi is not None else None)
+    linear = from_srgb(picture) if encoding == "srgb" else picture
+    found = reconstruct(linear, camera, names, roi=_parse_roi(roi) if roi is not None else None)
+    if not found:
+        cautions.append("no specularity found that stands out of the noise and closes inside the frame; try --roi")
+        warnings.warn(cautions[-1], stacklevel=2)
     document = {
         "image": str(image),
         "camera": {
@@ -117,12 +127,13 @@ def reconstruct_picture(
             "K": camera.K.tolist(),
             "pixel_centres": "integer + 0.5",
         },
+        "encoding": encoding,
         "warnings": cautions,
         "frame": "camera: x right, y down, z forward; normals are unit and face the camera",
         "specularities": [describe(i, specularity) for i, specularity in enumerate(found)],
         "provenance": provenance.environment(),
     }
-    return _write(out, document, picture, camera)
+    return len(found), _write(out, document, picture, camera)
 
 
 def _parse_roi(text: str) -> tuple[int, int, int, int]:
@@ -161,8 +172,8 @@ def _write(out: Path, document: dict[str, Any], picture: npt.NDArray[np.float32]
     from simtest.report.overlay import draw_overlay
 
     files = [out / name for name in ("normals.json", "normals.csv", "normals.ply", "overlay.png")]
+    make_folder(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
         write_json(files[0], document)
         write_atomically(files[1], lambda part: _write_csv(part, document))
         write_atomically(files[2], lambda part: part.write_text(_ply(document, camera), encoding="ascii"))

@@ -1,9 +1,19 @@
 """Options that several commands share."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
+
+
+def whole_number(_: Any, tokens: Sequence[Token]) -> int:
+    """Convert an option to an integer; 2.7 is not rounded."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"{tokens[0].value} is not a whole number") from None
+
 
 Settings = Annotated[
     list[str] | None,
@@ -18,3 +28,5 @@ Estimators = Annotated[
     list[str] | None, Parameter(name="--estimator", negative="", help="Estimator by name; may be repeated.")
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.")]
+Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
+Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]

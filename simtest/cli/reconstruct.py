@@ -1,7 +1,7 @@
 """`simtest reconstruct`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -19,6 +19,7 @@ def reconstruct(
     ] = None,
     estimators: Estimators = None,
     roi: Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")] = None,
+    encoding: Annotated[Literal["srgb", "linear"], Parameter(help="How the picture's values are encoded.")] = "srgb",
 ) -> None:
     """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, normals.ply, overlay.png.
 
@@ -29,5 +30,7 @@ def reconstruct(
     """
     from simtest.picture import reconstruct_picture
 
-    for file in reconstruct_picture(image, out, camera, fov, estimators, roi):
+    count, files = reconstruct_picture(image, out, camera, fov, estimators, roi, encoding)
+    print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
+    for file in files:
         print(file)

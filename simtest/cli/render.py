@@ -4,7 +4,7 @@ from simtest.cli.options import Out, Settings, Variant
 
 
 def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
-    """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json.
+    """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
     Parameters
     ----------
@@ -13,8 +13,10 @@ def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
     """
     from simtest import api
     from simtest.dataset import write_frame
+    from simtest.files import refuse_file
     from simtest.spec import parse_settings
 
+    refuse_file(out)
     frame = api.render(scene, parse_settings(settings or []), variant)
     for file in write_frame(frame, out):
         print(file)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Estimators, Settings, Variant
+from simtest.cli.options import Estimators, Realisations, Seed, Settings, Variant
 
 DEFAULT_OUT = Path("reports/runs")
 
@@ -17,8 +17,8 @@ def validate(
     /,
     *,
     out: Annotated[Path | None, Parameter(help="Folder of the run; default reports/runs/EXPERIMENT.")] = None,
-    realisations: Annotated[int | None, Parameter(help="Realisations of each setting.")] = None,
-    seed: Annotated[int | None, Parameter(help="Seed of the run.")] = None,
+    realisations: Realisations = None,
+    seed: Seed = None,
     settings: Settings = None,
     estimators: Estimators = None,
     variant: Variant = None,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from simtest import provenance
 from simtest.errors import InputError
-from simtest.files import write_atomically, write_json
+from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera
 from simtest.rendering import Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
@@ -88,7 +88,7 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz and frame.json.
+    """Write frame.png, radiance.exr, truth.npz, frame.json and camera.toml.
 
     Parameters
     ----------
@@ -107,16 +107,25 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     InputError
         If the folder cannot be written.
     """
-    files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json")]
+    files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
+    make_folder(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
         write_atomically(files[0], lambda part: part.write_bytes(_png(frame.image)))
         write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
         write_atomically(files[2], lambda part: np.savez_compressed(part, **_truth(frame)))
         write_json(files[3], _description(frame))
+        write_atomically(files[4], lambda part: part.write_text(_camera_file(frame.camera), encoding="utf-8"))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return files
+
+
+def _camera_file(camera: Camera) -> str:
+    """Give the calibration as `simtest reconstruct --camera` reads it."""
+    names = ("width", "height", "fx", "fy", "cx", "cy", "skew")
+    return "# Pinhole camera; pixel centres at integer + 0.5.\n" + "".join(
+        f"{name} = {getattr(camera, name)!r}\n" for name in names
+    )
 
 
 def _png(image: npt.NDArray[np.float32]) -> bytes:

@@ -233,8 +233,11 @@ def load(variant: str | None = None) -> Any:
     if mitsuba.variant() != name:
         try:
             mitsuba.set_variant(name)
-        except ImportError as error:
-            raise BackendError(f"variant {name}: cannot be used here ({str(error).splitlines()[0]})") from error
+            # The first use tells: a GPU variant is accepted without a GPU.
+            mitsuba.Float(0.0) + 1.0
+        except (ImportError, RuntimeError) as error:
+            cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
+            raise BackendError(f"variant {name}: cannot be used here ({cause})") from error
     return mitsuba
 
 

@@ -164,10 +164,17 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         provenance=words.provenance_rows(run),
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,
-        isophotes=[(t, _hex(isophote_colour(t))) for t in (0.1, 0.3, 0.5, 0.7, 0.9)],
+        isophotes=[(t, _hex(isophote_colour(t))) for t in _isovalues(run)],
         charts={key: Markup(text) for key, text in charts.items()},
         plotly=Markup(_plotly_script()) if charts else None,
     )
+
+
+def _isovalues(run: Run) -> list[float]:
+    """Give the isovalues that the gallery draws, sorted."""
+    estimates = [estimate for item in run.gallery for estimate in item.estimates]
+    drawn = [isophote.get("t") for estimate in estimates for isophote in estimate.get("isophotes") or ()]
+    return sorted({round(float(t), 3) for t in drawn if isinstance(t, int | float)})
 
 
 def _hex(colour: tuple[float, float, float, float]) -> str:

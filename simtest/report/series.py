@@ -16,6 +16,10 @@ TOLERANCE_SHARE = 0.03
 _ERROR_TITLE = "angular error (deg)"
 
 
+LEAST_LAW = 0.01
+"""A law below this (deg, or axis ratio) predicts nothing that noise would leave visible."""
+
+
 @dataclass(frozen=True)
 class LineFigure:
     """A figure of curves over one quantity."""
@@ -108,7 +112,9 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 6) -> list[LineFigu
 
 
 def law_misses(figure: LineFigure) -> dict[str, tuple[int, int, float, str]]:
-    """Count, by estimator, the points that meet their law.
+    """Count, by estimator, the points of sweeps that meet their law.
+
+    Left out are means over many highlights of unlike curvature, and points where the law is 0: there the noise decides.
 
     Parameters
     ----------
@@ -123,12 +129,12 @@ def law_misses(figure: LineFigure) -> dict[str, tuple[int, int, float, str]]:
     result: dict[str, tuple[int, int, float, str]] = {}
     for name in figure.estimators:
         gaps: list[tuple[float, bool, str]] = []
-        for curve in (c for c in figure.curves if c.estimator == name):
+        for curve in (c for c in figure.curves if c.estimator == name and c.joined):
             floor = 0.0 if figure.shared_law else TOLERANCE_DEG
             for y, law, where in zip(curve.y, curve.law_at, curve.names, strict=True):
-                if np.isfinite(law):
+                if np.isfinite(law) and law > LEAST_LAW:
                     gap = float(abs(y - law))
-                    gaps.append((gap, bool(gap <= max(floor, TOLERANCE_SHARE * law)), f"{curve.label}, {where}"))
+                    gaps.append((gap, bool(gap <= max(floor, TOLERANCE_SHARE * law)), where))
         if gaps:
             worst = max(gaps)
             result[name] = (sum(met for _, met, _ in gaps), len(gaps), worst[0], worst[2])

@@ -35,7 +35,7 @@ def headline(run: Run, figures: list[LineFigure]) -> list[str]:
         if total and figure.key in ("error_vs_curvature", "axis_ratio", "error_vs_offset"):
             rule = "3 %" if figure.shared_law else "0.3° or 3 %"
             met_text = f"is met within {rule} at {met} of {total} points"
-            sentences.append(f"{figure.title}: the law, which knows no noise, {met_text}.")
+            sentences.append(f"{figure.title}: the law, without noise, {met_text} of the sweeps where it is not 0.")
     return [s for s in sentences if s]
 
 

@@ -1,5 +1,5 @@
 """From radiance to a frame: exposure and noise."""
 
-from simtest.sensor.exposure import expose, to_uint8
+from simtest.sensor.exposure import expose, from_srgb, to_uint8
 
-__all__ = ["expose", "to_uint8"]
+__all__ = ["expose", "from_srgb", "to_uint8"]

@@ -43,3 +43,9 @@ def to_uint8(frame: Image) -> npt.NDArray[np.uint8]:
     linear = np.clip(np.nan_to_num(frame, nan=0.0), 0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(np.round(255 * encoded), dtype=np.uint8)
+
+
+def from_srgb(encoded: Image) -> Image:
+    """Give the linear values of an sRGB-encoded picture in [0, 1] (IEC 61966-2-1)."""
+    values = np.asarray(encoded, dtype=np.float32)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.resources import find
-from simtest.spec.reading import Spec, apply_settings, read_toml, validate
+from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
 
 
 class Uniform(Spec):
@@ -96,11 +96,14 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
     data = apply_settings(read_toml(path), own, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
-    experiment = validate(Experiment, data, str(path))
+    experiment = validate(Experiment, data, place(path, own))
     groups = tuple(_override(group, settings) for group in experiment.groups)
     if "realisations" in own:
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
-    return experiment.model_copy(update={"groups": groups})
+    description = experiment.description
+    if settings:
+        description = f"{description} With {', '.join(f'{key}={value}' for key, value in settings.items())}.".strip()
+    return experiment.model_copy(update={"groups": groups, "description": description})
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:

@@ -192,6 +192,11 @@ def _step(node: Any, part: str, following: str, path: str, where: str) -> Any:
     raise InputError(f"{where}: {shown(path)}: {shown(part)} is below a plain value, not a table")
 
 
+def place(path: Path, settings: Mapping[str, Any]) -> str:
+    """Name a file for messages, and say where some of its values are replaced."""
+    return f"{path} with replaced values" if settings else str(path)
+
+
 def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
     """Validate data against a model; an error is one line with file, key path, value and what is allowed.
 
@@ -242,7 +247,8 @@ def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> st
     if kind == "union_tag_invalid":
         return f"{path}.type = {_short(value['type'])}: unknown; allowed: {_tags(error['loc'], model)}"
     if kind == "value_error":
-        return f"{path} = {_short(value)}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
+        shown_value = "" if isinstance(value, Mapping) else f" = {_short(value)}"
+        return f"{path}{shown_value}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
     return f"{path} = {_short(value)}: must {_demand(error)}"
 
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.resources import find
-from simtest.spec.reading import Spec, apply_settings, read_toml, validate
+from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -282,7 +282,7 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     path = find(name, "scenes")
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", path.stem[:80])
-    return scene_from_dict(data, str(path))
+    return scene_from_dict(data, place(path, settings or {}))
 
 
 def load_camera(path: str | Path) -> Camera:

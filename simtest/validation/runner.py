@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -71,7 +72,8 @@ def run_experiment(
     experiment : Experiment
         What to run.
     folder : Path
-        Made if need be. A folder that holds something else than a run is refused.
+        Made if need be. A folder that holds something else than a run is refused; the same run, finished, is given
+        back as it is.
     command : str
         How the run was called, for the report.
     variant : str, optional
@@ -93,35 +95,42 @@ def run_experiment(
     started, clock = datetime.now(UTC), time.monotonic()
     cases = expand(experiment)
     estimators = load_estimators(experiment.estimators)
-    parts = _prepare(folder, experiment, cases, backend.requested_variant(variant))
+    digest = _fingerprint(experiment, cases, backend.requested_variant(variant))
+    _check_folder(folder)
+    finished = _finished(folder, digest, len(cases))
+    if finished is not None:
+        return finished
+    parts = _prepare(folder, digest)
     work = _Work(experiment, cases, estimators, folder, command, variant)
     resumed = work.run(parts, progress)
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
-    summary = {
-        "run": {
-            **provenance.environment(),
-            "variant": backend.requested_variant(variant),
-            "llvm": backend.library_in_use(),
-            "seed": experiment.seed,
-            "realisations": experiment.realisations,
-            "started": started.isoformat(timespec="seconds"),
-            "duration_s": round(time.monotonic() - clock, 1),
-            "command": command,
-            "inputs": _inputs(cases),
-        },
-        "experiments": {
-            experiment.name: {
-                "title": experiment.title or experiment.name,
-                "description": experiment.description,
-                "settings": summarise(results),
-            }
-        },
+    run = {
+        "variant": backend.requested_variant(variant),
+        "llvm": backend.library_in_use(),
+        "fingerprint": digest,
+        "seed": experiment.seed,
+        "realisations": experiment.realisations,
+        "started": started.isoformat(timespec="seconds"),
+        "duration_s": round(time.monotonic() - clock, 1),
+        "command": command,
+        "inputs": _inputs(cases),
     }
+    summary = _summary(experiment, results, run)
     write_atomically(folder / "results.parquet", results.write_parquet)
     write_json(folder / "summary.json", summary)
+    # The parts go last: until the summary stands, a run that is stopped can go on.
     _remove(parts)
-    _remove(folder / "figures")
     return Run(folder, results, summary, resumed)
+
+
+def _summary(experiment: Experiment, results: pl.DataFrame, run: dict[str, Any]) -> dict[str, Any]:
+    """Give the content of summary.json (design.md, section 3)."""
+    content = {
+        "title": experiment.title or experiment.name,
+        "description": experiment.description,
+        "settings": summarise(results),
+    }
+    return {"run": {**provenance.environment(), **run}, "experiments": {experiment.name: content}}
 
 
 @dataclass
@@ -173,10 +182,8 @@ class _Work:
         return view(self.session, scene)
 
 
-def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: str) -> Path:
-    """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
-    _check_folder(folder)
-    parts = folder / PARTS
+def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
+    """Give a hash of all that determines a run's results."""
     fingerprint = {
         "experiment": experiment.model_dump(mode="json"),
         "scenes": [case.data for case in cases],
@@ -185,7 +192,27 @@ def _prepare(folder: Path, experiment: Experiment, cases: list[Case], variant: s
         "source": provenance.source_hash(),
         "variant": variant,
     }
-    digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _finished(folder: Path, digest: str, cases: int) -> Run | None:
+    """Give the run that a folder holds whole, if it is the same; warn where another one will be replaced."""
+    if (folder / PARTS).is_dir():
+        # Whatever stands beside the parts of a stopped run may be half of each.
+        return None
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        if summary["run"]["fingerprint"] == digest:
+            return Run(folder, pl.read_parquet(folder / "results.parquet"), summary, cases)
+    except (OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError):
+        return None
+    warnings.warn(f"{folder}: holds another run, or one of another version of simtest; it is replaced", stacklevel=4)
+    return None
+
+
+def _prepare(folder: Path, digest: str) -> Path:
+    """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
+    parts = folder / PARTS
     record = parts / "fingerprint.json"
     try:
         if not (record.is_file() and record.read_text(encoding="utf-8", errors="replace").strip() == f'"{digest}"'):

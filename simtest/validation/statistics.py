@@ -71,4 +71,5 @@ def mean_interval(values: np.ndarray) -> tuple[float | None, float | None]:
     if len(values) < 2:
         return None, None
     half = stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return float(np.mean(values) - half), float(np.mean(values) + half)
+    # An angle is not negative, nor is its mean.
+    return max(float(np.mean(values) - half), 0.0), float(np.mean(values) + half)

@@ -122,7 +122,7 @@ def test_doctor_knows_variants():
     report = json.loads(done.stdout)
     assert done.returncode == 1
     assert report["can_render"] is False
-    assert "variant 'llvm_nope': unknown" in report["problem"]
+    assert "variant 'llvm_nope': cannot be used" in report["problem"]
     assert "allowed: " in report["problem"]
     assert "\n" not in report["problem"]
 

@@ -34,6 +34,8 @@ sweep = [{ "surface.tilt_deg" = [0.0, 2.0, 4.0, 6.0, 8.0] }]
 
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
+FILES = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")
+
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory):
@@ -115,7 +117,7 @@ BAD_USE = {
     "render plain --out x": "plain: no such file; shipped by name: anatomy, cylinder, plane",
     "render plane --out x --set tilt": "--set tilt: must be key=value, for example surface.distance_mm=12",
     "render plane --out x --set =3": "--set =3: must be key=value",
-    "render plane --out x --set surface.tilt_deg=95": "plane.toml: surface.tilt_deg = 95: must be less than 90",
+    "render plane --out x --set surface.tilt_deg=95": "values: surface.tilt_deg = 95: must be less than 90",
     "render plane --out x --set surface.typo=1": "surface.typo = 1: unknown key; allowed: type, distance_mm",
     "render plane --out x --set surface.tilt_deg=steep": "surface.tilt_deg = 'steep': must be a number",
     "render plane --out x --set rig.lights.3.power=2": "index 3 is not allowed; the first item is 0",
@@ -124,9 +126,9 @@ BAD_USE = {
     "doctor extra": "Unused Tokens: ['extra']",
     "validate": 'Command "validate" parameter EXPERIMENT requires an argument',
     "validate plain": "plain: no such file; shipped by name: anatomy, curvature, grid",
-    "validate overview --realisations many": 'Invalid value for --realisations: unable to convert "many" into int',
-    "validate overview --realisations 0": "overview.toml: realisations = 0: must be greater than or equal to 1",
-    "validate overview --seed -1": "overview.toml: seed = -1: must be greater than or equal to 0",
+    "validate overview --realisations many": "Invalid value for --realisations: many is not a whole number",
+    "validate overview --realisations 0": "with replaced values: realisations = 0: must be greater than or equal to 1",
+    "validate overview --seed -1": "overview.toml with replaced values: seed = -1: must be greater than or equal to 0",
     "validate overview --estimator magic": "estimator 'magic': not installed; allowed: ",
     "validate overview --set surface.typo=1": "surface.typo = 1: unknown key; allowed: ",
     "validate overview --set typo": "--set typo: must be key=value",
@@ -212,14 +214,22 @@ def frames(tmp_path_factory):
     for process, name in zip(children, ("first", "second"), strict=True):
         output, errors = process.communicate(timeout=120)
         assert (process.returncode, errors) == (0, "")
-        assert output.split() == [f"{name}/{file}" for file in ("frame.png", "radiance.exr", "truth.npz", "frame.json")]
+        assert output.split() == [
+            f"{name}/{file}" for file in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")
+        ]
     return folder / "first", folder / "second"
 
 
 @pytest.mark.render
-def test_render_writes_four_files_with_the_documented_keys(frames):
+def test_render_writes_its_files_with_the_documented_keys(frames):
     first, _ = frames
-    assert {path.name for path in first.iterdir()} == {"frame.png", "radiance.exr", "truth.npz", "frame.json"}
+    assert {path.name for path in first.iterdir()} == {
+        "frame.png",
+        "radiance.exr",
+        "truth.npz",
+        "frame.json",
+        "camera.toml",
+    }
     assert (first / "frame.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     with np.load(first / "truth.npz", allow_pickle=False) as truth:
         assert set(truth.files) == set(TRUTH)
@@ -255,10 +265,10 @@ def test_render_gives_the_same_bytes_twice(frames):
 def test_an_out_that_cannot_be_written(here, tmp_path):
     plain = tmp_path / "plain"
     plain.write_text("mine")
-    for out in (plain, plain / "below"):
+    for out, why in ((plain, "is a file; must be a folder"), (plain / "below", "cannot be written (Not a directory)")):
         code, output, errors = here("render", "plane", *SET_SMALL, "--out", out)
         assert (code, output, len(errors)) == (2, "", 1)
-        assert errors[0].startswith(f"simtest: --out {out}: cannot be written (")
+        assert errors[0] == f"simtest: --out {out}: {why}"
     assert [path.name for path in tmp_path.iterdir()] == ["plain"]
     assert plain.read_text() == "mine"
 

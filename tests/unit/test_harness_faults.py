@@ -1,5 +1,6 @@
 """Faults that the harness once had: each has its test."""
 
+import json
 import shlex
 from types import SimpleNamespace
 
@@ -8,11 +9,13 @@ import polars as pl
 import pytest
 
 import simtest
+from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators.checked import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
+from simtest.picture import reconstruct_picture
 from simtest.rendering import Session
 from simtest.rendering.frames import TrueHighlight
 from simtest.report import write_report
@@ -183,3 +186,30 @@ def test_false_detections_that_failed_are_counted():
     )  # fmt: skip
     assert figures(rows)["n_false"] == 2
     assert figures(rows)["n"] == 0
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("name", ["plane", "cylinder", "sphere", "saddle", "anatomy"])
+def test_a_rendered_picture_can_be_reconstructed(name, tmp_path):
+    """sRGB encoding lifts the noise of dark pixels: undone before detection."""
+    write_frame(simtest.render(name), tmp_path / "frame")
+    count, files = reconstruct_picture(
+        tmp_path / "frame" / "frame.png", tmp_path / "normals", tmp_path / "frame" / "camera.toml"
+    )
+    document = json.loads(files[0].read_text())
+    assert count == len(document["specularities"]) >= 1
+    assert document["specularities"][0]["estimates"]["cone_axis"]["status"] == "ok"
+
+
+@pytest.mark.render
+def test_a_finished_run_is_given_back_and_another_is_replaced_aloud(tmp_path):
+    experiment = small_experiment()
+    first = run_experiment(experiment, tmp_path)
+    before = (tmp_path / "results.parquet").stat().st_mtime_ns
+    again = run_experiment(experiment, tmp_path)
+    assert again.resumed == 1
+    assert again.results.equals(first.results)
+    assert (tmp_path / "results.parquet").stat().st_mtime_ns == before
+    with pytest.warns(UserWarning, match="holds another run"):
+        other = run_experiment(experiment.model_copy(update={"seed": 9}), tmp_path)
+    assert not other.results.equals(first.results)
