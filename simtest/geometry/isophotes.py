@@ -40,7 +40,7 @@ class Patch:
 
     Parameters
     ----------
-    values : ndarray of float32, shape (h, w)
+    values : ndarray, shape (h, w)
         Smoothed intensities of the region.
     origin_px : tuple of int
         Column and row of the region's first pixel in the frame.
@@ -50,7 +50,7 @@ class Patch:
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
     """
 
-    values: Image
+    values: Image | Array
     origin_px: tuple[int, int]
     peak_px: Array
     peak_value: float
@@ -58,18 +58,24 @@ class Patch:
 
     @classmethod
     def cut(
-        cls, smoothed: Image, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None
+        cls,
+        smoothed: Image | Array,
+        box: tuple[int, int, int, int],
+        peak: tuple[int, int] | None = None,
+        origin_px: tuple[int, int] = (0, 0),
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
         Parameters
         ----------
-        smoothed : ndarray of float32, shape (H, W)
+        smoothed : ndarray, shape (H, W)
             The frame.
         box : tuple of int
             Column, row, width, height of the region; inside the frame.
         peak : tuple of int, optional
             Column and row of the peak's pixel; default the brightest of the region.
+        origin_px : tuple of int
+            Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
 
         Returns
         -------
@@ -95,8 +101,9 @@ class Patch:
         value = float(values[row, column])
         if value <= 0 or value <= float(values.min()):
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
-        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + (x, y)
-        return cls(values, (x, y), peak_px, value)
+        corner = (x + origin_px[0], y + origin_px[1])
+        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
+        return cls(values, corner, peak_px, value)
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
@@ -138,7 +145,7 @@ class Patch:
         return best
 
 
-def _parabolic_peak(values: Image, row: int, column: int) -> Array:
+def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
     """Refine a peak's pixel by a parabola along each axis; at the border the pixel itself is kept. Gives (x, y)."""
     position = [float(column), float(row)]
     for axis, (index, line) in enumerate(((column, values[row, :]), (row, values[:, column]))):

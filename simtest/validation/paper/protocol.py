@@ -7,9 +7,9 @@ centres at + 0.5; the camera has f = M.
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
 from simtest.conventions import DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
 from simtest.errors import InputError
@@ -17,7 +17,6 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.isocurves import cosine_beta
 
 Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 
 MIN_SIZE = 16
 MAX_SIZE = 4096
@@ -120,7 +119,7 @@ def plane_from_image(setting: PaperSetting) -> Array:
     return np.asarray(np.linalg.inv(setting.camera.K @ camera_from_plane))
 
 
-def texture(setting: PaperSetting, light: Array) -> Image:
+def texture(setting: PaperSetting, light: Array) -> Array:
     """Give the M x M texture of the specular term max(0, cos beta)^n, its largest sample 1 at most.
 
     Parameters
@@ -132,12 +131,12 @@ def texture(setting: PaperSetting, light: Array) -> Image:
 
     Returns
     -------
-    ndarray of float32, shape (M, M)
+    ndarray, shape (M, M)
     """
     camera = np.array([0.0, 0.0, setting.height])
     side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
     points = np.stack(np.meshgrid(side, side), axis=-1) + window_centre(setting, light)
-    return np.asarray(np.maximum(cosine_beta(points, light, camera), 0) ** setting.exponent, dtype=np.float32)
+    return np.asarray(np.maximum(cosine_beta(points, light, camera), 0) ** setting.exponent)
 
 
 def window_centre(setting: PaperSetting, light: Array) -> Array:
@@ -146,18 +145,49 @@ def window_centre(setting: PaperSetting, light: Array) -> Array:
     return brightest_point(light, camera) if setting.recentre else np.zeros(2)
 
 
-def picture(setting: PaperSetting, light: Array) -> Image:
+Box = tuple[int, int, int, int]
+"""Column, row, width, height, px."""
+
+
+def picture(setting: PaperSetting, light: Array, box: Box | None = None) -> Array:
     """Give the noise-free picture of the texture seen slanted: the texture warped by the homography, bilinear.
+
+    Parameters
+    ----------
+    setting : PaperSetting
+        The setting.
+    light : ndarray, shape (3,)
+        L, texture units.
+    box : tuple of int, optional
+        Part of the picture; default all of it.
 
     Returns
     -------
-    ndarray of float32, shape (M, M)
+    ndarray, shape (h, w)
         0 where the window ends; the peak is the texture's.
     """
-    # cv2 counts pixels from their centres: half a pixel off on either side.
-    to_corner = np.array([[1, 0, PIXEL_CENTRE], [0, 1, PIXEL_CENTRE], [0, 0, 1]])
-    to_window = np.array([[1, 0, setting.size / 2], [0, 1, setting.size / 2], [0, 0, 1]])
-    texture_from_image = np.linalg.inv(to_corner) @ to_window @ plane_from_image(setting) @ to_corner
-    size = (setting.size, setting.size)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(texture(setting, light), texture_from_image, size, flags=flags))
+    x0, y0, width, height = box or (0, 0, setting.size, setting.size)
+    x, y = np.meshgrid(np.arange(x0, x0 + width) + PIXEL_CENTRE, np.arange(y0, y0 + height) + PIXEL_CENTRE)
+    plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ plane_from_image(setting).T
+    # The plane behind the camera is not seen.
+    scale = np.where(plane[..., 2] > 0, plane[..., 2], np.nan)
+    samples = plane[..., :2] / scale[..., None] + setting.size / 2 - PIXEL_CENTRE
+    columns, rows = np.nan_to_num(np.moveaxis(samples, -1, 0), nan=-2.0)
+    return np.asarray(map_coordinates(texture(setting, light), [rows, columns], order=1, cval=0.0, prefilter=False))
+
+
+def region_of_interest(setting: PaperSetting) -> Box:
+    """Give the bounding box of the texture's window in the picture: column, row, width, height, px.
+
+    Outside of it the picture is black; the published method's region of interest is its part inside the frame.
+    """
+    half = setting.size / 2
+    corners = np.array([[x, y, 1.0] for x in (-half, half) for y in (-half, half)])
+    seen = corners @ np.linalg.inv(plane_from_image(setting)).T
+    # A corner behind the camera is seen nowhere: then the window fills the frame towards it.
+    points = seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
+    low = np.nan_to_num(np.floor(points.min(axis=0)), nan=0.0)
+    high = np.nan_to_num(np.ceil(points.max(axis=0)), nan=float(setting.size))
+    x0, y0 = (int(v) for v in np.clip(low, 0, setting.size - 1))
+    x1, y1 = (int(v) for v in np.clip(high, 1, setting.size))
+    return x0, y0, x1 - x0, y1 - y0

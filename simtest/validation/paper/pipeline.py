@@ -1,0 +1,84 @@
+"""The published pipeline on one realisation: noise, smoothing, reconstruction [MB, section 3.1]."""
+
+import math
+from collections.abc import Mapping
+from functools import partial
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import Failure
+from simtest.estimators import Estimate, Estimator
+from simtest.estimators.checked import run
+from simtest.estimators.circle_pose import circle_pose
+from simtest.geometry import Patch
+from simtest.validation.paper.protocol import Box, PaperSetting, draw_light, picture, region_of_interest
+
+Array = npt.NDArray[np.float64]
+
+KERNEL_SIGMAS = 4.0
+"""Half-width of the smoothing kernel over its standard deviation."""
+
+
+class Pipeline:
+    """The published pipeline at one setting; what all realisations share is computed once.
+
+    Only the region of interest, the texture's window in the picture, is made and smoothed, with a margin of the
+    kernel's half-width, so that its values are those of the whole picture.
+
+    Parameters
+    ----------
+    setting : PaperSetting
+        The setting.
+    estimators : mapping, optional
+        Estimator by name; default circle pose at the setting's isovalue.
+    """
+
+    def __init__(self, setting: PaperSetting, estimators: Mapping[str, Estimator] | None = None) -> None:
+        self.setting = setting
+        published: dict[str, Estimator] = {"circle_pose": partial(circle_pose, isovalue=setting.isovalue)}
+        self.estimators = dict(estimators) if estimators else published
+        self.region = region_of_interest(setting)
+        self.outer = _grown(self.region, kernel_radius(setting), setting.size)
+        overhead = np.array([0.0, 0.0, setting.height])
+        self._fixed = picture(setting, overhead, self.outer) if setting.eps == 0 else None
+
+    def realise(self, rng: np.random.Generator) -> dict[str, Estimate | Failure]:
+        """Make one realisation.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Gives the light, where it is offset, then the noise of the outer region row by row.
+
+        Returns
+        -------
+        dict
+            Estimate or Failure by estimator name.
+        """
+        patch = self.patch(rng)
+        return {name: run(estimator, patch, self.setting.camera) for name, estimator in self.estimators.items()}
+
+    def patch(self, rng: np.random.Generator) -> Patch | Failure:
+        """Give the smoothed region of interest of one realisation (see `realise`)."""
+        setting = self.setting
+        clean = self._fixed if self._fixed is not None else picture(setting, draw_light(setting, rng), self.outer)
+        frame = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
+        if setting.smoothing_px > 0:
+            side = 2 * kernel_radius(setting) + 1
+            frame = cv2.GaussianBlur(frame, (side, side), setting.smoothing_px, borderType=cv2.BORDER_REFLECT)
+        x, y, width, height = self.region
+        box = (x - self.outer[0], y - self.outer[1], width, height)
+        return Patch.cut(frame, box, origin_px=self.outer[:2])
+
+
+def kernel_radius(setting: PaperSetting) -> int:
+    """Give the half-width of the smoothing kernel, px."""
+    return math.ceil(KERNEL_SIGMAS * setting.smoothing_px)
+
+
+def _grown(box: Box, margin: int, size: int) -> Box:
+    x0, y0 = max(box[0] - margin, 0), max(box[1] - margin, 0)
+    x1, y1 = min(box[0] + box[2] + margin, size), min(box[1] + box[3] + margin, size)
+    return x0, y0, x1 - x0, y1 - y0
