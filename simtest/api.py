@@ -48,6 +48,7 @@ def validate(
     command: str = "",
     variant: str | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Path:
     """Run an experiment and write its report.
 
@@ -65,6 +66,8 @@ def validate(
         Mitsuba variant.
     progress : callable, optional
         Called with realisations done, realisations in all, and the name of the setting.
+    workers : int
+        Processes for what is not rendered, >= 1.
 
     Returns
     -------
@@ -83,5 +86,5 @@ def validate(
     from simtest.validation.runner import run_experiment
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
-    run = run_experiment(described, Path(out), command, variant, progress)
+    run = run_experiment(described, Path(out), command, variant, progress, workers)
     return write_report(run.folder)

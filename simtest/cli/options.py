@@ -30,3 +30,7 @@ Estimators = Annotated[
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.")]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]
+Workers = Annotated[
+    int,
+    Parameter(help="Processes for what is not rendered; rendering uses all cores by itself.", converter=whole_number),
+]

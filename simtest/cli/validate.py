@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Estimators, Realisations, Seed, Settings, Variant
+from simtest.cli.options import Estimators, Realisations, Seed, Settings, Variant, Workers
 
 DEFAULT_OUT = Path("reports/runs")
 
@@ -22,13 +22,15 @@ def validate(
     settings: Settings = None,
     estimators: Estimators = None,
     variant: Variant = None,
+    workers: Workers = 1,
 ) -> None:
     """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
 
     Parameters
     ----------
     experiment : str
-        An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, reflectance, anatomy.
+        An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, reflectance,
+        anatomy, paper.
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
@@ -40,5 +42,6 @@ def validate(
     described = load_experiment(experiment, values)
     command = shlex.join(["simtest", *sys.argv[1:]])
     with progress_bar() as progress:
-        page = run(described, out or DEFAULT_OUT / described.name, command=command, variant=variant, progress=progress)
+        folder = out or DEFAULT_OUT / described.name
+        page = run(described, folder, command=command, variant=variant, progress=progress, workers=workers)
     print(page)

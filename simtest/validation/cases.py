@@ -13,6 +13,8 @@ from simtest.errors import InputError
 from simtest.resources import find, shown
 from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
+from simtest.spec.paper import is_paper, paper_from_dict
+from simtest.validation.paper.protocol import PaperSetting
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,15 @@ class Case:
     isolated: bool
     source: str
     settings: dict[str, Any]
+
+    @property
+    def is_paper(self) -> bool:
+        """Whether the case is one of the published protocol, which renders nothing."""
+        return is_paper(self.data)
+
+    def paper_setting(self) -> PaperSetting:
+        """Give the setting of the published protocol; raises `InputError` where a value does not fit."""
+        return PaperSetting(**paper_from_dict(self.data, self.where).model_dump())
 
     @property
     def name(self) -> str:
@@ -130,6 +141,11 @@ def expand(experiment: Experiment) -> list[Case]:
 
 def _check(case: Case, experiment: Experiment) -> None:
     """Raise `InputError` where a scene of a case would be malformed; a drawn range is tried at both ends."""
+    if case.is_paper:
+        case.paper_setting()
+        if case.random:
+            raise InputError(f"{case.where}: random: the published protocol draws its light itself; use sweep or pool")
+        return
     first, _ = case.scene(experiment, case.numbers()[0])
     lows = {path: float(d.low) for path, d in case.random.items()}
     # The upper end itself is never drawn.
@@ -151,7 +167,7 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
         for part, pooled in enumerate(_combinations(group.pool)):
             values = {**swept, **pooled}
             data = apply_settings(base, values, str(path))
-            label = group.label or scene_from_dict(data, str(path)).surface.label
+            label = group.label or ("published" if is_paper(data) else scene_from_dict(data, str(path)).surface.label)
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}
             settings = {**group.set, **values}
@@ -206,4 +222,6 @@ def swept_example(cases: list[Case]) -> dict[str, Any]:
     for case in cases:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)
+        if case.is_paper:
+            example["paper.bound_deg"] = 0.0
     return example

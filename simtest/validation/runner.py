@@ -26,11 +26,17 @@ from simtest.spec.scene import AnatomySurface
 from simtest.validation import gallery
 from simtest.validation.cases import Case, expand, swept_example
 from simtest.validation.metrics import table
+from simtest.validation.paper.bound import cramer_rao_bound
+from simtest.validation.paper.rows import paper_rows
+from simtest.validation.pool import Pool
 from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
 
 GALLERY_ITEMS = 18
 PARTS = "parts"
+
+PAPER_CHUNK = 125
+"""Realisations of the published protocol that a worker makes at a time."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -64,6 +70,7 @@ def run_experiment(
     command: str = "",
     variant: str | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Run:
     """Run an experiment, or go on with an interrupted run of the same.
 
@@ -80,6 +87,8 @@ def run_experiment(
         Mitsuba variant.
     progress : callable, optional
         See `Progress`.
+    workers : int
+        Processes for what is not rendered, >= 1; rendering uses all cores by itself. The rows do not depend on it.
 
     Returns
     -------
@@ -101,7 +110,7 @@ def run_experiment(
     if finished is not None:
         return finished
     parts = _prepare(folder, digest)
-    work = _Work(experiment, cases, estimators, folder, command, variant)
+    work = _Work(experiment, cases, estimators, folder, command, variant, workers)
     resumed = work.run(parts, progress)
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
     run = {
@@ -141,40 +150,66 @@ class _Work:
     folder: Path
     command: str
     variant: str | None
+    workers: int
     session: Session | None = None
 
     def run(self, parts: Path, progress: Progress | None) -> int:
         """Run the cases that are not done yet; gives how many were."""
         total, done, resumed = sum(case.realisations for case in self.cases), 0, 0
-        shown = set(
-            np.linspace(0, len(self.cases) - 1, min(GALLERY_ITEMS, len(self.cases))).round().astype(int).tolist()
-        )
+        count = min(GALLERY_ITEMS, len(self.cases))
+        shown = set(np.linspace(0, len(self.cases) - 1, count).round().astype(int).tolist())
         swept = swept_example(self.cases)
-        for index, case in enumerate(self.cases):
-            if _part_file(parts, index).exists():
-                resumed += 1
+        with Pool(self.workers) as pool:
+            for index, case in enumerate(self.cases):
+                if _part_file(parts, index).exists():
+                    resumed += 1
+                else:
+
+                    def step(more: int, before: int = done, name: str = case.setting) -> None:
+                        if progress:
+                            progress(before + more, total, name)
+
+                    item = self.folder / "gallery" / f"{index:04d}.npz" if index in shown else None
+                    rows = self._published(case, pool, step) if case.is_paper else self._rendered(case, item, step)
+                    write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
                 done += case.realisations
-                continue
-            rows: list[dict[str, Any]] = []
-            seen: View | None = None
-            for number in case.numbers():
-                if progress:
-                    progress(done, total, case.setting)
-                scene, drawn = case.scene(self.experiment, number)
-                if seen is None or scene != seen.scene:
-                    seen = self._view(scene)
-                assert self.session is not None
-                made = realise(self.session, self.experiment, case, number, seen, drawn, self.estimators)
-                rows += made.rows
-                if index in shown and number == case.numbers()[0]:
-                    item = self.folder / "gallery" / f"{index:04d}.npz"
-                    again = f"{case.again(self.experiment, number)} --out frame"
-                    gallery.save(item, self.session, case, seen, made, again)
-                done += 1
-            write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
         if progress:
             progress(total, total, "done")
         return resumed
+
+    def _rendered(self, case: Case, item: Path | None, step: Callable[[int], None]) -> list[dict[str, Any]]:
+        """Make the rows of a rendered case; its first realisation is kept for the gallery where `item` is given."""
+        rows: list[dict[str, Any]] = []
+        seen: View | None = None
+        for done, number in enumerate(case.numbers()):
+            step(done)
+            scene, drawn = case.scene(self.experiment, number)
+            if seen is None or scene != seen.scene:
+                seen = self._view(scene)
+            assert self.session is not None
+            made = realise(self.session, self.experiment, case, number, seen, drawn, self.estimators)
+            rows += made.rows
+            if item and not done:
+                again = f"{case.again(self.experiment, number)} --out frame"
+                gallery.save(item, self.session, case, seen, made, again)
+        return rows
+
+    def _published(self, case: Case, pool: Pool, step: Callable[[int], None]) -> list[dict[str, Any]]:
+        """Make the rows of a case of the published protocol, in chunks over the workers."""
+        experiment, numbers, setting = self.experiment, case.numbers(), case.paper_setting()
+        common = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **case.swept}
+        # The bound is that of the light at V.
+        common["paper.bound_deg"] = float(np.degrees(cramer_rao_bound(setting))) if setting.eps == 0 else None
+        tasks = []
+        for first in range(0, len(numbers), PAPER_CHUNK):
+            chunk = numbers[first : first + PAPER_CHUNK]
+            seeds = [case.noise_seed(experiment, number) for number in chunk]
+            tasks.append((setting, common, chunk, seeds, experiment.estimators))
+        rows: list[dict[str, Any]] = []
+        for done, made in enumerate(pool.map(paper_rows, tasks)):
+            step(min(done * PAPER_CHUNK, len(numbers)))
+            rows += made
+        return rows
 
     def _view(self, scene: Scene) -> View:
         if self.session is None:
@@ -266,7 +301,7 @@ def _inputs(cases: list[Case]) -> dict[str, str]:
     """Give the hashes of the files that the cases were read from."""
     files = {Path(case.where) for case in cases}
     for case in cases:
-        surface = case.data["surface"]
+        surface = case.data.get("surface", {})
         if surface.get("type") == "anatomy":
             path = AnatomySurface.model_validate(surface).file()
             files.add(path)

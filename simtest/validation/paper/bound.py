@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from simtest.validation.paper.protocol import PaperSetting
+from simtest.validation.paper.protocol import PaperSetting, region_of_interest
 
 Array = npt.NDArray[np.float64]
 
@@ -46,8 +46,9 @@ def cramer_rao_bound(setting: PaperSetting) -> float:
 
 
 def _sightlines(setting: PaperSetting) -> Array:
-    """Give the sightlines of all pixels at unit depth, shape (M, M, 3)."""
-    pixels = setting.camera.pixel_centres()
+    """Give the sightlines of the region of interest's pixels at unit depth, shape (h, w, 3)."""
+    x, y, width, height = region_of_interest(setting)
+    pixels = setting.camera.pixel_centres()[y : y + height, x : x + width]
     xy = (pixels - setting.size / 2) / setting.size
     return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
 
@@ -68,7 +69,7 @@ def _model(setting: PaperSetting, parameters: Array) -> Array:
 
 
 def _inside_window(setting: PaperSetting) -> npt.NDArray[np.bool_]:
-    """Tell which pixels see the texture's window in front of the camera, shape (M, M)."""
+    """Tell which pixels see the texture's window in front of the camera, shape (h, w) as the sightlines."""
     rays = _sightlines(setting)
     theta, centre = np.radians(setting.theta_deg), np.array([0.0, 0.0, setting.height])
     depth = (setting.normal @ centre) / (rays @ setting.normal)

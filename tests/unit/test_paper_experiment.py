@@ -1,0 +1,92 @@
+"""The published protocol through the harness: contract, workers, bad input."""
+
+import polars as pl
+import pytest
+
+from simtest.errors import InputError
+from simtest.report import write_report
+from simtest.spec import Experiment, load_experiment, load_scene
+from simtest.validation.cases import expand
+from simtest.validation.metrics import SCHEMA
+from simtest.validation.runner import run_experiment
+
+SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3}
+
+
+def small(**more):
+    groups = [{"scene": "published", "label": "noise", "set": SMALL, "sweep": [{"paper.sigma": [0.0, 0.05]}]}]
+    groups += [{"scene": "published", "label": "offset", "set": SMALL, "sweep": [{"paper.eps": [60.0]}]}]
+    return Experiment(name="small", realisations=130, groups=groups, estimators=("circle_pose", "cone_axis"), **more)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("paper")
+    return run_experiment(small(), folder)
+
+
+def test_results_fit_the_contract(run):
+    assert list(run.results.columns)[: len(SCHEMA)] == list(SCHEMA)
+    assert {"paper.sigma", "paper.eps", "paper.bound_deg"} <= set(run.results.columns)
+    figures = run.summary["experiments"]["small"]["settings"]["noise, sigma=0.05"]
+    assert set(figures) == {"circle_pose", "cone_axis"}
+    assert figures["circle_pose"]["n"] == 130
+    assert figures["circle_pose"]["mean_oracle_deg"] < 3
+    pose = run.results.filter(pl.col("estimator") == "circle_pose")
+    assert set(pose["isovalue"].drop_nulls()) == {0.3}
+    bounds = run.results.group_by("setting", maintain_order=True).agg(pl.col("paper.bound_deg").first())
+    assert bounds["paper.bound_deg"][0] == 0
+    assert bounds["paper.bound_deg"][1] > 0
+    assert bounds["paper.bound_deg"][2] is None  # the light is not at V
+
+
+def test_no_two_realisations_share_a_seed(run):
+    pose = run.results.filter(pl.col("estimator") == "circle_pose")
+    assert pose["seed"].n_unique() == pose.height
+
+
+def test_rows_do_not_depend_on_the_workers(run, tmp_path):
+    with_two = run_experiment(small(), tmp_path / "two", workers=2)
+    assert with_two.results.equals(run.results)
+    assert (tmp_path / "two" / "results.parquet").read_bytes() == (run.folder / "results.parquet").read_bytes()
+
+
+def test_the_page_shows_the_sweeps(run):
+    page = write_report(run.folder)
+    assert page.is_file()
+    assert (run.folder / "figures" / "error_vs_paper_sigma.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("sigma", -0.1), ("theta_deg", 90.0), ("exponent", 0.0), ("isovalue", 1.0), ("isovalue", 0.0), ("size", 15)],
+)
+def test_bad_values_are_refused_before_anything_runs(key, value):
+    with pytest.raises(InputError, match=rf"paper\.{key} = .*must be"):
+        expand(load_experiment("paper", {f"paper.{key}": value}))
+
+
+def test_random_values_are_refused():
+    random = {"paper.sigma": {"low": 0.0, "high": 0.1}}
+    experiment = Experiment(name="r", groups=[{"scene": "published", "random": random}])
+    with pytest.raises(InputError, match="draws its light itself"):
+        expand(experiment)
+
+
+def test_the_published_scene_is_not_for_rendering():
+    with pytest.raises(InputError, match="published"):
+        load_scene("published")
+
+
+@pytest.mark.parametrize("workers", [0, -1, 1000, True])
+def test_a_bad_number_of_workers_is_refused(workers, tmp_path):
+    with pytest.raises(InputError, match=r"workers = .*: must be 1 to"):
+        run_experiment(small(), tmp_path, workers=workers)
+
+
+def test_a_setting_where_nothing_can_be_fitted_is_reported(tmp_path):
+    groups = [{"scene": "published", "set": {**SMALL, "paper.theta_deg": 89.0}}]
+    run = run_experiment(Experiment(name="steep", realisations=3, groups=groups), tmp_path)
+    (figures,) = run.summary["experiments"]["steep"]["settings"].values()
+    assert figures["circle_pose"]["n_ok"] == 0
+    assert sum(figures["circle_pose"]["n_failed_by_reason"].values()) == 3
