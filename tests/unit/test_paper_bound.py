@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
+from simtest.geometry.isocurves import cosine_beta
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.protocol import (
     PaperSetting,
@@ -87,3 +88,12 @@ def test_values_out_of_range_are_refused_by_name(values):
     (name,) = values
     with pytest.raises(InputError, match=rf"^paper\.{name} = .*must be"):
         PaperSetting(**values)
+
+
+def test_texture_is_the_specular_term_of_the_isocurves():
+    setting = PaperSetting(size=64, eps=300.0)
+    light = draw_light(setting, np.random.default_rng(5))
+    side = np.arange(64) + 0.5 - 32
+    points = np.stack(np.meshgrid(side, side), axis=-1) + window_centre(setting, light)
+    expected = np.maximum(cosine_beta(points, light, np.array([0, 0, setting.height])), 0) ** setting.exponent
+    np.testing.assert_allclose(texture(setting, light), expected, rtol=1e-11)

@@ -13,7 +13,14 @@ from simtest.estimators import Estimate, Estimator
 from simtest.estimators.checked import run
 from simtest.estimators.circle_pose import circle_pose
 from simtest.geometry import Patch
-from simtest.validation.paper.protocol import Box, PaperSetting, draw_light, picture, region_of_interest
+from simtest.validation.paper.protocol import (
+    Box,
+    PaperSetting,
+    draw_light,
+    picture,
+    region_of_interest,
+    sample_positions,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -42,7 +49,8 @@ class Pipeline:
         self.region = region_of_interest(setting)
         self.outer = _grown(self.region, kernel_radius(setting), setting.size)
         overhead = np.array([0.0, 0.0, setting.height])
-        self._fixed = picture(setting, overhead, self.outer) if setting.eps == 0 else None
+        self._positions = sample_positions(setting, self.outer)
+        self._fixed = picture(setting, overhead, self._positions) if setting.eps == 0 else None
 
     def realise(self, rng: np.random.Generator) -> dict[str, Estimate | Failure]:
         """Make one realisation.
@@ -63,7 +71,9 @@ class Pipeline:
     def patch(self, rng: np.random.Generator) -> Patch | Failure:
         """Give the smoothed region of interest of one realisation (see `realise`)."""
         setting = self.setting
-        clean = self._fixed if self._fixed is not None else picture(setting, draw_light(setting, rng), self.outer)
+        clean = self._fixed
+        if clean is None:
+            clean = picture(setting, draw_light(setting, rng), self._positions)
         frame = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
         if setting.smoothing_px > 0:
             side = 2 * kernel_radius(setting) + 1

@@ -14,7 +14,6 @@ from scipy.ndimage import map_coordinates
 from simtest.conventions import DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.isocurves import cosine_beta
 
 Array = npt.NDArray[np.float64]
 
@@ -133,10 +132,14 @@ def texture(setting: PaperSetting, light: Array) -> Array:
     -------
     ndarray, shape (M, M)
     """
-    camera = np.array([0.0, 0.0, setting.height])
     side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
-    points = np.stack(np.meshgrid(side, side), axis=-1) + window_centre(setting, light)
-    return np.asarray(np.maximum(cosine_beta(points, light, camera), 0) ** setting.exponent)
+    centre = window_centre(setting, light)
+    x, y = side + centre[0], (side + centre[1])[:, None]
+    # `geometry.isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
+    product = x * (light[0] - x) + (y * (light[1] - y) + light[2] * setting.height)
+    to_mirrored = (light[0] - x) ** 2 + ((light[1] - y) ** 2 + light[2] ** 2)
+    to_camera = x**2 + (y**2 + setting.height**2)
+    return np.asarray((np.maximum(product, 0) / np.sqrt(to_mirrored * to_camera)) ** setting.exponent)
 
 
 def window_centre(setting: PaperSetting, light: Array) -> Array:
@@ -149,7 +152,18 @@ Box = tuple[int, int, int, int]
 """Column, row, width, height, px."""
 
 
-def picture(setting: PaperSetting, light: Array, box: Box | None = None) -> Array:
+def sample_positions(setting: PaperSetting, box: Box) -> Array:
+    """Give where each pixel of a part of the picture reads the texture: rows and columns, shape (2, h, w)."""
+    x0, y0, width, height = box
+    x, y = np.meshgrid(np.arange(x0, x0 + width) + PIXEL_CENTRE, np.arange(y0, y0 + height) + PIXEL_CENTRE)
+    plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ plane_from_image(setting).T
+    # The plane behind the camera is not seen: such pixels read outside of the texture.
+    scale = np.where(plane[..., 2] > 0, plane[..., 2], np.nan)
+    samples = plane[..., :2] / scale[..., None] + setting.size / 2 - PIXEL_CENTRE
+    return np.asarray(np.nan_to_num(np.moveaxis(samples[..., ::-1], -1, 0), nan=-2.0))
+
+
+def picture(setting: PaperSetting, light: Array, positions: Array | None = None) -> Array:
     """Give the noise-free picture of the texture seen slanted: the texture warped by the homography, bilinear.
 
     Parameters
@@ -158,22 +172,17 @@ def picture(setting: PaperSetting, light: Array, box: Box | None = None) -> Arra
         The setting.
     light : ndarray, shape (3,)
         L, texture units.
-    box : tuple of int, optional
-        Part of the picture; default all of it.
+    positions : ndarray, shape (2, h, w), optional
+        `sample_positions` of a part of the picture; default of all of it.
 
     Returns
     -------
     ndarray, shape (h, w)
         0 where the window ends; the peak is the texture's.
     """
-    x0, y0, width, height = box or (0, 0, setting.size, setting.size)
-    x, y = np.meshgrid(np.arange(x0, x0 + width) + PIXEL_CENTRE, np.arange(y0, y0 + height) + PIXEL_CENTRE)
-    plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ plane_from_image(setting).T
-    # The plane behind the camera is not seen.
-    scale = np.where(plane[..., 2] > 0, plane[..., 2], np.nan)
-    samples = plane[..., :2] / scale[..., None] + setting.size / 2 - PIXEL_CENTRE
-    columns, rows = np.nan_to_num(np.moveaxis(samples, -1, 0), nan=-2.0)
-    return np.asarray(map_coordinates(texture(setting, light), [rows, columns], order=1, cval=0.0, prefilter=False))
+    if positions is None:
+        positions = sample_positions(setting, (0, 0, setting.size, setting.size))
+    return np.asarray(map_coordinates(texture(setting, light), positions, order=1, cval=0.0, prefilter=False))
 
 
 def region_of_interest(setting: PaperSetting) -> Box:
