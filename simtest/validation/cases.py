@@ -223,5 +223,5 @@ def swept_example(cases: list[Case]) -> dict[str, Any]:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)
         if case.is_paper:
-            example["paper.bound_deg"] = 0.0
+            example["bound_deg"] = 0.0
     return example

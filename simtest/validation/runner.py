@@ -199,7 +199,7 @@ class _Work:
         experiment, numbers, setting = self.experiment, case.numbers(), case.paper_setting()
         common = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **case.swept}
         # The bound is that of the light at V.
-        common["paper.bound_deg"] = float(np.degrees(cramer_rao_bound(setting))) if setting.eps == 0 else None
+        common["bound_deg"] = float(np.degrees(cramer_rao_bound(setting))) if setting.eps == 0 else None
         tasks = []
         for first in range(0, len(numbers), PAPER_CHUNK):
             chunk = numbers[first : first + PAPER_CHUNK]

@@ -27,17 +27,17 @@ def run(tmp_path_factory):
 
 def test_results_fit_the_contract(run):
     assert list(run.results.columns)[: len(SCHEMA)] == list(SCHEMA)
-    assert {"paper.sigma", "paper.eps", "paper.bound_deg"} <= set(run.results.columns)
+    assert {"paper.sigma", "paper.eps", "bound_deg"} <= set(run.results.columns)
     figures = run.summary["experiments"]["small"]["settings"]["noise, sigma=0.05"]
     assert set(figures) == {"circle_pose", "cone_axis"}
     assert figures["circle_pose"]["n"] == 130
     assert figures["circle_pose"]["mean_oracle_deg"] < 3
     pose = run.results.filter(pl.col("estimator") == "circle_pose")
     assert set(pose["isovalue"].drop_nulls()) == {0.3}
-    bounds = run.results.group_by("setting", maintain_order=True).agg(pl.col("paper.bound_deg").first())
-    assert bounds["paper.bound_deg"][0] == 0
-    assert bounds["paper.bound_deg"][1] > 0
-    assert bounds["paper.bound_deg"][2] is None  # the light is not at V
+    bounds = run.results.group_by("setting", maintain_order=True).agg(pl.col("bound_deg").first())
+    assert bounds["bound_deg"][0] == 0
+    assert bounds["bound_deg"][1] > 0
+    assert bounds["bound_deg"][2] is None  # the light is not at V
 
 
 def test_no_two_realisations_share_a_seed(run):
