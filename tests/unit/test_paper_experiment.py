@@ -51,6 +51,23 @@ def test_rows_do_not_depend_on_the_workers(run, tmp_path):
     assert (tmp_path / "two" / "results.parquet").read_bytes() == (run.folder / "results.parquet").read_bytes()
 
 
+def test_a_run_cut_in_two_gives_the_same_bytes(run, tmp_path):
+    def stop_in_the_second_setting(done, _total, _name):
+        if done > 130:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(small(), tmp_path / "cut", progress=stop_in_the_second_setting)
+    resumed = run_experiment(small(), tmp_path / "cut")
+    assert resumed.resumed == 1
+    assert (tmp_path / "cut" / "results.parquet").read_bytes() == (run.folder / "results.parquet").read_bytes()
+
+
+@pytest.mark.slow
+def test_rows_do_not_depend_on_five_workers(run, tmp_path):
+    assert run_experiment(small(), tmp_path, workers=5).results.equals(run.results)
+
+
 def test_the_page_shows_the_sweeps(run):
     page = write_report(run.folder)
     assert page.is_file()
