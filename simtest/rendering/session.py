@@ -31,7 +31,6 @@ class _Built:
     scene: Any
     parameters: Any
     diffuse_bsdf: Any
-    diffuse_parameters: Any
 
 
 class Session:
@@ -113,7 +112,7 @@ class Session:
         # would share a parameter, and an update of one would change both.
         scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
         diffuse = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True))
-        return _Built(key, scene, self.mi.traverse(scene), diffuse, self.mi.traverse(diffuse))
+        return _Built(key, scene, self.mi.traverse(scene), diffuse)
 
     def _apply(self, built: _Built) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""

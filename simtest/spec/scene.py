@@ -12,7 +12,6 @@ from simtest.geometry.camera import Camera
 from simtest.resources import find
 from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
 
-Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Millimetres = Annotated[float, Field(ge=1e-3, le=1e6)]

@@ -13,8 +13,7 @@ from simtest.errors import InputError
 from simtest.resources import find, shown
 from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
-from simtest.spec.paper import is_paper, paper_from_dict
-from simtest.validation.paper.protocol import PaperSetting
+from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Case:
 
     def paper_setting(self) -> PaperSetting:
         """Give the setting of the published protocol; raises `InputError` where a value does not fit."""
-        return PaperSetting(**paper_from_dict(self.data, self.where).model_dump())
+        return paper_from_dict(self.data, self.where)
 
     @property
     def name(self) -> str:

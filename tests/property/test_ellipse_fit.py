@@ -182,7 +182,10 @@ def test_hyperbolas_give_no_ellipse_through_them(branches):
 
 def test_a_parabola_gives_a_slender_ellipse_or_a_failure():
     result = fit_ellipse(np.stack([T, T * T], axis=1))
-    if not isinstance(result, Failure):
+    # A parabola lies between the two kinds: rounding decides which side it falls on.
+    if isinstance(result, Failure):
+        assert result.reason in (Reason.NOT_AN_ELLIPSE, Reason.DEGENERATE_CONIC)
+    else:
         sound(result)
         _, a, b, _ = parameters(result)
         assert a > 100 * b

@@ -7,8 +7,9 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import find_contours
 
 from simtest.errors import Failure
+from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.pipeline import Pipeline, kernel_radius
-from simtest.validation.paper.protocol import PaperSetting, draw_light, region_of_interest
+from simtest.validation.paper.protocol import draw_light, region_of_interest
 
 
 def generator(number):

@@ -5,9 +5,9 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry.isocurves import cosine_beta
+from simtest.spec.paper import PaperSetting, paper_from_dict
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.protocol import (
-    PaperSetting,
     brightest_point,
     draw_light,
     picture,
@@ -86,8 +86,8 @@ def test_homography_maps_the_image_centre_to_the_window_centre():
 )  # fmt: skip
 def test_values_out_of_range_are_refused_by_name(values):
     (name,) = values
-    with pytest.raises(InputError, match=rf"^paper\.{name} = .*must be"):
-        PaperSetting(**values)
+    with pytest.raises(InputError, match=rf"^scene: paper\.{name} = .*must be"):
+        paper_from_dict({"paper": values}, "scene")
 
 
 def test_texture_is_the_specular_term_of_the_isocurves():

@@ -3,7 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from simtest.validation.paper.protocol import PaperSetting, region_of_interest
+from simtest.spec.paper import PaperSetting
+from simtest.validation.paper.protocol import region_of_interest
 
 Array = npt.NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from simtest.estimators import Estimate, Estimator
 from simtest.estimators.checked import run
 from simtest.estimators.circle_pose import circle_pose
 from simtest.geometry import Patch
+from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.protocol import (
     Box,
-    PaperSetting,
     draw_light,
     picture,
     region_of_interest,

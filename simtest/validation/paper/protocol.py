@@ -5,89 +5,14 @@ sample is one length unit; the tilt is about the image's x axis; the texture's c
 centres at + 0.5; the camera has f = M.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
-from simtest.errors import InputError
-from simtest.geometry.camera import Camera
+from simtest.conventions import PIXEL_CENTRE
+from simtest.spec.paper import PaperSetting
 
 Array = npt.NDArray[np.float64]
-
-MIN_SIZE = 16
-MAX_SIZE = 4096
-MAX_SMOOTHING_PX = 50.0
-
-
-@dataclass(frozen=True)
-class PaperSetting:
-    """One setting of the published protocol; the defaults are the article's.
-
-    Parameters
-    ----------
-    eps : float
-        Light offset, texture units, >= 0: L = V + eps (cos a, sin a, b).
-    size : int
-        M, px and texture samples along a side, 16 to 4096.
-    height : float
-        V_Z, texture units, > 0.
-    exponent : float
-        Roughness exponent n > 0.
-    sigma : float
-        Standard deviation of the noise, share of the noise-free peak, in [0, 1].
-    isovalue : float
-        t in (0, 1).
-    theta_deg : float
-        Slant, deg, in [0, 90).
-    smoothing_px : float
-        Standard deviation of the Gaussian smoothing, px, in [0, 50].
-    recentre : bool
-        Centre the texture's window at the BP, as published for the eps sweep; else at the camera's foot.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range.
-    """
-
-    eps: float = 0.0
-    size: int = 406
-    height: float = 1000.0
-    exponent: float = 50.0
-    sigma: float = 0.05
-    isovalue: float = 0.1
-    theta_deg: float = 58.0
-    smoothing_px: float = DEFAULT_SMOOTHING_PX
-    recentre: bool = True
-
-    def __post_init__(self) -> None:
-        for name, good, allowed in (
-            ("eps", self.eps >= 0, ">= 0"),
-            ("size", MIN_SIZE <= self.size <= MAX_SIZE, f"{MIN_SIZE} to {MAX_SIZE}"),
-            ("height", self.height > 0, "> 0"),
-            ("exponent", self.exponent > 0, "> 0"),
-            ("sigma", 0 <= self.sigma <= 1, "in [0, 1]"),
-            ("isovalue", 0 < self.isovalue < 1, "inside (0, 1)"),
-            ("theta_deg", 0 <= self.theta_deg < 90, "in [0, 90)"),
-            ("smoothing_px", 0 <= self.smoothing_px <= MAX_SMOOTHING_PX, f"in [0, {MAX_SMOOTHING_PX:g}]"),
-        ):
-            if not (good and np.isfinite(getattr(self, name))):
-                raise InputError(f"paper.{name} = {getattr(self, name)!r}: must be {allowed}")
-
-    @property
-    def camera(self) -> Camera:
-        """The imaging camera: f = M, c = M/2."""
-        size = self.size
-        return Camera(size, size, float(size), float(size), size / 2, size / 2)
-
-    @property
-    def normal(self) -> Array:
-        """The plane's normal in the imaging camera's frame, facing it, shape (3,)."""
-        theta = np.radians(self.theta_deg)
-        return np.array([0.0, np.sin(theta), -np.cos(theta)])
 
 
 def brightest_point(light: Array, camera: Array) -> Array:

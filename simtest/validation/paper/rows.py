@@ -6,9 +6,9 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.circle_pose import circle_pose
 from simtest.seeds import from_integer
+from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import angle_deg
 from simtest.validation.paper.pipeline import Pipeline
-from simtest.validation.paper.protocol import PaperSetting
 
 SURFACE = "published plane"
 
