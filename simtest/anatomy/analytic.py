@@ -18,7 +18,7 @@ from simtest.anatomy.base import (
     implicit_shape_operator,
     pack_points,
 )
-from simtest.spec.scene import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
+from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
 
 PLANE_REACH = 1000.0
 """Half-size of the rendered plane over the anchor's distance: beyond the view even at grazing tilt."""

@@ -6,7 +6,7 @@ from simtest.anatomy.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.anatomy.base import SurfaceModel
 from simtest.errors import InputError
 from simtest.resources import find
-from simtest.spec.scene import (
+from simtest.spec.surface import (
     AnatomySurface,
     CylinderSurface,
     PlaneSurface,

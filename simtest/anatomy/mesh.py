@@ -23,7 +23,7 @@ from simtest.anatomy.mesh_file import MESH_SUFFIXES, read_mesh
 from simtest.anatomy.viewpoints import MeshProbe, lumen_pose, organ_pose
 from simtest.errors import InputError
 from simtest.resources import find
-from simtest.spec.scene import AnatomySurface
+from simtest.spec.surface import AnatomySurface
 
 __all__ = ["LUMEN_QUOTIENT", "MeshSurface", "PreparedMesh", "isoperimetric_quotient", "prepare", "read_mesh"]
 

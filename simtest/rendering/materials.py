@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from simtest.spec.scene import (
+from simtest.spec.reflectance import (
     PhongReflectance,
     PrincipledReflectance,
     RoughConductorReflectance,

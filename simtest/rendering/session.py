@@ -11,7 +11,8 @@ from simtest.rendering import backend, highlights, integrate, phong
 from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps
 from simtest.rendering.materials import bsdf_dict, parameter_updates
 from simtest.rendering.shapes import make_shape
-from simtest.spec.scene import AnatomySurface, Scene
+from simtest.spec.scene import Scene
+from simtest.spec.surface import AnatomySurface
 
 COLOCATED_MM = 1e-9
 """A light nearer to the camera than this sees what the camera sees: no shadow rays."""

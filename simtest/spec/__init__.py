@@ -1,20 +1,17 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema."""
 
+from simtest.spec.camera import CameraSpec, load_camera
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
-from simtest.spec.scene import (
+from simtest.spec.rig import LightSpec
+from simtest.spec.scene import Scene, load_scene, scene_from_dict
+from simtest.spec.surface import (
     AnatomySurface,
-    CameraSpec,
     CylinderSurface,
-    LightSpec,
     PlaneSurface,
     QuadricSurface,
-    Scene,
     SphereSurface,
     Surface,
-    load_camera,
-    load_scene,
-    scene_from_dict,
 )
 
 __all__ = [

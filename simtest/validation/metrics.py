@@ -12,7 +12,8 @@ from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session
 from simtest.rendering.frames import Array
-from simtest.spec.scene import PhongReflectance, Scene
+from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.truth import JudgedHighlight
 

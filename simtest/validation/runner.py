@@ -22,7 +22,7 @@ from simtest.files import write_atomically, write_json
 from simtest.rendering import Session, backend
 from simtest.resources import shown
 from simtest.spec import Experiment, Scene
-from simtest.spec.scene import AnatomySurface
+from simtest.spec.surface import AnatomySurface
 from simtest.validation import gallery
 from simtest.validation.cases import Case, expand, swept_example
 from simtest.validation.metrics import table

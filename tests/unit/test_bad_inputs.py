@@ -14,7 +14,7 @@ from simtest.estimators import load_estimators
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct
 from simtest.spec import load_camera, load_experiment, load_scene, parse_settings, scene_from_dict
-from simtest.spec.scene import AnatomySurface
+from simtest.spec.surface import AnatomySurface
 from simtest.validation import runner
 from simtest.validation.cases import expand
 

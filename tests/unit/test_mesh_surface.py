@@ -15,7 +15,7 @@ from simtest.anatomy.mesh import (
     read_mesh,
 )
 from simtest.errors import InputError
-from simtest.spec.scene import AnatomySurface
+from simtest.spec.surface import AnatomySurface
 
 MESHES = Path(__file__).resolve().parents[2].parent / "shared/data/meshes"
 COLON, LIVER = MESHES / "colon_edingca_00090.ply", MESHES / "liver_sksurgery.ply"

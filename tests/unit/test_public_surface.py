@@ -25,7 +25,7 @@ PUBLIC = {
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",
     "Specularity": "simtest.reconstruction",
-    "load_camera": "simtest.spec.scene",
+    "load_camera": "simtest.spec.camera",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",
     "reconstruct": "simtest.reconstruction",

@@ -12,7 +12,7 @@ from simtest.anatomy.mesh import MeshSurface
 from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, load_recipe
 from simtest.anatomy.viewpoints import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
 from simtest.errors import InputError
-from simtest.spec.scene import AnatomySurface
+from simtest.spec.surface import AnatomySurface
 
 ROOT = Path(__file__).resolve().parents[2]
 MESHES = ROOT.parent / "shared/data/meshes"

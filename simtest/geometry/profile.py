@@ -1,0 +1,69 @@
+"""A factor over the angle from an axis: a light's emission, a lens's vignetting."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AngularProfile:
+    """A factor over the angle from an axis, 1 on the axis or relative to the table's unit.
+
+    Parameters
+    ----------
+    power : float
+        k of cos^k; used where there is no table. 0 is isotropic.
+    angles : tuple of float
+        Angles of a table, rad, rising from 0 to at most pi; empty for cos^k.
+    values : tuple of float
+        Factors at those angles, >= 0; linear between them, the last one holds beyond the table.
+
+    Raises
+    ------
+    InputError
+        If the power is negative or not finite, or the table is malformed.
+    """
+
+    power: float = 0.0
+    angles: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.power) and self.power >= 0):
+            raise InputError(f"profile power = {self.power!r}: must be a finite number >= 0")
+        if len(self.angles) != len(self.values):
+            raise InputError(f"profile: {len(self.angles)} angles and {len(self.values)} values; must be as many")
+        if not self.angles:
+            return
+        angles, values = np.array(self.angles), np.array(self.values)
+        if len(angles) < 2 or angles[0] != 0 or not (np.diff(angles) > 0).all() or angles[-1] > np.pi + 1e-12:
+            raise InputError(f"profile angles = {list(self.angles)}: must rise from 0 to at most pi, two or more")
+        if not (np.isfinite(values).all() and (values >= 0).all() and values[0] > 0):
+            raise InputError(f"profile values = {list(self.values)}: must be finite, >= 0 and positive on the axis")
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the factor is 1 in all directions."""
+        return self.power == 0 and not self.angles
+
+    def at(self, cosine: npt.ArrayLike) -> Array:
+        """Give the factor where the angle from the axis has this cosine.
+
+        Parameters
+        ----------
+        cosine : array_like, shape (...)
+
+        Returns
+        -------
+        ndarray, shape (...)
+            cos^k is 0 at angles of 90 deg and more, unless k is 0.
+        """
+        c = np.clip(np.asarray(cosine, dtype=float), -1.0, 1.0)
+        if self.angles:
+            return np.asarray(np.interp(np.arccos(c), self.angles, self.values))
+        return np.ones_like(c) if self.power == 0 else np.asarray(np.maximum(c, 0.0) ** self.power)

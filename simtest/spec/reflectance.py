@@ -1,0 +1,51 @@
+"""The reflectances of a scene."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from simtest.spec.quantities import Share
+from simtest.spec.reading import Spec
+
+
+class _Reflectance(Spec):
+    diffuse: Share = Field(0.0, description="share of the diffuse base, its albedo")
+    colour: tuple[Share, Share, Share] = Field((1.0, 1.0, 1.0), description="linear RGB colour of the diffuse base")
+
+
+class PhongReflectance(_Reflectance):
+    """Phong: specular c cos^n(beta) as published, or the energy-conserving form."""
+
+    type: Literal["phong"] = "phong"
+    exponent: float = Field(50.0, gt=0, le=1e5, description="roughness exponent n")
+    specular: float = Field(1.0, ge=0, le=1e6, description="scale c of the specular lobe")
+    normalised: bool = Field(False, description="energy-conserving form: (n + 2)/(2 pi) cos^n(beta) cos(theta)")
+
+
+class RoughPlasticReflectance(_Reflectance):
+    """Mitsuba's rough plastic, GGX."""
+
+    type: Literal["rough_plastic"] = "rough_plastic"
+    alpha: float = Field(0.15, gt=0, le=1, description="GGX roughness")
+    diffuse: Share = Field(0.5, description="share of the diffuse base, its albedo")
+
+
+class PrincipledReflectance(_Reflectance):
+    """Mitsuba's principled material, not metallic."""
+
+    type: Literal["principled"] = "principled"
+    roughness: float = Field(0.3, gt=0, le=1, description="roughness (alpha is its square)")
+    diffuse: Share = Field(0.5, description="share of the diffuse base, its albedo")
+
+
+class RoughConductorReflectance(_Reflectance):
+    """Mitsuba's rough conductor, GGX, blended with a diffuse base by its share."""
+
+    type: Literal["rough_conductor"] = "rough_conductor"
+    alpha: float = Field(0.2, gt=0, le=1, description="GGX roughness")
+
+
+Reflectance = Annotated[
+    PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance,
+    Field(discriminator="type"),
+]

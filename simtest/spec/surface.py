@@ -1,0 +1,108 @@
+"""The surfaces of a scene."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from simtest.resources import find
+from simtest.spec.quantities import Curvature, Millimetres
+from simtest.spec.reading import Spec
+
+
+class _Placed(Spec):
+    """An analytic surface whose anchor point lies on the optical axis, its normal tilted away from the camera's axis.
+
+    The anchor is (0, 0, distance_mm); at tilt 0 its normal is (0, 0, -1).
+    """
+
+    distance_mm: Millimetres = Field(10.0, description="depth of the anchor point on the optical axis, mm")
+    tilt_deg: float = Field(0.0, ge=0, lt=90, description="angle between the anchor's normal and the optical axis, deg")
+    azimuth_deg: float = Field(
+        0.0, ge=-360, le=360, description="image direction towards which the normal leans, deg from x to y"
+    )
+    spin_deg: float = Field(
+        0.0, ge=-360, le=360, description="direction of the first principal direction in the tangent plane, deg"
+    )
+
+    @property
+    def label(self) -> str:
+        """Name of the surface in the results."""
+        return str(getattr(self, "type"))  # noqa: B009 - declared by each subclass as a Literal
+
+
+class PlaneSurface(_Placed):
+    """A plane."""
+
+    type: Literal["plane"] = "plane"
+
+
+class _Round(_Placed):
+    radius_mm: Millimetres = Field(10.0, description="radius, mm")
+    side: Literal["outside", "inside"] = Field("outside", description="which side the camera is on")
+
+    @model_validator(mode="after")
+    def _camera_inside(self) -> "_Round":
+        if self.side == "inside" and self._camera_from_centre() >= self.radius_mm:
+            raise ValueError(
+                f"distance_mm = {self.distance_mm:g} puts the camera outside a radius of {self.radius_mm:g} mm; "
+                "must be small enough for the camera to lie inside when side is inside"
+            )
+        return self
+
+    def _camera_from_centre(self) -> float:
+        """Distance of the camera from the centre, for side inside, mm: across the axis for a cylinder."""
+        tilt = math.radians(self.tilt_deg)
+        return math.hypot(self.radius_mm - self.distance_mm * math.cos(tilt), self._sideways() * math.sin(tilt))
+
+    def _sideways(self) -> float:
+        """Part of the camera's distance from the anchor that counts when it is seen aslant, mm."""
+        return self.distance_mm
+
+
+class SphereSurface(_Round):
+    """A sphere, seen from outside (k = 1/R) or from inside (k = -1/R)."""
+
+    type: Literal["sphere"] = "sphere"
+
+
+class CylinderSurface(_Round):
+    """A cylinder; at spin 0 it is curved along image x and straight along image y."""
+
+    type: Literal["cylinder"] = "cylinder"
+
+    def _sideways(self) -> float:
+        return self.distance_mm * math.cos(math.radians(self.azimuth_deg - self.spin_deg))
+
+
+class QuadricSurface(_Placed):
+    """The quadric patch z = -(k1 x^2 + k2 y^2)/2 over its tangent plane; k1, k2 are the curvatures at the anchor."""
+
+    type: Literal["quadric"] = "quadric"
+    k1_per_mm: Curvature = Field(description="curvature along the first principal direction, 1/mm, convex positive")
+    k2_per_mm: Curvature = Field(description="curvature along the second principal direction, 1/mm, convex positive")
+
+
+class AnatomySurface(Spec):
+    """A colon or liver made from a recipe in meshes/, or a mesh that the user names."""
+
+    type: Literal["anatomy"] = "anatomy"
+    path: str = Field(min_length=1, description="recipe by name or path (TOML), or a mesh file: PLY, OBJ, STL, VTK")
+    kind: Literal["auto", "lumen", "organ"] = Field("auto", description="lumen: camera inside; organ: camera outside")
+    viewpoint: int = Field(0, ge=0, le=10**6, description="number of the automatically chosen camera pose")
+    subdivisions: int = Field(1, ge=0, le=3, description="Loop subdivisions of a user's mesh")
+
+    @property
+    def label(self) -> str:
+        """Name of the surface in the results."""
+        return Path(self.path).stem
+
+    def file(self) -> Path:
+        """Give the recipe's or mesh's file; raise `InputError` where there is none."""
+        return find(self.path, "meshes")
+
+
+Surface = Annotated[
+    PlaneSurface | SphereSurface | CylinderSurface | QuadricSurface | AnatomySurface, Field(discriminator="type")
+]
