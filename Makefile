@@ -4,12 +4,13 @@ VENV ?= .venv
 WORKERS ?= auto
 BIN := $(VENV)/bin
 
-.PHONY: help demo test test-all lint format clean
+.PHONY: help demo test test-all bench lint format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make test      fast tests (under 5 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
+	@echo "make bench     speeds, as ratios within one run"
 	@echo "make lint      ruff, mypy, import-linter"
 
 $(BIN)/python:
@@ -31,6 +32,9 @@ test: $(VENV)/.tests
 
 test-all: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+bench: $(VENV)/.installed
+	$(BIN)/python -m benchmarks
 
 lint: $(VENV)/.tests
 	$(BIN)/ruff check
