@@ -10,38 +10,42 @@ if TYPE_CHECKING:
     from simtest.api import LabelledFrame, render, validate
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
-    from simtest.geometry import Camera, Patch
+    from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask
     from simtest.reconstruction import Specularity, reconstruct
-    from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene
+    from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene, save_camera
 
 _HOMES = {
     "simtest.api": ("LabelledFrame", "render", "validate"),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
-    "simtest.geometry": ("Camera", "Patch"),
+    "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "ViewMask"),
     "simtest.reconstruction": ("Specularity", "reconstruct"),
-    "simtest.spec": ("Experiment", "Scene", "load_camera", "load_experiment", "load_scene"),
+    "simtest.spec": ("Experiment", "Scene", "load_camera", "load_experiment", "load_scene", "save_camera"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "BackendError",
+    "BrownConrady",
     "Camera",
     "Estimate",
     "Experiment",
     "Failure",
     "InputError",
+    "KannalaBrandt",
     "LabelledFrame",
     "Patch",
     "Reason",
     "Scene",
     "SimtestError",
     "Specularity",
+    "ViewMask",
     "load_camera",
     "load_experiment",
     "load_scene",
     "reconstruct",
     "render",
+    "save_camera",
     "validate",
 ]
 

@@ -13,11 +13,12 @@ import numpy.typing as npt
 
 from simtest import provenance
 from simtest.errors import Failure, InputError
+from simtest.estimators.base import drawable
 from simtest.files import make_folder, write_atomically, write_json
-from simtest.geometry import Camera
+from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction import DEFAULT_ESTIMATORS, Specularity, reconstruct
 from simtest.sensor import from_srgb
-from simtest.spec import load_camera
+from simtest.spec import describe_camera, load_camera
 
 MAX_PIXELS = 100_000_000
 
@@ -121,16 +122,11 @@ def reconstruct_picture(
         warnings.warn(cautions[-1], stacklevel=2)
     document = {
         "image": str(image),
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": camera.K.tolist(),
-            "pixel_centres": "integer + 0.5",
-        },
+        "camera": describe_camera(camera),
         "encoding": encoding,
         "warnings": cautions,
         "frame": "camera: x right, y down, z forward; normals are unit and face the camera",
-        "specularities": [describe(i, specularity) for i, specularity in enumerate(found)],
+        "specularities": [describe(i, specularity, camera) for i, specularity in enumerate(found)],
         "provenance": provenance.environment(),
     }
     return len(found), _write(out, document, picture, camera)
@@ -144,7 +140,7 @@ def _parse_roi(text: str) -> tuple[int, int, int, int]:
     return x, y, width, height
 
 
-def describe(index: int, specularity: Specularity) -> dict[str, Any]:
+def describe(index: int, specularity: Specularity, camera: Camera) -> dict[str, Any]:
     """Describe a specularity for normals.json: its region, and each estimator's result or reason of failure."""
     results: dict[str, Any] = {}
     for name, result in specularity.estimates.items():
@@ -161,7 +157,9 @@ def describe(index: int, specularity: Specularity) -> dict[str, Any]:
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "flags": list(result.flags),
             "isophotes": [{"t": i.isovalue, "points": np.round(i.points, 3).tolist()} for i in result.isophotes],
-            "ellipses": [isophote.conic.image.tolist() for isophote in result.isophotes],
+            "ellipses": [i.conic.image.tolist() for i in result.isophotes if i.conic is not None],
+            "cones": [isophote.cone.tolist() for isophote in result.isophotes],
+            "curves": [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
         }
     peak = None if isinstance(specularity.patch, Failure) else specularity.patch.peak_px.tolist()
     return {"id": index, "box_px": list(specularity.region.box), "peak_px": peak, "estimates": results}
@@ -206,12 +204,16 @@ def _write_csv(path: Path, document: dict[str, Any]) -> None:
 
 
 def _ply(document: dict[str, Any], camera: Camera) -> str:
-    """Give the proposed normals as oriented points at unit depth on the sightlines they look along (PLY, ASCII)."""
+    """Give the proposed normals as oriented points on the sightlines they look along (PLY, ASCII).
+
+    The points are at unit depth; through a fisheye, which sees sideways and backwards too, at unit distance.
+    """
+    fisheye = isinstance(camera.distortion, KannalaBrandt)
     lines, names = [], sorted({row["estimator"] for row in _rows(document)})
     for row in _rows(document):
         if row["status"] == "ok" and None not in row["look_px"]:
             ray = camera.unproject(row["look_px"])
-            values = [*(ray / ray[2]).tolist(), *row["normal"]]
+            values = [*(ray if fisheye else ray / ray[2]).tolist(), *row["normal"]]
             lines.append(
                 " ".join(f"{v:.9g}" for v in values) + f" {row['specularity']} {names.index(row['estimator'])}"
             )

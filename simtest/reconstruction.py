@@ -61,7 +61,7 @@ def reconstruct(
     smoothing_px : float
         Standard deviation of the Gaussian smoothing, px, in [0, 50].
     isolated : bool
-        Detect only specularities whose isophote at t = 0.5 closes inside the frame.
+        Detect only specularities whose isophote at t = 0.5 closes inside the frame and the camera's view mask.
 
     Returns
     -------
@@ -80,14 +80,15 @@ def reconstruct(
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
     roi = None if roi is None else _check_roi(roi)
     chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
-    smoothed = smooth(intensity, smoothing_px)
+    seen = camera.seen
+    smoothed = smooth(intensity, smoothing_px, seen)
     if roi is not None:
-        patch = Patch.cut(smoothed, roi)
+        patch = Patch.cut(smoothed, roi, seen=seen)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
-        regions = detect(smoothed, estimate_noise(intensity), isolated)
-        found = [(region, Patch.cut(smoothed, region.box, region.peak)) for region in regions]
+        regions = detect(smoothed, estimate_noise(intensity, seen), isolated, seen)
+        found = [(region, Patch.cut(smoothed, region.box, region.peak, seen=seen)) for region in regions]
     return [
         Specularity(region, patch, {name: run(estimator, patch, camera) for name, estimator in chosen.items()})
         for region, patch in found

@@ -16,7 +16,7 @@ from simtest.rendering import Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
 from simtest.seeds import from_integer
 from simtest.sensor import expose, to_uint8
-from simtest.spec import Scene
+from simtest.spec import Scene, camera_toml, describe_camera
 from simtest.validation.realise import view
 from simtest.validation.truth import JudgedHighlight
 
@@ -114,18 +114,10 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
         write_atomically(files[2], lambda part: np.savez_compressed(part, **_truth(frame)))
         write_json(files[3], _description(frame))
-        write_atomically(files[4], lambda part: part.write_text(_camera_file(frame.camera), encoding="utf-8"))
+        write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return files
-
-
-def _camera_file(camera: Camera) -> str:
-    """Give the calibration as `simtest reconstruct --camera` reads it."""
-    names = ("width", "height", "fx", "fy", "cx", "cy", "skew")
-    return "# Pinhole camera; pixel centres at integer + 0.5.\n" + "".join(
-        f"{name} = {getattr(camera, name)!r}\n" for name in names
-    )
 
 
 def _png(image: npt.NDArray[np.float32]) -> bytes:
@@ -169,15 +161,9 @@ FIELDS = {
 
 
 def _description(frame: LabelledFrame) -> dict[str, Any]:
-    camera = frame.camera
     return {
         "scene": frame.scene.model_dump(mode="json"),
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": camera.K.tolist(),
-            "pixel_centres": "integer + 0.5",
-        },
+        "camera": describe_camera(frame.camera),
         "full_scale": frame.full_scale,
         "highlights": [_highlight(judged) for judged in frame.highlights],
         "fields": FIELDS,

@@ -10,21 +10,28 @@ _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 MAD_TO_SIGMA = 1.4826
 
 
-def estimate_noise(frame: npt.ArrayLike) -> float:
+def estimate_noise(frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None) -> float:
     """Estimate the standard deviation of white noise, robust against edges and highlights.
 
     Parameters
     ----------
     frame : array_like, shape (H, W)
         Intensities before smoothing.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all. What lies outside is not the sensor's noise alone.
 
     Returns
     -------
     float
-        In the frame's units; 0 for frames under 3 x 3 px.
+        In the frame's units; 0 for frames, or views, under 3 x 3 px.
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if min(image.shape) < 3:
         return 0.0
     response = cv2.filter2D(image, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
+    if seen is not None:
+        whole = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
+        response = response[whole]
+        if not response.size:
+            return 0.0
     return float(MAD_TO_SIGMA * np.median(np.abs(response)) / 6.0)

@@ -26,6 +26,9 @@ NOISE_FREE_SHARE = 1e-3
 """Contrast that is asked for where the noise is 0, as a share of the frame's maximum."""
 
 
+_AROUND = np.ones((3, 3), dtype=bool)
+
+
 @dataclass(frozen=True)
 class Region:
     """A detected specularity.
@@ -56,7 +59,7 @@ class Component:
     x, y : int
         Column and row of the mask's first pixel in the frame.
     closed : bool
-        Whether they stay clear of the frame's border.
+        Whether they stay clear of the frame's border and of pixels outside the view mask.
     """
 
     mask: Mask
@@ -65,7 +68,7 @@ class Component:
     closed: bool
 
 
-def detect(smoothed: Image, noise: float, isolated: bool = True) -> list[Region]:
+def detect(smoothed: Image, noise: float, isolated: bool = True, seen: Mask | None = None) -> list[Region]:
     """Find the specularities of a frame.
 
     Parameters
@@ -75,7 +78,9 @@ def detect(smoothed: Image, noise: float, isolated: bool = True) -> list[Region]
     noise : float
         Standard deviation of the unsmoothed frame's noise, frame units.
     isolated : bool
-        Leave out those whose isophote at t = 0.5 reaches the frame's border.
+        Leave out those whose isophote at t = 0.5 reaches the frame's border, or that of the view.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
 
     Returns
     -------
@@ -84,6 +89,8 @@ def detect(smoothed: Image, noise: float, isolated: bool = True) -> list[Region]
         higher value in it, and which stands 10 noise standard deviations above its surroundings.
     """
     image = np.where(np.isfinite(smoothed), smoothed, 0).astype(np.float32)
+    if seen is not None:
+        image[~seen] = 0
     if min(image.shape) < 3 or image.max() <= 0:
         return []
     threshold = max(HIGHLIGHT_CONTRAST_SIGMA * noise, NOISE_FREE_SHARE * float(image.max()))
@@ -92,14 +99,14 @@ def detect(smoothed: Image, noise: float, isolated: bool = True) -> list[Region]
     for row, column in _local_maxima(image, threshold):
         if taken[row, column]:
             continue
-        found = half_height_component(image, row, column)
+        found = half_height_component(image, row, column, seen)
         if found is None:
             continue
         mask, x, y = found.mask, found.x, found.y
         taken[y : y + mask.shape[0], x : x + mask.shape[1]] |= mask
         if isolated and not found.closed:
             continue
-        height_above = contrast(image, found, float(image[row, column]))
+        height_above = contrast(image, found, float(image[row, column]), seen)
         if height_above >= threshold and np.count_nonzero(mask) >= MIN_AREA_PX:
             regions.append(Region(_expanded_box(found, image.shape), (column, row), height_above))
     return regions
@@ -113,7 +120,7 @@ def _local_maxima(image: Image, threshold: float) -> list[tuple[int, int]]:
     return [(int(rows[i]), int(columns[i])) for i in order]
 
 
-def half_height_component(image: Image, row: int, column: int) -> Component | None:
+def half_height_component(image: Image, row: int, column: int, seen: Mask | None = None) -> Component | None:
     """Give the connected pixels above half of a peak's value, or None where they hold a higher peak.
 
     Parameters
@@ -122,6 +129,8 @@ def half_height_component(image: Image, row: int, column: int) -> Component | No
         Smoothed intensities.
     row, column : int
         The peak's pixel.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
 
     Returns
     -------
@@ -141,11 +150,12 @@ def half_height_component(image: Image, row: int, column: int) -> Component | No
         edges = ((mask[0], y0 == 0), (mask[-1], y1 == rows), (mask[:, 0], x0 == 0), (mask[:, -1], x1 == columns))
         touched = [at_border for line, at_border in edges if line.any()]
         if all(touched):
-            return Component(mask, x0, y0, closed=not touched)
+            cut = seen is not None and bool((ndimage.binary_dilation(mask, _AROUND) & ~seen[y0:y1, x0:x1]).any())
+            return Component(mask, x0, y0, closed=not touched and not cut)
         half *= 2
 
 
-def contrast(image: Image, component: Component, peak: float) -> float:
+def contrast(image: Image, component: Component, peak: float, seen: Mask | None = None) -> float:
     """Give a peak's height above the median of its surroundings: the region of interest outside the component.
 
     Parameters
@@ -156,6 +166,8 @@ def contrast(image: Image, component: Component, peak: float) -> float:
         The highlight at half height.
     peak : float
         The peak's value.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
 
     Returns
     -------
@@ -166,8 +178,11 @@ def contrast(image: Image, component: Component, peak: float) -> float:
     inside = np.zeros((height, width), dtype=bool)
     rows, columns = np.nonzero(component.mask)
     inside[rows + component.y - top, columns + component.x - left] = True
+    if seen is not None:
+        inside |= ~seen[top : top + height, left : left + width]
     around = image[top : top + height, left : left + width][~inside]
-    return peak - float(np.median(around) if around.size else image.min())
+    least = image.min() if seen is None else image.min(where=seen, initial=np.inf)
+    return peak - float(np.median(around) if around.size else least)
 
 
 def _expanded_box(component: Component, shape: tuple[int, ...]) -> tuple[int, int, int, int]:

@@ -6,14 +6,13 @@ from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators.base import Estimate, fit_isophote
 from simtest.geometry import Camera, Patch
-from simtest.geometry import circle_pose as pose_of_cone
 
 
 def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOVALUE) -> Estimate | Failure:
     """Reconstruct the normal of a plane from one isophote taken as the image of a circle.
 
     The article leaves the choice between N+ and N- to a person. Both make the same angle with the cone's axis, so
-    the one is proposed whose projected circle centre, K C'^-1 N, is nearer to the sub-pixel peak.
+    the one is proposed whose projected circle centre (along C'^-1 N) is nearer to the sub-pixel peak.
 
     Parameters
     ----------
@@ -32,7 +31,7 @@ def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOV
     fitted = fit_isophote(patch, camera, isovalue)
     if isinstance(fitted, Failure):
         return fitted
-    pose = pose_of_cone(fitted.cone)
+    pose = fitted.pose()
     if isinstance(pose, Failure):
         return pose
     looks = camera.project(pose.centres)

@@ -7,7 +7,7 @@ import numpy as np
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
 from simtest.estimators.base import Estimate, fit_isophotes
-from simtest.geometry import Camera, Patch, circle_pose
+from simtest.geometry import Camera, Patch
 
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
@@ -34,7 +34,7 @@ def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AX
     fitted, failures = fit_isophotes(patch, camera, isovalues)
     poses = []
     for isophote in fitted:
-        pose = circle_pose(isophote.cone)
+        pose = isophote.pose()
         if isinstance(pose, Failure):
             failures.append(pose)
         else:

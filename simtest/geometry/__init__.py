@@ -1,20 +1,27 @@
 """NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
 
-from simtest.geometry.camera import Camera
+from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.circle_pose import CirclePose, circle_pose, cone_axes
-from simtest.geometry.conics import Ellipse, backproject_conic, ellipse_of_conic
+from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
+from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse
 from simtest.geometry.isophotes import Patch, smooth
 
 __all__ = [
+    "BrownConrady",
     "Camera",
     "CirclePose",
+    "Distortion",
     "Ellipse",
     "FittedConic",
+    "KannalaBrandt",
     "Patch",
+    "ViewMask",
     "backproject_conic",
     "circle_pose",
     "cone_axes",
+    "cone_of_conic",
+    "cone_rays",
     "ellipse_of_conic",
     "fit_ellipse",
     "smooth",

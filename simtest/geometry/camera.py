@@ -1,4 +1,4 @@
-"""The pinhole camera: pixels to unit sightlines and back, pixel centres at integer + 0.5."""
+"""The camera: pixels to unit sightlines and back, pixel centres at integer + 0.5."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,13 +8,56 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
+from simtest.geometry.distortion import Distortion
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+FOLD_GRID = 33
+"""Points along each side of the image at which a lens is tried for a fold."""
+
+FOLD_CIRCLE = 256
+"""The same around a view mask."""
+
+
+@dataclass(frozen=True)
+class ViewMask:
+    """The round field of view of an endoscope: pixels whose centres lie outside see nothing.
+
+    Parameters
+    ----------
+    cx, cy : float
+        Centre, px, pixel centres at integer + 0.5.
+    radius : float
+        px; positive.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or the radius is not positive.
+    """
+
+    cx: float
+    cy: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        for name in ("cx", "cy", "radius"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+                raise InputError(f"view_mask.{name} = {value!r}: must be a finite number")
+        if self.radius <= 0:
+            raise InputError(f"view_mask.radius = {self.radius!r}: must be > 0")
+
+    def contains(self, points_px: npt.ArrayLike) -> Mask:
+        """Tell which pixel positions, shape (..., 2), lie inside the circle."""
+        points = np.asarray(points_px, dtype=float)
+        return np.asarray(np.hypot(points[..., 0] - self.cx, points[..., 1] - self.cy) <= self.radius)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in the OpenCV frame (x right, y down, z forward).
+    """A camera in the OpenCV frame (x right, y down, z forward): a pinhole, or a lens with distortion.
 
     Parameters
     ----------
@@ -26,11 +69,16 @@ class Camera:
         Principal point, px, pixel centres at integer + 0.5.
     skew : float
         Skew, px.
+    distortion : BrownConrady or KannalaBrandt, optional
+        The lens between sightlines and normalised image coordinates; default none.
+    view_mask : ViewMask, optional
+        What of the image is seen; default all of it.
 
     Raises
     ------
     InputError
-        If the size is not positive, a number is not finite, or K is singular.
+        If the size is not positive, a number is not finite, K is singular, the view mask covers no pixel, or the lens
+        folds over inside the image (inside the view mask, where there is one).
     """
 
     width: int
@@ -40,8 +88,17 @@ class Camera:
     cx: float
     cy: float
     skew: float = 0.0
+    distortion: Distortion | None = None
+    view_mask: ViewMask | None = None
 
     def __post_init__(self) -> None:
+        self._check_numbers()
+        if self.view_mask is not None and not self.view_mask.contains(self.pixel_centres()).any():
+            raise InputError(f"camera.view_mask = {self.view_mask}: must cover a pixel of the image")
+        if self.distortion is not None:
+            self._check_fold(self.distortion)
+
+    def _check_numbers(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
@@ -53,6 +110,27 @@ class Camera:
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be > 0, else K is singular")
+
+    def _check_fold(self, distortion: Distortion) -> None:
+        """Raise `InputError` where a pixel that should be seen has no sightline on the lens's first branch."""
+        x, y = (np.linspace(0.0, size, FOLD_GRID) for size in (self.width, self.height))
+        tried = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        if self.view_mask is not None:
+            phase = np.linspace(0, 2 * np.pi, FOLD_CIRCLE)
+            centre, radius = [self.view_mask.cx, self.view_mask.cy], self.view_mask.radius
+            circle = centre + radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            tried = np.concatenate([tried[self.view_mask.contains(tried)], circle])
+            tried = tried[(tried >= 0).all(axis=1) & (tried <= [self.width, self.height]).all(axis=1)]
+        folded = tried[np.isnan(self.unproject(tried)).any(axis=1)]
+        if len(folded):
+            gaps = np.hypot(*(folded - [self.cx, self.cy]).T)
+            place = folded[int(gaps.argmin())]
+            within = "image" if self.view_mask is None else "view mask"
+            raise InputError(
+                f"camera.distortion: the lens folds over at {np.degrees(distortion.limit_angle):.4g} deg off its axis, "
+                f"by pixel ({place[0]:.0f}, {place[1]:.0f}), {gaps.min():.0f} px from the principal point; must stay "
+                f"monotone over the {within}: other coefficients, or a smaller view_mask.radius"
+            )
 
     @classmethod
     def from_matrix(cls, matrix: npt.ArrayLike, width: int, height: int) -> "Camera":
@@ -101,7 +179,7 @@ class Camera:
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
-        """Give the unit sightlines of pixels.
+        """Give the unit sightlines of pixels, inside the image and outside.
 
         Parameters
         ----------
@@ -111,16 +189,21 @@ class Camera:
         Returns
         -------
         ndarray, shape (..., 3)
-            Unit vectors in the camera frame.
+            Unit vectors in the camera frame; NaN where the lens sees no direction.
         """
         points = np.asarray(points_px, dtype=float)
         y = (points[..., 1] - self.cy) / self.fy
         x = (points[..., 0] - self.cx - self.skew * y) / self.fx
+        if self.distortion is not None:
+            return self.distortion.undistort(np.stack([x, y], axis=-1))
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """Give the pixels of points or directions in front of the camera.
+        """Give the pixels of points or directions that the lens images.
+
+        Like `unproject` it speaks of the lens alone and goes on outside the image and the view mask; `contains` tells
+        what is in view.
 
         Parameters
         ----------
@@ -130,11 +213,15 @@ class Camera:
         Returns
         -------
         ndarray, shape (..., 2)
-            Pixel positions (x, y); NaN where z <= 0.
+            Pixel positions (x, y); NaN where the lens images nothing: z <= 0 (but for a fisheye, which sees sideways
+            and backwards), and where the lens folds over.
         """
         P = np.asarray(points, dtype=float)
-        z = np.where(P[..., 2] > 0, P[..., 2], np.nan)
-        x, y = P[..., 0] / z, P[..., 1] / z
+        if self.distortion is not None:
+            x, y = np.moveaxis(self.distortion.distort(P), -1, 0)
+        else:
+            z = np.where(P[..., 2] > 0, P[..., 2], np.nan)
+            x, y = P[..., 0] / z, P[..., 1] / z
         return np.stack([self.fx * x + self.skew * y + self.cx, self.fy * y + self.cy], axis=-1)
 
     def pixel_centres(self) -> Array:
@@ -143,8 +230,13 @@ class Camera:
         y = np.arange(self.height) + PIXEL_CENTRE
         return np.stack(np.meshgrid(x, y), axis=-1)
 
-    def contains(self, points_px: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which pixel positions, shape (..., 2), lie inside the image."""
+    @cached_property
+    def seen(self) -> Mask | None:
+        """Pixels whose centres lie inside the view mask, shape (height, width); None where there is no mask."""
+        return None if self.view_mask is None else self.view_mask.contains(self.pixel_centres())
+
+    def contains(self, points_px: npt.ArrayLike) -> Mask:
+        """Tell which pixel positions, shape (..., 2), lie inside the image and the view mask."""
         points = np.asarray(points_px, dtype=float)
-        inside = (points >= 0) & (points <= [self.width, self.height])
-        return np.asarray(inside.all(axis=-1))
+        inside = ((points >= 0) & (points <= [self.width, self.height])).all(axis=-1)
+        return np.asarray(inside if self.view_mask is None else inside & self.view_mask.contains(points))

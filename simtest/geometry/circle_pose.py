@@ -32,20 +32,26 @@ class CirclePose:
     centres: Array
 
 
-def cone_axes(cones: npt.ArrayLike) -> tuple[Array, Array]:
+FORWARD = (0.0, 0.0, 1.0)
+
+
+def cone_axes(cones: npt.ArrayLike, sightline: npt.ArrayLike = FORWARD) -> tuple[Array, Array]:
     """Give eigenvalues and eigenvectors of cones in the order of circle pose: l1 >= l2 > 0 > l3.
 
     Parameters
     ----------
     cones : array_like, shape (..., 3, 3)
         Symmetric matrices of signature (2, 1) or (1, 2).
+    sightline : array_like, shape (3,) or (..., 3)
+        Any direction on the side of the cone that is meant; default forward. A fisheye also sees cones whose axis
+        points backwards.
 
     Returns
     -------
     values : ndarray, shape (..., 3)
         l1, l2, l3; the sign of each matrix is chosen so that det C' < 0.
     vectors : ndarray, shape (..., 3, 3)
-        Columns e1, e2, e3, right-handed, e3 with e3_z > 0 (the cone's axis, pointing into the scene).
+        Columns e1, e2, e3, right-handed, e3 on the sightline's side (the cone's axis, pointing into the scene).
     """
     C = np.asarray(cones, dtype=float)
     values, vectors = np.linalg.eigh(C)
@@ -53,13 +59,14 @@ def cone_axes(cones: npt.ArrayLike) -> tuple[Array, Array]:
     flipped = values[..., 1] < 0
     values = np.where(flipped[..., None], -values, values[..., ::-1])
     vectors = np.where(flipped[..., None, None], vectors, vectors[..., ::-1])
-    vectors = np.where(vectors[..., 2:3, 2:3] < 0, -vectors, vectors)
+    side = np.sum(vectors[..., 2] * np.asarray(sightline, dtype=float), axis=-1)
+    vectors = np.where(side[..., None, None] < 0, -vectors, vectors)
     hand = np.sign(np.linalg.det(vectors))[..., None]
     vectors = np.concatenate([vectors[..., :1] * hand[..., None], vectors[..., 1:]], axis=-1)
     return values, vectors
 
 
-def circle_pose(cone: npt.ArrayLike) -> CirclePose | Failure:
+def circle_pose(cone: npt.ArrayLike, sightline: npt.ArrayLike = FORWARD) -> CirclePose | Failure:
     """Give the two normals of a circle seen as a conic [MB, section 2.3; F91].
 
     g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence
@@ -69,6 +76,8 @@ def circle_pose(cone: npt.ArrayLike) -> CirclePose | Failure:
     ----------
     cone : array_like, shape (3, 3)
         C' = K^T C K, any scale and sign.
+    sightline : array_like, shape (3,)
+        Any direction on the side of the cone that is meant; default forward.
 
     Returns
     -------
@@ -78,7 +87,7 @@ def circle_pose(cone: npt.ArrayLike) -> CirclePose | Failure:
     C = np.asarray(cone, dtype=float)
     if not np.isfinite(C).all():
         return Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
-    (l1, l2, l3), vectors = cone_axes(C)
+    (l1, l2, l3), vectors = cone_axes(C, sightline)
     if not (l1 >= l2 > 0 > l3):
         return Failure(Reason.DEGENERATE_CONIC, f"eigenvalues {l1:.3g}, {l2:.3g}, {l3:.3g} are not those of a cone")
     e1, _, e3 = vectors.T

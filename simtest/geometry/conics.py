@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
+from simtest.geometry.circle_pose import cone_axes
 from simtest.geometry.ellipse_fit import FittedConic
 
 Array = npt.NDArray[np.float64]
@@ -29,10 +30,50 @@ def backproject_conic(conic: FittedConic, camera: Camera) -> Array:
     ndarray, shape (3, 3)
         Symmetric; w^T C' w = 0 for the sightlines w of the ellipse's pixels. Scaled to unit norm.
     """
-    H = conic.normalised_from_image @ camera.K
+    return cone_of_conic(conic, camera.K)
+
+
+def cone_of_conic(conic: FittedConic, plane_from_camera: Array) -> Array:
+    """Give the cone of directions through an ellipse of a plane: C' = A^T C A.
+
+    Parameters
+    ----------
+    conic : FittedConic
+        In the plane's coordinates.
+    plane_from_camera : ndarray, shape (3, 3)
+        A, from the camera frame to the plane's homogeneous coordinates: K for pixels, a rotation for a gnomonic plane.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+        Symmetric, camera frame, scaled to unit norm.
+    """
+    H = conic.normalised_from_image @ plane_from_camera
     cone = H.T @ conic.normalised @ H
     cone = (cone + cone.T) / 2
     return np.asarray(cone / np.linalg.norm(cone))
+
+
+def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike = (0.0, 0.0, 1.0), count: int = 73) -> Array:
+    """Give directions along the cone of an ellipse, to draw it through any lens.
+
+    Parameters
+    ----------
+    cone : array_like, shape (3, 3)
+        C', camera frame.
+    sightline : array_like, shape (3,)
+        Any direction on the side of the cone that is meant.
+    count : int
+        Number of directions; the first is repeated at the end.
+
+    Returns
+    -------
+    ndarray, shape (count, 3)
+    """
+    (l1, l2, l3), vectors = cone_axes(cone, sightline)
+    phase = np.linspace(0, 2 * np.pi, count)
+    across = [np.cos(phase) / np.sqrt(l1), np.sin(phase) / np.sqrt(l2), np.full(count, 1 / np.sqrt(-l3))]
+    return np.asarray((vectors @ np.stack(across)).T)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from simtest.errors import Failure, InputError, Reason
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 
-def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
+def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
     """Smooth a frame with a Gaussian.
 
     Parameters
@@ -23,12 +24,24 @@ def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
         Intensities.
     sigma_px : float
         Standard deviation, px; 0 leaves the frame as it is.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside a camera's view mask. Each smoothed value is then the weighted mean of those alone, so that
+        the dark around them does not draw the values at the mask's border down; the others are 0.
 
     Returns
     -------
     ndarray of float32, shape (H, W)
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
+    if seen is None:
+        return _blurred(image, sigma_px)
+    weights = _blurred(seen.astype(np.float32), sigma_px)
+    return np.asarray(
+        np.divide(_blurred(np.where(seen, image, 0), sigma_px), weights, where=seen, out=np.zeros_like(image))
+    )
+
+
+def _blurred(image: Image, sigma_px: float) -> Image:
     if sigma_px <= 0:
         return image
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
@@ -48,12 +61,15 @@ class Patch:
         Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
     peak_value : float
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    seen : ndarray of bool, shape (h, w), optional
+        The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
     """
 
     values: Image | Array
     origin_px: tuple[int, int]
     peak_px: Array
     peak_value: float
+    seen: Mask | None = None
     _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -63,6 +79,7 @@ class Patch:
         box: tuple[int, int, int, int],
         peak: tuple[int, int] | None = None,
         origin_px: tuple[int, int] = (0, 0),
+        seen: Mask | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -76,6 +93,8 @@ class Patch:
             Column and row of the peak's pixel; default the brightest of the region.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        seen : ndarray of bool, shape (H, W), optional
+            The frame's pixels inside the camera's view mask; default all.
 
         Returns
         -------
@@ -99,11 +118,13 @@ class Patch:
         else:
             column, row = peak[0] - x, peak[1] - y
         value = float(values[row, column])
-        if value <= 0 or value <= float(values.min()):
-            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
+        seen = None if seen is None else seen[y : y + height, x : x + width]
+        least = float(values.min() if seen is None else values.min(where=seen, initial=np.inf))
+        if value <= 0 or value <= least:
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {least:g}")
         corner = (x + origin_px[0], y + origin_px[1])
         peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
-        return cls(values, corner, peak_px, value)
+        return cls(values, corner, peak_px, value, seen)
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
@@ -133,7 +154,7 @@ class Patch:
         if min(self.values.shape) < 3:
             return Failure(Reason.NO_CLOSED_ISOPHOTE, f"region of {self.values.shape[1]} x {self.values.shape[0]} px")
         best, best_area = None, 0.0
-        for contour in find_contours(self.values, isovalue * self.peak_value):
+        for contour in find_contours(self.values, isovalue * self.peak_value, mask=self.seen):
             points = contour[:, ::-1] + PIXEL_CENTRE + self.origin_px
             if len(points) < 4 or not np.array_equal(points[0], points[-1]):
                 continue

@@ -1,12 +1,20 @@
 """What a session gives: radiance, ground-truth maps and the true highlights."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 FloatImage = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
+
+
+def scattered(values: npt.NDArray[Any], where: npt.NDArray[np.bool_], fill: float) -> npt.NDArray[Any]:
+    """Put values, shape (M, ...), at the M places marked in `where`, shape (N,), and `fill` at the others."""
+    whole = np.full((len(where), *values.shape[1:]), fill, dtype=values.dtype)
+    whole[where] = values
+    return whole
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simtest.geometry.camera import Camera
-from simtest.rendering.frames import Array, Radiance
+from simtest.rendering.frames import Array, Radiance, scattered
 
 Rays = Callable[[Array], tuple[Array, Array]]
 
@@ -53,7 +53,7 @@ class Tracer:
         Parameters
         ----------
         origins, directions : ndarray, shape (N, 3)
-            Model frame, mm; unit directions.
+            Model frame, mm; unit directions, NaN where there is no ray: no radiance comes from there.
         path_depth : int
             2: direct light alone; more: up to path_depth - 1 bounces.
         seed : int
@@ -67,6 +67,14 @@ class Tracer:
         import drjit as dr
 
         mi = self.mi
+        rays = np.asarray(np.isfinite(directions).all(axis=1))
+        if not rays.any():
+            # Dr.Jit ends the process on a kernel without rays.
+            nothing = np.zeros((len(rays), dr.size_v(mi.Spectrum)))
+            return nothing, nothing, nothing
+        if not rays.all():
+            specular, diffuse, indirect = self.trace(origins[rays], directions[rays], path_depth, seed)
+            return scattered(specular, rays, 0), scattered(diffuse, rays, 0), scattered(indirect, rays, 0)
         ray = mi.Ray3f(
             mi.Point3f(np.ascontiguousarray(origins.T, dtype=np.float32)),
             mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)),

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
-from simtest.geometry.camera import Camera
 from simtest.rendering import backend, highlights, integrate, phong
-from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps
+from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps, scattered
 from simtest.rendering.materials import bsdf_dict, parameter_updates
 from simtest.rendering.shapes import make_shape
 from simtest.spec.scene import Scene
@@ -64,6 +63,7 @@ class Session:
         self.rebuilds = 0
         self._built: _Built | None = None
         self._truth: TruthMaps | None = None
+        self._camera_spec, self.camera = scene.camera, scene.camera.model()
         self._load_surface(scene)
         self.update(scene)
 
@@ -79,8 +79,9 @@ class Session:
             self._load_surface(scene)
         elif scene.camera != self.scene.camera:
             self._truth = None  # of another camera
+        if self._camera_spec != scene.camera:
+            self._camera_spec, self.camera = scene.camera, scene.camera.model()
         self.scene: Scene = scene
-        self.camera: Camera = scene.camera.model()
         updates = parameter_updates(scene.reflectance)
         fixed = (
             scene.reflectance
@@ -143,10 +144,16 @@ class Session:
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     def _rays(self, points_px: Array) -> tuple[Array, Array]:
-        """Give the rays of pixels, shape (N, 2), in the model frame, unit directions."""
+        """Give the rays of pixels, shape (N, 2), in the model frame, unit directions; NaN where the lens has none."""
         pose = self.surface.model_from_camera
         directions = self.camera.unproject(points_px) @ pose[:3, :3].T
         return np.broadcast_to(pose[:3, 3], directions.shape), directions
+
+    def _rays_in_view(self, points_px: Array) -> tuple[Array, Array]:
+        """Give the rays of pixels as `_rays` does; NaN outside the camera's view mask too."""
+        origins, directions = self._rays(points_px)
+        mask = self.camera.view_mask
+        return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
 
     # Radiance ----------------------------------------------------------------------------------------------------
 
@@ -166,13 +173,13 @@ class Session:
         tracer = integrate.Tracer(self.mi, self._built.scene, self._built.diffuse_bsdf, lights, powers, shadows)
         effort = self.scene.render
         return integrate.render(
-            tracer, self._rays, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed
+            tracer, self._rays_in_view, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed
         )
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixels onto the exact surface.
+        """Cast rays through pixels onto the exact surface, outside the image and the view mask too.
 
         Parameters
         ----------
@@ -186,8 +193,10 @@ class Session:
         shading_normal, geometric_normal : ndarray, shape (N, 3)
             Normals of the rendered shape, camera frame; NaN where the ray misses.
         """
-        assert self._built is not None
-        origins, directions = self._rays(points_px)
+        return self._cast(*self._rays(points_px))
+
+    def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
+        """Cast rays of the model frame (see `cast`); a direction of NaN hits nothing."""
         hits, shading, geometric = self._hits(origins, directions)
         exact = self.surface.points(np.asarray(origins), directions, hits)
         rotation = self.surface.model_from_camera[:3, :3]
@@ -210,6 +219,15 @@ class Session:
             # Dr.Jit ends the process on a kernel without rays.
             none = np.empty((0, 3))
             return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
+        rays = np.asarray(np.isfinite(directions).all(axis=1))
+        if not rays.all():
+            # Rays that do not exist must not reach the tracer.
+            traced, *normals_ = self._hits(origins[rays], directions[rays])
+            hits = RayHits(
+                scattered(traced.distance, rays, np.inf), scattered(traced.face, rays, 0),
+                scattered(traced.barycentric, rays, 0.0),
+            )  # fmt: skip
+            return hits, scattered(normals_[0], rays, np.nan), scattered(normals_[1], rays, np.nan)
         mi = self.mi
         ray = mi.Ray3f(_point(mi, origins), mi.Vector3f(_point(mi, directions)))
         preliminary = self._built.scene.ray_intersect_preliminary(ray)
@@ -248,7 +266,7 @@ class Session:
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]
         size = centres.shape[:2]
-        points, shading, geometric = self.cast(centres.reshape(-1, 2))
+        points, shading, geometric = self._cast(*self._rays_in_view(centres.reshape(-1, 2)))
         return TruthMaps(
             depth=points.distance.reshape(size),
             position=points.position.reshape(*size, 3),

@@ -69,37 +69,6 @@ def anchor(item: GalleryItem, estimate: Mapping[str, Any]) -> Array | None:
     return vector(item.position[row, column], 3)
 
 
-def conic_points(conic: Any, count: int = 73) -> Array | None:
-    """Sample an ellipse.
-
-    Parameters
-    ----------
-    conic : array_like, shape (3, 3)
-        Symmetric matrix C of the curve p^T C p = 0, px.
-    count : int
-        Number of points; the first is repeated at the end.
-
-    Returns
-    -------
-    ndarray, shape (count, 2), or None
-        None where the conic is no real ellipse.
-    """
-    try:
-        C = np.asarray(conic, dtype=float)
-    except (TypeError, ValueError):
-        return None
-    if C.shape != (3, 3) or not np.isfinite(C).all() or np.linalg.det(C[:2, :2]) <= 0:
-        return None
-    centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
-    level = -(C[2, 2] + C[:2, 2] @ centre)
-    values, vectors = np.linalg.eigh(C[:2, :2])
-    if level == 0 or np.any(level / values <= 0):
-        return None
-    angle = np.linspace(0, 2 * np.pi, count)
-    circle = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(level / values)[:, None]
-    return np.asarray((vectors @ circle).T + centre)
-
-
 def draw_item(item: GalleryItem, colours: Mapping[str, str]) -> "Figure":
     """Draw one frame and, below it, the neighbourhood of its main highlight.
 
@@ -163,9 +132,9 @@ def _draw_overlay(ax: "Axes", item: GalleryItem, colours: Mapping[str, str], det
             if key not in drawn and isophote.get("t") is not None:
                 drawn.add(key)
                 _closed(ax, isophote.get("points"), isophote_colour(float(isophote["t"])), 1.6 if detailed else 0.8)
-        for conic in (estimate.get("ellipses") or []) if detailed else []:
-            points = conic_points(conic)
-            if points is not None:
+        for curve in (estimate.get("curves") or []) if detailed else []:
+            points = np.asarray(curve, dtype=float)
+            if points.ndim == 2 and points.shape[1] == 2:
                 ax.plot(points[:, 0], points[:, 1], "--", color=colour, lw=1.1, dashes=(4, 3))
     for truth in item.truth:
         point, normal = vector(truth.get("position"), 3), vector(truth.get("normal"), 3)

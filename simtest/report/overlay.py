@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry import Camera, ellipse_of_conic
+from simtest.geometry import Camera
 from simtest.report import static
 from simtest.report.style import colours
 
@@ -55,8 +55,8 @@ def draw_overlay(path: Path, picture: npt.NDArray[np.float32], camera: Camera, s
 
 def _draw_result(ax: Any, result: dict[str, Any], colour: str, reach: float) -> None:
     """Draw the ellipses of one estimate, and each candidate normal by its part across the view."""
-    for conic in result["ellipses"]:
-        ax.plot(*ellipse_of_conic(conic).points().T, color=colour, lw=0.8)
+    for curve in result["curves"]:
+        ax.plot(*np.array(curve).reshape(-1, 2).T, color=colour, lw=0.8)
     if None in result["look_px"]:
         return
     x, y = result["look_px"]

@@ -13,6 +13,7 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.spec.camera import CameraSpec
 
 MAX_GALLERY = 24
 """Gallery items that a page shows; of a longer gallery, evenly spaced ones."""
@@ -201,7 +202,7 @@ def _read_item(path: Path) -> GalleryItem:
         with np.load(path, allow_pickle=False) as data:
             meta = json.loads(str(data["meta"][()]))
             frame, position, normal = (np.asarray(data[k], np.float32) for k in ("frame", "position", "normal"))
-        camera = Camera(**meta["camera"])
+        camera = CameraSpec(**meta["camera"]).model()
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
     return GalleryItem(path.stem, frame, position, normal, camera, meta)

@@ -1,6 +1,6 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema."""
 
-from simtest.spec.camera import CameraSpec, load_camera
+from simtest.spec.camera import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
 from simtest.spec.rig import LightSpec
@@ -28,10 +28,14 @@ __all__ = [
     "Surface",
     "Uniform",
     "apply_settings",
+    "camera_table",
+    "camera_toml",
+    "describe_camera",
     "load_camera",
     "load_experiment",
     "load_scene",
     "parse_settings",
     "read_toml",
+    "save_camera",
     "scene_from_dict",
 ]

@@ -77,21 +77,44 @@ def read_toml(path: Path) -> dict[str, Any]:
     InputError
         If the file is missing, too large, not UTF-8 or not TOML.
     """
+    try:
+        return _loads(read_text(path, "TOML"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{shown(path)}: not valid TOML: {error}") from error
+
+
+def read_text(path: Path, kind: str) -> str:
+    """Read a text file of moderate size.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        What it should be, for messages: "TOML", "camera".
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        If the file is missing, too large or not UTF-8.
+    """
     name = shown(path)
     try:
         size = path.stat().st_size
         # A device or a pipe has no size and might never end.
         if not path.is_file():
-            raise InputError(f"{name}: is {'a folder' if path.is_dir() else 'no plain file'}; a TOML file is needed")
+            raise InputError(f"{name}: is {'a folder' if path.is_dir() else 'no plain file'}; a {kind} file is needed")
         if size > MAX_TOML_BYTES:
-            raise InputError(f"{name}: {size} bytes; a TOML file of at most {MAX_TOML_BYTES} is allowed")
-        return _loads(path.read_text(encoding="utf-8"))
+            raise InputError(f"{name}: {size} bytes; a {kind} file of at most {MAX_TOML_BYTES} is allowed")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{name}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: not a text file in UTF-8 (byte {error.start})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name}: not valid TOML: {error}") from error
 
 
 def _loads(text: str) -> dict[str, Any]:
@@ -306,6 +329,10 @@ def _node(location: tuple[Any, ...], model: type[BaseModel]) -> Any:
 def _resolve(node: Any, schema: Any) -> Any:
     while isinstance(node, dict) and "$ref" in node:
         node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
+    if isinstance(node, dict) and "anyOf" in node:
+        # An optional table: the other choice is null.
+        tables = [choice for choice in node["anyOf"] if choice.get("type") != "null"]
+        return _resolve(tables[0], schema) if len(tables) == 1 else {}
     return node if isinstance(node, dict) else {}
 
 

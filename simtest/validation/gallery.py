@@ -9,8 +9,11 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.estimators.base import drawable
 from simtest.files import write_atomically
+from simtest.geometry import Camera
 from simtest.rendering import Session
+from simtest.spec import camera_table
 from simtest.validation.cases import Case
 from simtest.validation.metrics import angle_deg
 from simtest.validation.realise import Realisation, View
@@ -48,9 +51,9 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "label": case.label,
         "sigma": seen.scene.sensor.noise_sigma,
         "command": command,
-        "camera": {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "skew")},
+        "camera": camera_table(camera),
         "truth": [_truth(j, judged) for j, judged in enumerate(made.truths)],
-        "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made)],
+        "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made, camera)],
     }
 
     def write(part: Path) -> None:
@@ -78,7 +81,7 @@ def _truth(j: int, judged: Any) -> dict[str, Any]:
     }
 
 
-def _estimates(i: int, made: Realisation) -> list[dict[str, Any]]:
+def _estimates(i: int, made: Realisation, camera: Camera) -> list[dict[str, Any]]:
     specularity = made.specularities[i]
     true_id = made.matched.get(i)
     peak = [v + PIXEL_CENTRE for v in specularity.region.peak]
@@ -88,18 +91,18 @@ def _estimates(i: int, made: Realisation) -> list[dict[str, Any]]:
     for name, result in specularity.estimates.items():
         entry: dict[str, Any] = {
             "specularity": i, "true_id": true_id, "estimator": name, "bp_px": peak, "error_deg": None, "normal": None,
-            "candidates": [], "look_px": None, "isophotes": [], "ellipses": [],
+            "candidates": [], "look_px": None, "isophotes": [], "curves": [],
         }  # fmt: skip
         if isinstance(result, Failure):
             entries.append(entry | {"status": str(result.reason)})
             continue
-        entries.append(entry | {"status": "ok"} | _drawn(result))
+        entries.append(entry | {"status": "ok"} | _drawn(result, camera))
         if true_id is not None:
             entries[-1]["error_deg"] = float(angle_deg(result.normal, made.truths[true_id].highlight.normal))
     return entries
 
 
-def _drawn(estimate: Estimate) -> dict[str, Any]:
+def _drawn(estimate: Estimate, camera: Camera) -> dict[str, Any]:
     isophotes = []
     for isophote in estimate.isophotes:
         step = max(1, len(isophote.points) // CONTOUR_POINTS)
@@ -109,5 +112,5 @@ def _drawn(estimate: Estimate) -> dict[str, Any]:
         "candidates": estimate.candidates.tolist(),
         "look_px": estimate.look_px.tolist() if np.isfinite(estimate.look_px).all() else None,
         "isophotes": isophotes,
-        "ellipses": [isophote.conic.image.tolist() for isophote in estimate.isophotes],
+        "curves": [drawable(isophote.ellipse_px(camera)) for isophote in estimate.isophotes],
     }

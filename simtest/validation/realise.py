@@ -82,14 +82,14 @@ def view(session: Session, scene: Scene) -> View:
     session.update(scene)
     radiance = session.radiance()
     total = radiance.intensity
-    peak = float(total.max())
+    peak, seen = float(total.max()), session.camera.seen
     highlights = session.highlights(radiance)
     # Exposure is set on the brightest isolated highlight, which is judged without noise first.
-    isolated = [judged.highlight.radiance for judged in judge(highlights, total, 0.0, peak) if judged.isolated]
+    isolated = [judged.highlight.radiance for judged in judge(highlights, total, 0.0, peak, seen) if judged.isolated]
     full_scale = max(isolated, default=peak)
     # Noise is independent in each channel; estimators see the channels' mean.
     sigma = scene.sensor.noise_sigma / np.sqrt(radiance.channels)
-    return View(scene, radiance, judge(highlights, total, float(sigma), full_scale), full_scale)
+    return View(scene, radiance, judge(highlights, total, float(sigma), full_scale, seen), full_scale)
 
 
 def realise(

@@ -41,7 +41,11 @@ class JudgedHighlight:
 
 
 def judge(
-    highlights: list[TrueHighlight], radiance: Image, noise_sigma: float, full_scale: float
+    highlights: list[TrueHighlight],
+    radiance: Image,
+    noise_sigma: float,
+    full_scale: float,
+    seen: npt.NDArray[np.bool_] | None = None,
 ) -> list[JudgedHighlight]:
     """Judge each true highlight by the noise-free frame.
 
@@ -55,17 +59,22 @@ def judge(
         Share of full scale.
     full_scale : float
         Radiance at full scale.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
 
     Returns
     -------
     list of JudgedHighlight
         In the same order.
     """
-    smoothed = smooth(radiance, DEFAULT_SMOOTHING_PX)
+    smoothed = smooth(radiance, DEFAULT_SMOOTHING_PX, seen)
     peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
     owners = _owners(highlights, peaks)
     noise = noise_sigma * full_scale
-    return [_judge(h, smoothed, peak, owners.get(peak) is h, noise) for h, peak in zip(highlights, peaks, strict=True)]
+    return [
+        _judge(highlight, (smoothed, seen), peak, owners.get(peak) is highlight, noise)
+        for highlight, peak in zip(highlights, peaks, strict=True)
+    ]
 
 
 def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:
@@ -82,17 +91,23 @@ def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> di
 
 
 def _judge(
-    highlight: TrueHighlight, smoothed: Image, peak: tuple[int, int], owns_peak: bool, noise: float
+    highlight: TrueHighlight,
+    frame: tuple[Image, npt.NDArray[np.bool_] | None],
+    peak: tuple[int, int],
+    owns_peak: bool,
+    noise: float,
 ) -> JudgedHighlight:
+    """Judge one true highlight by the smoothed frame and what of it is seen."""
+    smoothed, seen = frame
     if not highlight.lit:
         return JudgedHighlight(highlight, 0.0, "in shadow")
     if not owns_peak:
         return JudgedHighlight(highlight, 0.0, "part of a brighter one")
     row, column = peak
-    component = half_height_component(smoothed, row, column)
+    component = half_height_component(smoothed, row, column, seen)
     if component is None:
         return JudgedHighlight(highlight, 0.0, "part of a brighter one")
-    height = contrast(smoothed, component, float(smoothed[row, column]))
+    height = contrast(smoothed, component, float(smoothed[row, column]), seen)
     snr = height / noise if noise > 0 else np.inf if height > 0 else 0.0
     if highlight.min_gain <= HIGHLIGHT_MIN_GAIN:
         return JudgedHighlight(highlight, snr, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}")

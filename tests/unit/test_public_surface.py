@@ -14,22 +14,26 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PUBLIC = {
     "BackendError": "simtest.errors",
+    "BrownConrady": "simtest.geometry.distortion",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.base",
     "Experiment": "simtest.spec.experiment",
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
+    "KannalaBrandt": "simtest.geometry.distortion",
     "LabelledFrame": "simtest.dataset.frame",
     "Patch": "simtest.geometry.isophotes",
     "Reason": "simtest.errors",
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",
     "Specularity": "simtest.reconstruction",
+    "ViewMask": "simtest.geometry.camera",
     "load_camera": "simtest.spec.camera",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",
     "reconstruct": "simtest.reconstruction",
     "render": "simtest.api",
+    "save_camera": "simtest.spec.camera",
     "validate": "simtest.api",
 }
 """Public name and the module that defines it. A change here is a change of the interface."""

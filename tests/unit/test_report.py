@@ -11,7 +11,6 @@ import pytest
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.report import write_report
-from simtest.report.gallery import conic_points
 from simtest.report.run import read_run
 from simtest.report.series import law_misses, line_figures
 from simtest.report.static import heat_range
@@ -132,18 +131,17 @@ def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose
     angle = np.linspace(0, 2 * np.pi, 40)
     ring = np.stack([np.cos(angle), np.sin(angle)], 1) * axes
     contours = [{"t": t, "points": (spot + ring * np.sqrt(-np.log(t) / 0.7)).tolist()} for t in (0.3, 0.5, 0.7)]
-    A = np.diag(1 / axes**2)
-    conic = np.block([[A, -(A @ spot)[:, None]], [-(A @ spot)[None], np.array([[spot @ A @ spot - 1]])]]).tolist()
+    curve = (spot + ring).tolist()
     turned = [[-s[0] * np.cos(u) - s[2] * np.sin(u), 0.0, s[0] * np.sin(u) - s[2] * np.cos(u)] for u in (-1, 1)]
     common = {"specularity": 0, "true_id": 0, "status": "ok", "look_px": spot.tolist(), "bp_px": (spot + 0.7).tolist()}
     estimates = [
         common | {"estimator": estimator, "error_deg": 57.3, "normal": turned[0], "candidates": turned,
-                  "isophotes": contours[1:2], "ellipses": [conic]},
+                  "isophotes": contours[1:2], "curves": [curve]},
         common | {"estimator": "cone_axis", "error_deg": 0.01, "normal": (-s).tolist(), "candidates": [(-s).tolist()],
-                  "isophotes": contours, "ellipses": []},
+                  "isophotes": contours, "curves": []},
         common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak",
                   "error_deg": None, "normal": None, "candidates": [], "look_px": None, "isophotes": [],
-                  "ellipses": []},
+                  "curves": []},
     ]  # fmt: skip
     meta = {
         "surface": "cylinder", "setting": f"R = {radius:g} mm", "label": "cylinder outside", "sigma": 0.02,
@@ -423,15 +421,6 @@ def test_surface_without_truth_or_pixels(tmp_path):
     make_run(tmp_path, "noise", items=0)
     assert surface_3d(read_run(tmp_path)) is None
     assert "surface3d" not in read_page(write_report(tmp_path)).ids()
-
-
-def test_conic_points():
-    circle = conic_points([[1, 0, -2], [0, 1, -3], [-2, -3, 4 + 9 - 25]])
-    np.testing.assert_allclose(np.hypot(circle[:, 0] - 2, circle[:, 1] - 3), 5)
-    assert conic_points([[1, 0, 0], [0, -1, 0], [0, 0, -1]]) is None
-    assert conic_points([[1, 0, 0], [0, 1, 0], [0, 0, 1]]) is None
-    assert conic_points([[None] * 3] * 3) is None
-    assert conic_points("nothing") is None
 
 
 def test_style():

@@ -1,0 +1,324 @@
+"""Lens distortion: from directions to normalised image coordinates and back.
+
+Normalised coordinates m are those that K maps to pixels; without distortion m = (x/z, y/z). Each model is followed on
+its first monotone branch only, from the optical axis outwards: beyond it the lens would fold over, and one pixel would
+see two directions.
+"""
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import Polynomial
+
+from simtest.errors import InputError
+
+Array = npt.NDArray[np.float64]
+Curve = Callable[[Array], tuple[Array, Array]]
+
+NEWTON_STEPS = 100
+CLOSE = 4 * float(np.finfo(float).eps)
+REAL_ROOT = 1e-9
+"""Share of a root's size below which its imaginary part is rounding."""
+
+
+@dataclass(frozen=True)
+class BrownConrady:
+    """Radial and tangential distortion of a perspective lens: OpenCV's models of 5 and of 8 coefficients.
+
+    With x = X/Z, y = Y/Z, u = x^2 + y^2 and R = (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3):
+    m = (x R + 2 p1 x y + p2 (u + 2 x^2), y R + p1 (u + 2 y^2) + 2 p2 x y).
+
+    Parameters
+    ----------
+    k1, k2, k3, k4, k5, k6 : float
+        Radial coefficients; k4 to k6 are those of the denominator.
+    p1, p2 : float
+        Tangential coefficients.
+
+    Raises
+    ------
+    InputError
+        If a coefficient is not finite.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
+    @cached_property
+    def limit(self) -> float:
+        """End of the first monotone branch of the radial part: tangent of the field angle; inf where it has none."""
+        u = Polynomial([0.0, 1.0])
+        above, below = self._radial_polynomials
+        # Numerator of the slope of sqrt(u) above/below, and the pole.
+        slope = (above + 2 * u * above.deriv()) * below - 2 * u * above * below.deriv()
+        return float(np.sqrt(min(_first_root(slope), _first_root(below))))
+
+    @property
+    def limit_angle(self) -> float:
+        """Field angle at which the radial part folds over, rad; pi/2 where it does not."""
+        return float(np.arctan(self.limit))
+
+    @cached_property
+    def _radial_polynomials(self) -> tuple[Polynomial, Polynomial]:
+        return Polynomial([1.0, self.k1, self.k2, self.k3]), Polynomial([1.0, self.k4, self.k5, self.k6])
+
+    def distort(self, rays: npt.ArrayLike) -> Array:
+        """Give the normalised image coordinates of directions.
+
+        Parameters
+        ----------
+        rays : array_like, shape (..., 3)
+            Camera frame, any length.
+
+        Returns
+        -------
+        ndarray, shape (..., 2)
+            NaN at 90 deg off the axis and more, and beyond the first monotone branch.
+        """
+        P = np.asarray(rays, dtype=float)
+        z = np.where(P[..., 2] > 0, P[..., 2], np.nan)
+        xy = P[..., :2] / z[..., None]
+        with np.errstate(over="ignore", invalid="ignore"):
+            m, jacobian = self._forward(xy)
+            valid = self._on_branch(xy, jacobian)
+        return np.asarray(np.where(valid[..., None], m, np.nan))
+
+    def undistort(self, m: npt.ArrayLike) -> Array:
+        """Give the unit directions of normalised image coordinates, by Newton's method.
+
+        Parameters
+        ----------
+        m : array_like, shape (..., 2)
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Camera frame; NaN where no direction of the first monotone branch is seen.
+        """
+        target = np.asarray(m, dtype=float)
+        radius = np.linalg.norm(target, axis=-1)
+        tangential = self.p1 != 0 or self.p2 != 0
+        reach = radius
+        if tangential and np.isfinite(self.limit):
+            # Tangential terms may carry a point a little beyond what the radial part alone reaches.
+            reach = np.minimum(radius, self._radial(np.array(0.98 * self.limit))[0])
+        inner = _invert(self._radial, reach, self.limit)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            xy = np.where(radius[..., None] > 0, target * (inner / radius)[..., None], target)
+        if tangential:
+            xy = self._polish(xy, target)
+        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+        rays[np.isnan(xy).any(axis=-1)] = np.nan
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+    def _radial(self, r: Array) -> tuple[Array, Array]:
+        """Give the radial part r R(r^2) and its slope."""
+        u = r * r
+        above, below = self._radial_polynomials
+        ratio = above(u) / below(u)
+        return r * ratio, ratio + 2 * u * (above.deriv()(u) - ratio * below.deriv()(u)) / below(u)
+
+    def _forward(self, xy: Array) -> tuple[Array, Array]:
+        """Give m and the Jacobian's three entries (it is symmetric): xx, xy, yy, shape (..., 3)."""
+        x, y = xy[..., 0], xy[..., 1]
+        u = x * x + y * y
+        above, below = self._radial_polynomials
+        R = above(u) / below(u)
+        slope = (above.deriv()(u) - R * below.deriv()(u)) / below(u)
+        p1, p2 = self.p1, self.p2
+        m = np.stack([x * R + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * R + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1)
+        jacobian = np.stack(
+            [
+                R + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+                2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
+                R + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+            ],
+            axis=-1,
+        )
+        return m, jacobian
+
+    def _on_branch(self, xy: Array, jacobian: Array) -> npt.NDArray[np.bool_]:
+        xx, mixed, yy = jacobian[..., 0], jacobian[..., 1], jacobian[..., 2]
+        inside = np.hypot(xy[..., 0], xy[..., 1]) < self.limit
+        # Both eigenvalues are positive on the axis; the first one to vanish ends the branch.
+        return np.asarray(inside & (xx * yy - mixed * mixed > 0) & (xx + yy > 0))
+
+    def _polish(self, xy: Array, target: Array) -> Array:
+        """Solve for the tangential terms too, from the radial solution; NaN where it does not converge."""
+        start, wanted = xy.reshape(-1, 2), target.reshape(-1, 2)
+        solution, scale = np.full_like(start, np.nan), 1 + np.linalg.norm(wanted, axis=1)
+        active = np.flatnonzero(np.isfinite(start).all(axis=1))
+        x = start[active]
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):
+                m, jacobian = self._forward(x)
+                xx, mixed, yy = jacobian.T
+                gap = m - wanted[active]
+                step = np.stack([yy * gap[:, 0] - mixed * gap[:, 1], xx * gap[:, 1] - mixed * gap[:, 0]], axis=1)
+                step /= (xx * yy - mixed * mixed)[:, None]
+                # A step across the whole branch would leave it.
+                length = np.linalg.norm(step, axis=1)
+                most = 0.2 * (0.1 + np.linalg.norm(x, axis=1))
+                x = x - step * np.where(length > most, most / length, 1.0)[:, None]
+                done = length <= CLOSE * scale[active]
+                solution[active[done]] = x[done]
+                active, x = active[~done], x[~done]
+                if not len(active):
+                    break
+            solution[active] = x
+            m, jacobian = self._forward(solution)
+            solved = self._on_branch(solution, jacobian) & (np.linalg.norm(m - wanted, axis=1) <= 1e-13 * scale)
+        return np.where(solved[:, None], solution, np.nan).reshape(xy.shape)
+
+
+@dataclass(frozen=True)
+class KannalaBrandt:
+    """A fisheye lens: OpenCV's fisheye model (ROS: equidistant).
+
+    With theta the angle off the optical axis and phi the direction around it,
+    m = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (cos phi, sin phi). All coefficients 0 is the
+    equidistant lens. Angles of 90 deg and more are seen like the others.
+
+    Parameters
+    ----------
+    k1, k2, k3, k4 : float
+        Coefficients.
+
+    Raises
+    ------
+    InputError
+        If a coefficient is not finite.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_finite(self)
+
+    @cached_property
+    def limit_angle(self) -> float:
+        """End of the first monotone branch, rad; pi where it does not fold over."""
+        slope = Polynomial([1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
+        return float(min(np.pi, np.sqrt(_first_root(slope))))
+
+    def distort(self, rays: npt.ArrayLike) -> Array:
+        """Give the normalised image coordinates of directions.
+
+        Parameters
+        ----------
+        rays : array_like, shape (..., 3)
+            Camera frame, any length.
+
+        Returns
+        -------
+        ndarray, shape (..., 2)
+            NaN beyond the first monotone branch, and straight behind the camera.
+        """
+        P = np.asarray(rays, dtype=float)
+        across = np.hypot(P[..., 0], P[..., 1])
+        theta = np.arctan2(across, P[..., 2])
+        theta = np.where((theta < self.limit_angle) & (np.abs(P).max(axis=-1) > 0), theta, np.nan)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = self._radial(theta)[0] / across
+        # On the axis the share is 0/0; the coordinates are 0 there whatever it is.
+        share = np.where((across == 0) & (theta == 0), 0.0, share)
+        return np.asarray(P[..., :2] * share[..., None])
+
+    def undistort(self, m: npt.ArrayLike) -> Array:
+        """Give the unit directions of normalised image coordinates, by Newton's method.
+
+        Parameters
+        ----------
+        m : array_like, shape (..., 2)
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Camera frame; NaN where no direction of the first monotone branch is seen.
+        """
+        target = np.asarray(m, dtype=float)
+        radius = np.hypot(target[..., 0], target[..., 1])
+        theta = _invert(self._radial, radius, self.limit_angle)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(radius > 0, np.sin(theta) / radius, theta)
+        return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
+
+    def _radial(self, theta: Array) -> tuple[Array, Array]:
+        u = theta * theta
+        factor = Polynomial([1.0, self.k1, self.k2, self.k3, self.k4])
+        return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
+
+
+Distortion = BrownConrady | KannalaBrandt
+
+
+def _check_finite(model: Distortion) -> None:
+    for name, value in zip(model.__dataclass_fields__, astuple(model), strict=True):
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise InputError(f"distortion.{name} = {value!r}: must be a finite number")
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """Give the smallest positive real root, inf where there is none."""
+    roots = polynomial.trim().roots() if polynomial.trim().degree() > 0 else np.empty(0)
+    real = np.real(roots)[np.abs(np.imag(roots)) <= REAL_ROOT * np.abs(roots)]
+    return float(min(real[real > 0], default=np.inf))
+
+
+def _invert(curve: Curve, value: Array, top: float) -> Array:
+    """Solve curve(x) = value for x in [0, top), by Newton steps kept inside a bracket.
+
+    Parameters
+    ----------
+    curve : callable
+        Gives value and slope; 0 at 0, and rising up to `top`.
+    value : ndarray, shape (...)
+        At least 0.
+    top : float
+        May be inf; the curve then has no bound.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        NaN where the curve does not reach the value below `top`.
+    """
+    wanted = np.ravel(value).astype(float)
+    found = np.full(wanted.shape, np.nan)
+    high = top
+    if np.isinf(top):
+        high, most = 1.0, float(np.max(wanted, initial=0.0, where=np.isfinite(wanted)))
+        while curve(np.array(high))[0] <= most:
+            high *= 2
+    open_ = np.flatnonzero(wanted < float(curve(np.array(high))[0]))
+    low, high_ = np.zeros(len(open_)), np.full(len(open_), float(high))
+    target = wanted[open_]
+    x = np.minimum(target, 0.5 * high_)
+    for _ in range(NEWTON_STEPS):
+        reached, slope = curve(x)
+        gap = reached - target
+        low, high_ = np.where(gap < 0, x, low), np.where(gap > 0, x, high_)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            after = x - gap / slope
+        after = np.where((after >= low) & (after <= high_), after, (low + high_) / 2)
+        done = (np.abs(after - x) <= CLOSE * x) | (np.abs(gap) <= CLOSE * target)
+        found[open_[done]] = after[done]
+        open_, target, low, high_, x = (part[~done] for part in (open_, target, low, high_, after))
+        if not len(open_):
+            break
+    found[open_] = x
+    return found.reshape(np.shape(value))
