@@ -19,6 +19,9 @@ Array = npt.NDArray[np.float64]
 Curve = Callable[[Array], tuple[Array, Array]]
 
 NEWTON_STEPS = 100
+STEEPEST = 1e6
+"""Largest tangent of a field angle that a perspective lens is asked for."""
+
 CLOSE = 4 * float(np.finfo(float).eps)
 REAL_ROOT = 1e-9
 """Share of a root's size below which its imaginary part is rounding."""
@@ -58,16 +61,26 @@ class BrownConrady:
 
     @cached_property
     def limit(self) -> float:
-        """End of the first monotone branch of the radial part: tangent of the field angle; inf where it has none."""
+        """End of the first monotone branch of the radial part: tangent of the field angle, at most 1e6."""
+        return min(*self._turn_and_pole, STEEPEST)
+
+    @cached_property
+    def _turn_and_pole(self) -> tuple[float, float]:
+        """Radii at which the slope of the radial part, and its denominator, vanish first; inf where they do not."""
         u = Polynomial([0.0, 1.0])
         above, below = self._radial_polynomials
-        # Numerator of the slope of sqrt(u) above/below, and the pole.
+        # Numerator of the slope of sqrt(u) above/below.
         slope = (above + 2 * u * above.deriv()) * below - 2 * u * above * below.deriv()
-        return float(np.sqrt(min(_first_root(slope), _first_root(below))))
+        return float(np.sqrt(_first_root(slope))), float(np.sqrt(_first_root(below)))
+
+    @cached_property
+    def _reach(self) -> float:
+        """What the radial part rises to on its first branch: inf where it ends at a pole."""
+        return np.inf if self._turn_and_pole[1] <= self.limit else float(self._radial(np.array(self.limit))[0])
 
     @property
     def limit_angle(self) -> float:
-        """Field angle at which the radial part folds over, rad; pi/2 where it does not."""
+        """Field angle at which the radial part folds over, rad; almost pi/2 where it does not."""
         return float(np.arctan(self.limit))
 
     @cached_property
@@ -111,10 +124,10 @@ class BrownConrady:
         radius = np.linalg.norm(target, axis=-1)
         tangential = self.p1 != 0 or self.p2 != 0
         reach = radius
-        if tangential and np.isfinite(self.limit):
+        if tangential:
             # Tangential terms may carry a point a little beyond what the radial part alone reaches.
-            reach = np.minimum(radius, self._radial(np.array(0.98 * self.limit))[0])
-        inner = _invert(self._radial, reach, self.limit)
+            reach = np.minimum(radius, 0.99 * self._reach)
+        inner = _invert(self._radial, reach, self.limit, self._reach)
         with np.errstate(invalid="ignore", divide="ignore"):
             xy = np.where(radius[..., None] > 0, target * (inner / radius)[..., None], target)
         if tangential:
@@ -253,7 +266,8 @@ class KannalaBrandt:
         """
         target = np.asarray(m, dtype=float)
         radius = np.hypot(target[..., 0], target[..., 1])
-        theta = _invert(self._radial, radius, self.limit_angle)
+        top = self.limit_angle
+        theta = _invert(self._radial, radius, top, float(self._radial(np.array(top))[0]))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(radius > 0, np.sin(theta) / radius, theta)
         return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
@@ -274,13 +288,16 @@ def _check_finite(model: Distortion) -> None:
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Give the smallest positive real root, inf where there is none."""
-    roots = polynomial.trim().roots() if polynomial.trim().degree() > 0 else np.empty(0)
-    real = np.real(roots)[np.abs(np.imag(roots)) <= REAL_ROOT * np.abs(roots)]
-    return float(min(real[real > 0], default=np.inf))
+    """Give the smallest positive real root of a polynomial that is 1 at 0; inf where there is none."""
+    # Those of the reversed polynomial, whose first coefficient is that 1, are the inverses: tiny last coefficients
+    # then make roots near 0 in place of a matrix of huge entries.
+    inverse = np.roots(polynomial.coef)
+    real = np.real(inverse)[np.abs(np.imag(inverse)) <= REAL_ROOT * np.abs(inverse)]
+    most = float(max(real, default=0.0))
+    return 1 / most if most > 1 / STEEPEST**2 else np.inf
 
 
-def _invert(curve: Curve, value: Array, top: float) -> Array:
+def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
     """Solve curve(x) = value for x in [0, top), by Newton steps kept inside a bracket.
 
     Parameters
@@ -290,7 +307,8 @@ def _invert(curve: Curve, value: Array, top: float) -> Array:
     value : ndarray, shape (...)
         At least 0.
     top : float
-        May be inf; the curve then has no bound.
+    reach : float
+        What the curve rises to at `top`; may be inf.
 
     Returns
     -------
@@ -299,25 +317,19 @@ def _invert(curve: Curve, value: Array, top: float) -> Array:
     """
     wanted = np.ravel(value).astype(float)
     found = np.full(wanted.shape, np.nan)
-    high = top
-    if np.isinf(top):
-        high, most = 1.0, float(np.max(wanted, initial=0.0, where=np.isfinite(wanted)))
-        while curve(np.array(high))[0] <= most:
-            high *= 2
-    open_ = np.flatnonzero(wanted < float(curve(np.array(high))[0]))
-    low, high_ = np.zeros(len(open_)), np.full(len(open_), float(high))
-    target = wanted[open_]
-    x = np.minimum(target, 0.5 * high_)
+    open_ = np.flatnonzero((wanted < reach) & np.isfinite(wanted))
+    low, high, target = np.zeros(len(open_)), np.full(len(open_), top), wanted[open_]
+    x = np.minimum(target, 0.5 * high)
     for _ in range(NEWTON_STEPS):
         reached, slope = curve(x)
         gap = reached - target
-        low, high_ = np.where(gap < 0, x, low), np.where(gap > 0, x, high_)
+        low, high = np.where(gap < 0, x, low), np.where(gap > 0, x, high)
         with np.errstate(divide="ignore", invalid="ignore"):
             after = x - gap / slope
-        after = np.where((after >= low) & (after <= high_), after, (low + high_) / 2)
+        after = np.where((after >= low) & (after <= high), after, (low + high) / 2)
         done = (np.abs(after - x) <= CLOSE * x) | (np.abs(gap) <= CLOSE * target)
         found[open_[done]] = after[done]
-        open_, target, low, high_, x = (part[~done] for part in (open_, target, low, high_, after))
+        open_, target, low, high, x = (part[~done] for part in (open_, target, low, high, after))
         if not len(open_):
             break
     found[open_] = x

@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.resources import shown
+from simtest.spec.plain_yaml import parse_yaml
 from simtest.spec.reading import read_text
 
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k")
@@ -35,9 +37,6 @@ MODELS = {
 BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 """Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor."""
-
-MAX_NESTING = 32
-"""OpenCV's parsers end the process on files nested too deeply."""
 
 
 def read_opencv(path: Path) -> dict[str, Any]:
@@ -79,56 +78,41 @@ def read_opencv(path: Path) -> dict[str, Any]:
 
 def _parse(path: Path) -> Mapping[str, Any]:
     """Read a file's keys into plain dicts, lists, numbers and text."""
-    text, kind, where = read_text(path, "camera"), path.suffix.lower(), shown(path)
-    data: Any = None
-    if kind == ".json":
-        try:
-            # OpenCV has long written 1. for 1.0, which is no JSON.
-            data = json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{where}: not valid JSON: {error}") from error
-    else:
-        opening, closing = (r"<[^/?!]", r"</|/>") if kind == ".xml" else (r"[\[{]", r"[\]}]")
-        if _depth(text, opening, closing) > MAX_NESTING:
-            raise InputError(f"{where}: nested too deeply; at most {MAX_NESTING} levels are allowed")
-        storage = cv2.FileStorage()
-        try:
-            storage.open(text if kind == ".xml" else _plain_yaml(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-            data = _plain(storage.root())
-        except (cv2.error, SystemError, ValueError) as error:
-            said = re.sub(r"(?s)^.*error: \(.*?\) (\w+ in function '.*?\((\d+)\): )?", r"line \2: ", str(error)).strip()
-            raise InputError(f"{where}: not valid {kind[1:].upper()}: {shown(said.rstrip(chr(39)), 80)}") from error
+    text, where = read_text(path, "camera"), shown(path)
+    kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower(), "YAML")
+    try:
+        data = {"JSON": _parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
+    except RecursionError:
+        raise InputError(f"{where}: not valid {kind}: nested too deeply") from None
+    except (ValueError, ElementTree.ParseError) as error:
+        raise InputError(f"{where}: not valid {kind}: {shown(error, 80)}") from error
     if not isinstance(data, Mapping) or not data:
         raise InputError(f"{where}: holds no keys; must be a calibration of OpenCV or ROS")
     return data
 
 
-def _depth(text: str, opening: str, closing: str) -> int:
-    depth = most = 0
-    for found in re.finditer(f"({opening})|({closing})", text):
-        depth += 1 if found[1] else -1
-        most = max(most, depth)
-    return most
+def _parse_json(text: str) -> Any:
+    # OpenCV has long written 1. for 1.0, which is no JSON.
+    return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
 
 
-def _plain_yaml(text: str) -> str:
-    """Bring YAML that other programs write into the subset that OpenCV reads: one document, lists indented."""
-    if text.startswith("%YAML"):
-        return text
-    documents = [part for part in re.split(r"(?m)^(?:---|\.\.\.)\s*$", text) if part.strip()]
-    return re.sub(r"(?m)^- ", "  - ", documents[0] if documents else "")
+def _parse_xml(text: str) -> Any:
+    """Read OpenCV's XML; its own parser does not end on some malformed files."""
+    return _plain_xml(ElementTree.fromstring(text))
 
 
-def _plain(node: Any) -> Any:
-    if node.isMap():
-        return {key: _plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118 - no plain dict
-    if node.isSeq():
-        return [_plain(node.at(i)) for i in range(node.size())]
-    if node.isInt():
-        return int(node.real())
-    if node.isReal():
-        return float(node.real())
-    return node.string() if node.isString() else None
+def _plain_xml(element: ElementTree.Element) -> Any:
+    children = list(element)
+    if children:
+        if all(child.tag == "_" for child in children):
+            return [_plain_xml(child) for child in children]
+        return {child.tag: _plain_xml(child) for child in children}
+    words = (element.text or "").split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words).strip('"')
+    return values[0] if len(values) == 1 else values
 
 
 def _one_of(data: Mapping[str, Any], names: Sequence[str], where: str) -> tuple[str | None, Any]:

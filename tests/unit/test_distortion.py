@@ -1,0 +1,168 @@
+"""Lenses with distortion: against their formulas, against OpenCV, and there and back."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import Phase, assume, given, settings
+from hypothesis import strategies as st
+
+from simtest.errors import InputError
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
+
+WIDTH, HEIGHT = 640, 480
+MASK = ViewMask(325.0, 236.0, 220.0)
+
+
+def inside(camera, count=20):
+    """Give positions all over what the camera sees, its border included."""
+    x, y = (np.linspace(0, size, count) for size in (camera.width, camera.height))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return points[camera.contains(points)]
+
+
+def spread(low, high):
+    return st.floats(low, high, allow_subnormal=False)
+
+
+BROWN = st.builds(
+    BrownConrady, k1=spread(-0.5, 0.5), k2=spread(-0.2, 0.2), p1=spread(-0.02, 0.02), p2=spread(-0.02, 0.02),
+    k3=spread(-0.05, 0.05), k4=spread(-0.3, 0.3), k5=spread(-0.1, 0.1), k6=spread(-0.05, 0.05),
+)  # fmt: skip
+FISHEYE = st.builds(KannalaBrandt, *(spread(-width, width) for width in (0.2, 0.05, 0.01, 0.002)))
+
+
+@settings(max_examples=80, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@given(st.one_of(BROWN, FISHEYE), st.sampled_from([None, MASK]), spread(150, 900))
+def test_pixels_round_trip(lens, mask, focal):
+    try:
+        camera = Camera(WIDTH, HEIGHT, focal, 0.9 * focal, 331.2, 225.7, 3.0, lens, mask)
+    except InputError:
+        assume(False)
+    pixels = inside(camera)
+    rays = camera.unproject(pixels)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-14)
+    np.testing.assert_allclose(camera.project(rays), pixels, atol=1e-8)
+    np.testing.assert_allclose(camera.project(0.3 * rays), pixels, atol=1e-8)
+
+
+@settings(max_examples=120, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@given(st.one_of(BROWN, FISHEYE), st.integers(0, 2**32 - 1))
+def test_directions_round_trip(lens, seed):
+    """On the first branch, undistort takes back what distort did, to the digits that the branch's slope leaves."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, min(0.9 * lens.limit_angle, 1.2), 200)
+    around = rng.uniform(0, 2 * np.pi, 200)
+    rays = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=-1)
+    there = lens.distort(rays)
+    seen = np.isfinite(there).all(axis=-1)  # tangential terms may fold a little earlier
+    back = lens.undistort(there[seen])
+    np.testing.assert_allclose(lens.distort(back), there[seen], atol=2e-13)
+    if isinstance(lens, KannalaBrandt) or lens.p1 == lens.p2 == 0:
+        assert seen.all()
+        np.testing.assert_allclose(back, rays, atol=1e-10)
+
+
+def test_undistort_is_exact():
+    m = np.random.default_rng(3).uniform(-0.45, 0.45, (1000, 2))
+    for lens in (BrownConrady(-0.3, 0.1, 0.001, -0.002, 0.01), BrownConrady(-0.3, 0.1), KannalaBrandt(0.05, -0.01)):
+        np.testing.assert_allclose(lens.distort(lens.undistort(m)), m, atol=1e-13)
+    np.testing.assert_array_equal(BrownConrady(-0.3).undistort([0.0, 0.0]), [0, 0, 1])
+    np.testing.assert_array_equal(KannalaBrandt(0.1).undistort([[0.0, 0.0]]), [[0, 0, 1]])
+    assert BrownConrady(-0.3).undistort(np.zeros((3, 4, 2))).shape == (3, 4, 3)
+    assert KannalaBrandt().distort(np.ones((3, 4, 3))).shape == (3, 4, 2)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_brown_conrady_is_opencvs(count):
+    coefficients = np.array([-0.31, 0.12, 0.0013, -0.0021, -0.02, 0.03, -0.01, 0.004])[:count]
+    camera = Camera(WIDTH, HEIGHT, 500.0, 430.0, 331.2, 225.7, 0.0, BrownConrady(*coefficients))
+    points = np.random.default_rng(1).uniform([-4, -4, 8], [4, 4, 10], (500, 3))
+    exported = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), exported, coefficients)
+    np.testing.assert_allclose(camera.project(points), seen[:, 0] + 0.5, atol=1e-6)
+    # Negative control: the half pixel counts.
+    assert np.abs(camera.project(points) - seen[:, 0]).min() > 0.49
+
+
+def test_kannala_brandt_is_opencvs():
+    coefficients = np.array([0.05, -0.02, 0.004, -0.0007])
+    camera = Camera(WIDTH, HEIGHT, 240.0, 235.0, 331.2, 225.7, 0.0, KannalaBrandt(*coefficients))
+    points = np.random.default_rng(1).uniform([-9, -9, 2], [9, 9, 10], (500, 1, 3))
+    exported = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    seen, _ = cv2.fisheye.projectPoints(points, np.zeros((3, 1)), np.zeros((3, 1)), exported, coefficients)
+    np.testing.assert_allclose(camera.project(points[:, 0]), seen[:, 0] + 0.5, atol=1e-6)
+    flat = np.ascontiguousarray(points[:, :, :2] / points[:, :, 2:])
+    again = cv2.fisheye.distortPoints(flat, exported, coefficients)
+    np.testing.assert_allclose(camera.project(points[:, 0]), again[:, 0] + 0.5, atol=1e-6)
+
+
+def test_a_fisheye_sees_sideways_and_backwards():
+    camera = Camera(800, 800, 180.0, 180.0, 400.0, 400.0, 0.0, KannalaBrandt(0.01), ViewMask(400, 400, 350))
+    right, edge = camera.unproject([[400 + 180 * np.pi / 2 * (1 + 0.01 * (np.pi / 2) ** 2), 400], [749.9, 400.0]])
+    np.testing.assert_allclose(right, [1, 0, 0], atol=1e-12)
+    assert edge[2] < -0.1
+    np.testing.assert_allclose(camera.project(5 * edge), [749.9, 400.0], atol=1e-8)
+    assert np.isnan(camera.project([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])).all()
+    # A perspective lens does not.
+    perspective = Camera(800, 800, 500.0, 500.0, 400.0, 400.0, 0.0, BrownConrady(0.1))
+    assert np.isnan(perspective.project([[1.0, 0, 0], [1.0, 0, -0.5]])).all()
+
+
+def test_beyond_the_fold_nothing_is_seen():
+    lens = BrownConrady(k1=-0.4)
+    assert lens.limit == pytest.approx(np.sqrt(1 / 1.2))
+    assert KannalaBrandt(k1=-0.2).limit_angle == pytest.approx(np.sqrt(1 / 0.6))
+    assert BrownConrady(k1=0.1).limit == 1e6
+    assert BrownConrady(k4=-0.25).limit == pytest.approx(2)  # the pole
+    before, after = lens.limit - 1e-3, lens.limit + 1e-3
+    assert np.isfinite(lens.distort([before, 0, 1])).all()
+    assert np.isnan(lens.distort([after, 0, 1])).all()
+    # The radius at the fold, r (1 - 0.4 r^2), is the largest that has a direction.
+    most = lens.limit * (1 - 0.4 * lens.limit**2)
+    assert np.isfinite(lens.undistort([most - 1e-9, 0])).all()
+    assert np.isnan(lens.undistort([most + 1e-9, 0])).all()
+
+
+def test_tangential_terms_fold_too():
+    lens = BrownConrady(p2=0.3)
+    # Along x: m = x + 3 p2 x^2, whose slope vanishes at x = -1/(6 p2).
+    assert np.isfinite(lens.distort([-0.55, 0, 1])).all()
+    assert np.isnan(lens.distort([-0.56, 0, 1])).all()
+    with pytest.raises(InputError, match="folds over"):
+        Camera(600, 600, 600.0, 600.0, 300.0, 300.0, 0.0, lens)
+    Camera(600, 600, 1500.0, 1500.0, 300.0, 300.0, 0.0, lens)
+
+
+@pytest.mark.parametrize("lens", [BrownConrady(k1=-0.4), KannalaBrandt(k1=-0.4, k2=-0.05)])
+def test_a_lens_that_folds_over_in_view_is_refused(lens):
+    fold = float(lens.distort([np.sin(0.9999 * lens.limit_angle), 0, np.cos(0.9999 * lens.limit_angle)])[0])
+    size, focal = 600, 300 / fold
+    with pytest.raises(InputError, match=rf"folds over at {np.degrees(lens.limit_angle):.4g} deg .* over the image"):
+        Camera(size, size, focal, focal, 300.0, 300.0, 0.0, lens)
+    with pytest.raises(InputError, match="over the view mask"):
+        Camera(size, size, focal, focal, 300.0, 300.0, 0.0, lens, ViewMask(300.0, 300.0, 301.0))
+    camera = Camera(size, size, focal, focal, 300.0, 300.0, 0.0, lens, ViewMask(300.0, 300.0, 299.0))
+    assert np.isfinite(camera.unproject(camera.pixel_centres()[camera.seen])).all()
+    Camera(size, size, 1.5 * focal, 1.5 * focal, 300.0, 300.0, 0.0, lens)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), "0.1", None, True])
+def test_coefficients_that_are_none(bad):
+    for lens in (BrownConrady, KannalaBrandt):
+        with pytest.raises(InputError, match=r"distortion\.k2 = .*: must be a finite number"):
+            lens(0.1, bad)
+    with pytest.raises(InputError, match=r"view_mask\.cy = .*: must be a finite number"):
+        ViewMask(3.0, bad, 5.0)
+
+
+def test_the_view_mask():
+    camera = Camera(8, 6, 9.0, 9.0, 4.0, 3.0, view_mask=ViewMask(4.0, 3.0, 2.0))
+    assert camera.seen.sum() == 12  # 4 x 4 centres less the corners
+    assert camera.contains([[4.0, 3.0], [4.0, 5.1], [6.0, 3.0]]).tolist() == [True, False, True]
+    # The lens goes on outside.
+    assert np.isfinite(camera.unproject([0.0, 0.0])).all()
+    assert Camera(8, 6, 9.0, 9.0, 4.0, 3.0).seen is None
+    with pytest.raises(InputError, match="must be > 0"):
+        ViewMask(4.0, 3.0, 0.0)
+    with pytest.raises(InputError, match="must cover a pixel"):
+        Camera(8, 6, 9.0, 9.0, 4.0, 3.0, view_mask=ViewMask(40.0, 3.0, 2.0))
