@@ -1,0 +1,295 @@
+"""Frames through lenses: rays are distorted, not pictures; what is fitted on sightlines is what a pinhole gives."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.detection import detect, estimate_noise
+from simtest.errors import Failure, Reason
+from simtest.estimators.base import fit_isophote
+from simtest.estimators.cone_axis import cone_axis
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask, smooth
+from simtest.reconstruction import reconstruct
+from simtest.rendering import Session
+from simtest.seeds import from_integer
+from simtest.sensor import expose
+from simtest.spec import scene_from_dict
+from simtest.validation.metrics import angle_deg
+from simtest.validation.realise import view
+
+# A 140 degree fisheye: 70 deg from the axis lie 320 px away.
+FOCAL = 320 / np.radians(70)
+FISHEYE = {
+    "width": 640, "height": 640, "fx": FOCAL, "fy": FOCAL, "distortion": {"type": "kannala_brandt"},
+    "view_mask": {"radius": 320},
+}  # fmt: skip
+BARREL = {
+    "width": 640, "height": 640, "fx": 500.0, "fy": 500.0, "view_mask": {"radius": 300},
+    "distortion": {"type": "brown_conrady", "k1": -0.3, "k2": 0.05, "p1": 0.002, "p2": -0.001},
+}  # fmt: skip
+PINHOLE = {"width": 320, "height": 320, "fx": FOCAL, "fy": FOCAL}
+
+
+# The fit, without rendering --------------------------------------------------------------------------------------
+
+
+class Ring:
+    """Stands for a patch whose isophote is a circular cone of sightlines, seen through a lens."""
+
+    def __init__(self, camera, axis, half_angle):
+        first = np.cross(axis, [0.3, -0.5, 0.8])
+        first /= np.linalg.norm(first)
+        phase = np.linspace(0, 2 * np.pi, 80)[:, None]
+        across = np.cos(phase) * first + np.sin(phase) * np.cross(axis, first)
+        self.rays = np.cos(half_angle) * axis + np.sin(half_angle) * across
+        self.points = camera.project(self.rays)
+
+    def isophote(self, isovalue):
+        return self.points
+
+
+LENSES = {
+    "barrel": Camera(640, 640, 500.0, 480.0, 320.0, 310.0, 2.0, BrownConrady(-0.2, 0.03, 0.001, 0.002)),
+    "fisheye": Camera(900, 900, 200.0, 190.0, 440.0, 455.0, 0.0, KannalaBrandt(-0.01), ViewMask(450, 450, 400)),
+}
+
+
+@pytest.mark.parametrize(
+    ("lens", "angle"), [("barrel", 5), ("barrel", 25), ("fisheye", 40), ("fisheye", 80), ("fisheye", 105)]
+)
+def test_a_circular_cone_is_found_through_a_lens(lens, angle):
+    camera, u = LENSES[lens], np.radians(angle)
+    axis = np.array([np.sin(u) * 0.6, np.sin(u) * 0.8, np.cos(u)])
+    ring = Ring(camera, axis, np.radians(6))
+    fitted = fit_isophote(ring, camera, 0.5)
+    assert fitted.conic is None
+    pose = fitted.pose()
+    np.testing.assert_allclose(pose.axis, axis, atol=1e-10)
+    assert pose.axis_ratio == pytest.approx(1, abs=1e-9)
+    # What is drawn lies on the isophote.
+    drawn = fitted.ellipse_px(camera)
+    gaps = np.linalg.norm(drawn[:, None] - ring.points, axis=-1).min(axis=1)
+    spacing = np.linalg.norm(np.diff(ring.points, axis=0), axis=1).max()
+    assert gaps.max() < spacing
+    back = camera.unproject(drawn)
+    np.testing.assert_allclose(back @ axis, np.cos(np.radians(6)), atol=1e-9)
+    # Negative control: the same contour read as a pinhole's gives another axis.
+    plain = dataclasses.replace(camera, distortion=None, view_mask=None)
+    wrong = fit_isophote(ring, plain, 0.5).pose()
+    assert angle_deg(wrong.axis, axis) > (0.02 if angle == 5 else 0.5)
+
+
+def test_an_isophote_as_wide_as_a_half_space_is_no_ellipse():
+    ring = Ring(LENSES["fisheye"], np.array([0.0, 0.0, 1.0]), np.radians(5))
+    ring.points[3] = LENSES["fisheye"].project([1.0, 0.0, -0.2])
+    result = fit_isophote(ring, LENSES["fisheye"], 0.5)
+    assert isinstance(result, Failure)
+    assert result.reason == Reason.NOT_AN_ELLIPSE
+    # And one that leaves what the lens images.
+    ring.points[3] = 5000.0
+    assert fit_isophote(ring, LENSES["fisheye"], 0.5).reason == Reason.NOT_FINITE
+
+
+# The view mask in detection --------------------------------------------------------------------------------------
+
+
+def spot(camera, x, y, width, floor=0.3):
+    pixels = camera.pixel_centres()
+    return (floor + np.exp(-((pixels[..., 0] - x) ** 2 + (pixels[..., 1] - y) ** 2) / (2 * width**2))).astype(
+        np.float32
+    )
+
+
+ROUND = Camera(200, 160, 300.0, 300.0, 100.0, 80.0, view_mask=ViewMask(100.0, 80.0, 70.0))
+
+
+def masked(frame, noise=0.005, outside=0.0):
+    rng = np.random.default_rng(0)
+    return np.where(ROUND.seen, frame, outside) + rng.normal(0, noise, frame.shape).astype(np.float32)
+
+
+def test_the_border_of_the_view_is_no_highlight():
+    """A bright floor ends at the mask; a highlight outside, or cut by it, rises towards it."""
+    for frame in (
+        spot(ROUND, 0, 0, 9, 0.6),
+        spot(ROUND, 100, 168, 12),
+        spot(ROUND, 168, 80, 12),
+        spot(ROUND, 100, 14, 8, 0),
+    ):
+        assert reconstruct(masked(frame), ROUND) == []
+        # What lies outside, of a real endoscope's picture, does not matter.
+        assert reconstruct(masked(frame, outside=1.0), ROUND) == []
+    # Negative control: without the mask the cut highlight is taken for a whole one.
+    plain = dataclasses.replace(ROUND, view_mask=None)
+    assert len(reconstruct(masked(spot(ROUND, 168, 80, 12)), plain)) == 1
+
+
+def test_a_highlight_beside_the_border_of_the_view_keeps_its_shape():
+    clean = spot(ROUND, 150.3, 80.6, 6, 0.05)
+    (found,) = reconstruct(masked(clean, 0.0, outside=7.0), ROUND, ["cone_axis"])
+    (alone,) = reconstruct(clean, dataclasses.replace(ROUND, view_mask=None), ["cone_axis"])
+    np.testing.assert_allclose(found.patch.peak_px, alone.patch.peak_px, atol=1e-3)
+    assert angle_deg(found.estimates["cone_axis"].normal, alone.estimates["cone_axis"].normal) < 1e-3
+    assert found.patch.seen.shape == found.patch.values.shape
+    assert not found.patch.seen.all()
+
+
+def test_noise_is_that_of_the_view():
+    frame = masked(spot(ROUND, 100, 80, 20), noise=0.02)
+    frame[~ROUND.seen] = 0
+    assert estimate_noise(frame, ROUND.seen) == pytest.approx(0.02, rel=0.05)
+    assert estimate_noise(frame) < 0.019
+    assert estimate_noise(frame, np.zeros_like(ROUND.seen)) == 0
+
+
+def test_smoothing_within_the_view():
+    seen, constant = ROUND.seen, np.full((160, 200), 2.5, np.float32)
+    smoothed = smooth(np.where(seen, constant, 9), 2.0, seen)
+    np.testing.assert_allclose(smoothed[seen], 2.5, rtol=1e-5)
+    assert (smoothed[~seen] == 0).all()
+    assert detect(smoothed, 0.0, seen=seen) == []
+    # An isophote that would run along the mask's border is not closed.
+    patch = Patch.cut(smooth(spot(ROUND, 165, 80, 12), 2.0, seen), (130, 50, 50, 60), seen=seen)
+    assert patch.isophote(0.5).reason == Reason.NO_CLOSED_ISOPHOTE
+
+
+# Rendered --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session():
+    return Session(scene_from_dict({"surface": {"type": "plane"}}))
+
+
+def tilted(kind, angle, pointed):
+    """Give a surface whose highlight is seen `angle` deg off the axis, or the same seen on it."""
+    depth = 10 * np.cos(np.radians(angle)) if pointed else 10.0
+    surface = {"type": kind, "distance_mm": float(depth), "tilt_deg": 0.0 if pointed else angle, "azimuth_deg": 30.0}
+    # Tilted along its straight direction, a cylinder's nearest point moves by the tilt.
+    return surface | ({"radius_mm": 5.0, "spin_deg": 120.0} if kind == "cylinder" else {})
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(("kind", "angle"), [("plane", 2.0), ("plane", 60.0), ("cylinder", 30.0), ("cylinder", 60.0)])
+def test_normals_through_a_fisheye_equal_those_through_a_pinhole(session, kind, angle):
+    """The same highlight, off the axis of a 140 deg fisheye and on the axis of a pinhole pointed at it."""
+    normals, shape = {}, {}
+    for name, camera in (("fisheye", FISHEYE), ("pinhole", PINHOLE)):
+        pointed = name == "pinhole"
+        scene = scene_from_dict(
+            {"surface": tilted(kind, angle, pointed), "camera": camera, "reflectance": {"type": "phong"}}
+        )
+        seen = view(session, scene)
+        (truth,) = [t.highlight for t in seen.truths if t.isolated]
+        # The true BP: the surface's point on its pixel's ray, where the normal is the reversed sightline.
+        np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
+        assert angle_deg(truth.normal, -session.camera.unproject(truth.bp_px)) < 1e-6
+        for sigma in (0.0, 0.01):
+            frame = expose(seen.radiance.total, seen.full_scale, sigma, from_integer(3))
+            (found,) = reconstruct(frame, session.camera, ["cone_axis"])
+            estimate = found.estimates["cone_axis"]
+            # Expressed against the true normal, the two cameras' frames are comparable.
+            normals[name, sigma], shape[name, sigma] = angle_deg(estimate.normal, truth.normal), estimate.axis_ratio
+    for sigma in (0.0, 0.01):
+        assert normals["fisheye", sigma] < 0.025
+        assert normals["pinhole", sigma] < 0.025
+        assert shape["fisheye", sigma] == pytest.approx(shape["pinhole", sigma], rel=0.01)
+
+
+@pytest.mark.render
+def test_normals_through_a_barrel_lens_and_without_its_model(session):
+    scene = scene_from_dict({"surface": tilted("plane", 20.0, False), "camera": BARREL})
+    seen = view(session, scene)
+    (truth,) = [t.highlight for t in seen.truths if t.isolated]
+    np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
+    frame = expose(seen.radiance.total, seen.full_scale, 0.0, from_integer(0))
+    (found,) = reconstruct(frame, session.camera, ["cone_axis"])
+    assert angle_deg(found.estimates["cone_axis"].normal, truth.normal) < 0.01
+    plain = dataclasses.replace(session.camera, distortion=None)
+    (ignored,) = reconstruct(frame, plain, ["cone_axis"])
+    assert angle_deg(ignored.estimates["cone_axis"].normal, truth.normal) > 0.5
+
+
+SURFACES = [
+    {"type": "plane"},
+    {"type": "sphere", "radius_mm": 30.0, "side": "inside"},
+    {"type": "cylinder", "radius_mm": 20.0, "side": "inside"},
+    {"type": "quadric", "k1_per_mm": 0.02, "k2_per_mm": -0.03},
+    {"type": "anatomy", "path": "colon"},
+]
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("surface", SURFACES, ids=lambda surface: surface["type"])
+def test_frames_and_truth_through_a_masked_fisheye(session, surface):
+    """Each pixel's truth lies on its own sightline; outside the view there is neither radiance nor truth."""
+    camera = {**FISHEYE, "width": 160, "height": 120, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 50, "cx": 83.0}}
+    reflectance = {"type": "phong", "diffuse": 0.3}
+    session.update(scene_from_dict({"surface": surface, "camera": camera, "reflectance": reflectance}))
+    model, truth, radiance = session.camera, session.truth(), session.radiance()
+    seen = model.seen
+    assert 0 < seen.sum() < seen.size
+    assert not radiance.total[~seen].any()
+    assert radiance.total[truth.mask].all()
+    assert not truth.mask[~seen].any()
+    assert truth.mask[seen].mean() > 0.4  # the quadric is a patch
+    for name in ("depth", "position", "normal", "shading_normal", "geometric_normal", "k_min", "direction_max"):
+        assert np.isnan(getattr(truth, name)[~seen]).all(), name
+    sightlines = truth.position / truth.depth[..., None]
+    np.testing.assert_allclose(sightlines[truth.mask], model.unproject(model.pixel_centres())[truth.mask], atol=1e-5)
+    assert all(model.contains(highlight.bp_px) for highlight in session.highlights(radiance))
+
+
+@pytest.mark.render
+def test_more_samples_soften_the_border_of_the_view(session):
+    camera = {"width": 40, "height": 30, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 8.3}}
+    scene = {"surface": {"type": "plane"}, "camera": camera, "reflectance": {"type": "phong", "diffuse": 1.0}}
+    session.update(scene_from_dict({**scene, "render": {"samples_per_pixel": 16}}))
+    row = session.radiance().total[15]
+    inner = row[17:23].min()
+    assert ((row > 0.05 * inner) & (row < 0.9 * inner)).any()
+    assert (row[:8] == 0).all()
+    tiny = {**camera, "view_mask": {"radius": 0.6, "cx": 20.5, "cy": 15.5}}
+    session.update(scene_from_dict({**scene, "camera": tiny, "render": {"samples_per_pixel": 4}}))
+    assert (
+        np.count_nonzero(
+            session.radiance().total.sum(axis=-1) if session.radiance().channels > 1 else session.radiance().total
+        )
+        >= 1
+    )
+
+
+@pytest.mark.render
+def test_lines_are_bent_as_opencv_bends_them(session):
+    """A rendered edge, the rim of a sphere, lies where OpenCV projects it."""
+    camera = {**BARREL, "width": 400, "height": 400, "fx": 330.0, "fy": 320.0, "view_mask": {"radius": 190}}
+    session.update(
+        scene_from_dict({"surface": {"type": "sphere", "radius_mm": 4.0, "distance_mm": 8.0}, "camera": camera})
+    )
+    model = session.camera
+    outline, _ = cv2.findContours(session.truth().mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    rim = np.arcsin(4 / 12)
+    phase = np.linspace(0, 2 * np.pi, 2000)
+    rays = np.stack(
+        [np.sin(rim) * np.cos(phase), np.sin(rim) * np.sin(phase), np.full_like(phase, np.cos(rim))], axis=-1
+    )
+    lens = np.array([-0.3, 0.05, 0.002, -0.001])
+    K = model.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, lens)
+    gaps = np.linalg.norm(outline[0][:, 0, None] - expected[:, 0], axis=-1).min(axis=1)
+    assert gaps.max() < 1.5
+    straight, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, None)
+    assert np.linalg.norm(outline[0][:, 0, None] - straight[:, 0], axis=-1).min(axis=1).max() > 3
+
+
+def test_cone_axis_is_an_estimator_of_any_camera():
+    """A patch made through a lens is read like any other, by the registered callable."""
+    camera = LENSES["fisheye"]
+    pixels = camera.pixel_centres()
+    axis = np.array([0.0, np.sin(1.2), np.cos(1.2)])
+    with np.errstate(invalid="ignore"):
+        frame = np.nan_to_num(np.exp((camera.unproject(pixels) @ axis - 1) * 150))
+    (found,) = reconstruct(np.where(camera.seen, frame, 0), camera, {"cone_axis": cone_axis}, smoothing_px=1.0)
+    assert angle_deg(found.estimates["cone_axis"].normal, -axis) < 0.01
