@@ -13,7 +13,9 @@ def reconstruct(
     /,
     *,
     out: Out,
-    camera: Annotated[Path | None, Parameter(help="Calibration: TOML with width, height, fx, fy, cx, cy.")] = None,
+    camera: Annotated[
+        Path | None, Parameter(help="Calibration: simtest's TOML, or a file of OpenCV, ROS or MATLAB.")
+    ] = None,
     fov: Annotated[
         float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")
     ] = None,
