@@ -160,7 +160,9 @@ def describe(index: int, specularity: Specularity) -> dict[str, Any]:
             "isovalues": [isophote.isovalue for isophote in result.isophotes],
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "flags": list(result.flags),
-            "isophotes": [{"t": i.isovalue, "points": np.round(i.points, 3).tolist()} for i in result.isophotes],
+            "isophotes": [
+                {"t": t, "points": np.round(points, 3).tolist()} for t, points in specularity.contours(result)
+            ],
             "ellipses": [isophote.conic.image.tolist() for isophote in result.isophotes],
         }
     peak = None if isinstance(specularity.patch, Failure) else specularity.patch.peak_px.tolist()

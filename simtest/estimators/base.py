@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
-from simtest.geometry import Camera, FittedConic, Patch, backproject_conic, fit_ellipse
+from simtest.geometry import Camera, FittedConic, Patch, backproject_conic, fit_ellipses
 
 Array = npt.NDArray[np.float64]
 
@@ -21,7 +21,7 @@ class FittedIsophote:
     isovalue : float
         t.
     points : ndarray, shape (N, 2)
-        Contour, px.
+        Where the contour crosses the lines between pixel centres, px, in no order.
     conic : FittedConic
         Ellipse, px.
     cone : ndarray, shape (3, 3)
@@ -68,6 +68,9 @@ class Estimate:
     flags: tuple[str, ...] = field(default=())
 
 
+BatchEstimator = Callable[[Sequence[Patch | Failure], Camera], list[Estimate | Failure]]
+"""The same for several highlights seen by one camera; what is a Failure already stays one."""
+
 Estimator = Callable[[Patch, Camera], Estimate | Failure]
 """An estimator: a callable that takes the patch of a highlight and the camera.
 
@@ -91,20 +94,38 @@ def fit_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophot
     -------
     FittedIsophote or Failure
     """
-    points = patch.isophote(isovalue)
-    if isinstance(points, Failure):
-        return points
-    # The last point repeats the first and would count twice.
-    conic = fit_ellipse(points[:-1])
-    if isinstance(conic, Failure):
-        return conic
-    return FittedIsophote(isovalue, points, conic, backproject_conic(conic, camera))
+    return _fit([isovalue], [patch.crossings(isovalue)], camera)[0]
 
 
 def fit_isophotes(
     patch: Patch, camera: Camera, isovalues: Sequence[float]
 ) -> tuple[list[FittedIsophote], list[Failure]]:
     """Fit several isophotes (see `fit_isophote`); gives those that succeeded and the failures of the others."""
-    results = [fit_isophote(patch, camera, t) for t in isovalues]
+    results = _fit(isovalues, [patch.crossings(t) for t in isovalues], camera)
     fitted = [result for result in results if isinstance(result, FittedIsophote)]
     return fitted, [result for result in results if isinstance(result, Failure)]
+
+
+def fit_isophote_of_each(
+    patches: Sequence[Patch | Failure], camera: Camera, isovalue: float
+) -> list[FittedIsophote | Failure]:
+    """Fit the isophote of the same value of several patches (see `fit_isophote`)."""
+    contours = [patch if isinstance(patch, Failure) else patch.crossings(isovalue) for patch in patches]
+    return _fit([isovalue] * len(patches), contours, camera)
+
+
+def _fit(
+    isovalues: Sequence[float], contours: Sequence[Array | Failure], camera: Camera
+) -> list[FittedIsophote | Failure]:
+    """Fit ellipses to contours at their isovalues; failures are passed on."""
+    traced = {i: contour for i, contour in enumerate(contours) if not isinstance(contour, Failure)}
+    conics = fit_ellipses(list(traced.values()))
+    cones = backproject_conic(conics, camera)
+    results: dict[int, FittedIsophote | Failure] = {i: c for i, c in enumerate(contours) if isinstance(c, Failure)}
+    for place, (i, points) in enumerate(traced.items()):
+        conic = conics[place]
+        if isinstance(conic, Failure):
+            results[i] = conic
+        else:
+            results[i] = FittedIsophote(isovalues[i], points, conic, cones[place])
+    return [results[i] for i in range(len(contours))]

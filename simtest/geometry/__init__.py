@@ -1,9 +1,9 @@
 """NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
 
 from simtest.geometry.camera import Camera
-from simtest.geometry.circle_pose import CirclePose, circle_pose, cone_axes
+from simtest.geometry.circle_pose import CirclePose, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, backproject_conic, ellipse_of_conic
-from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse
+from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
 from simtest.geometry.isophotes import Patch, smooth
 
 __all__ = [
@@ -14,8 +14,10 @@ __all__ = [
     "Patch",
     "backproject_conic",
     "circle_pose",
+    "circle_poses",
     "cone_axes",
     "ellipse_of_conic",
     "fit_ellipse",
+    "fit_ellipses",
     "smooth",
 ]

@@ -1,5 +1,6 @@
 """Circle pose from one conic [F91; MB, section 2.3, step 4] and the axis of the back-projected cone."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,32 @@ class CirclePose:
     centres: Array
 
 
+@dataclass(frozen=True)
+class CirclePoses:
+    """What each of N cones says about a circle (see `CirclePose`).
+
+    Parameters
+    ----------
+    normals : ndarray, shape (N, 2, 3)
+    axes : ndarray, shape (N, 3)
+    axis_ratios : ndarray, shape (N,)
+    centres : ndarray, shape (N, 2, 3)
+    failures : mapping
+        Failure by the cone's number; the other entries of such a cone mean nothing.
+    """
+
+    normals: Array
+    axes: Array
+    axis_ratios: Array
+    centres: Array
+    failures: Mapping[int, Failure]
+
+    def __getitem__(self, index: int) -> CirclePose | Failure:
+        failure = self.failures.get(index)
+        ratio = float(self.axis_ratios[index])
+        return failure or CirclePose(self.normals[index], self.axes[index], ratio, self.centres[index])
+
+
 def cone_axes(cones: npt.ArrayLike) -> tuple[Array, Array]:
     """Give eigenvalues and eigenvectors of cones in the order of circle pose: l1 >= l2 > 0 > l3.
 
@@ -60,32 +87,50 @@ def cone_axes(cones: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def circle_pose(cone: npt.ArrayLike) -> CirclePose | Failure:
-    """Give the two normals of a circle seen as a conic [MB, section 2.3; F91].
+    """Give the two normals of a circle seen as a conic (see `circle_poses`), `cone` of shape (3, 3)."""
+    return circle_poses(np.asarray(cone, dtype=float)[None])[0]
+
+
+def circle_poses(cones: npt.ArrayLike) -> CirclePoses:
+    """Give the two normals of each circle seen as a conic [MB, section 2.3; F91].
 
     g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence
     its distance, is not observable.
 
     Parameters
     ----------
-    cone : array_like, shape (3, 3)
+    cones : array_like, shape (N, 3, 3)
         C' = K^T C K, any scale and sign.
 
     Returns
     -------
-    CirclePose or Failure
-        A Failure if C' is not finite or not the cone of an ellipse.
+    CirclePoses
+        A Failure for each C' that is not finite or not the cone of an ellipse.
     """
-    C = np.asarray(cone, dtype=float)
-    if not np.isfinite(C).all():
-        return Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
-    (l1, l2, l3), vectors = cone_axes(C)
-    if not (l1 >= l2 > 0 > l3):
-        return Failure(Reason.DEGENERATE_CONIC, f"eigenvalues {l1:.3g}, {l2:.3g}, {l3:.3g} are not those of a cone")
-    e1, _, e3 = vectors.T
+    C = np.asarray(cones, dtype=float)
+    finite = np.isfinite(C).all(axis=(1, 2))
+    values, vectors = cone_axes(np.where(finite[:, None, None], C, _ROUND))
+    l1, l2, l3 = values.T
+    sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
+    failures = {}
+    for index in np.flatnonzero(~(finite & sound)).tolist():
+        detail = f"eigenvalues {l1[index]:.3g}, {l2[index]:.3g}, {l3[index]:.3g} are not those of a cone"
+        cone = Failure(Reason.DEGENERATE_CONIC, detail)
+        failures[index] = cone if finite[index] else Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
+    # The values of a round cone stand in for those that are none.
+    l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
+    e1, e3 = vectors[:, :, 0], vectors[:, :, 2]
     g, h = np.sqrt((l1 - l2) / (l1 - l3)), np.sqrt((l2 - l3) / (l1 - l3))
-    normals = -np.stack([g * e1 + h * e3, -g * e1 + h * e3])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = _pair(e1 * g[:, None], e3 * h[:, None])
     # C'^-1 N in the eigenbasis; the centre lies in front of the camera, on the axis' side.
-    centres = -np.stack([g / l1 * e1 + h / l3 * e3, -g / l1 * e1 + h / l3 * e3])
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    return CirclePose(normals, e3, float(np.sqrt(l2 / l1)), centres)
+    centres = _pair(e1 * (g / l1)[:, None], e3 * (h / l3)[:, None])
+    return CirclePoses(normals, e3, np.sqrt(l2 / l1), centres, failures)
+
+
+_ROUND = np.diag([1.0, 1.0, -1.0])
+
+
+def _pair(across: Array, along: Array) -> Array:
+    """Give the unit vectors along -(+-across + along), shape (N, 2, 3)."""
+    both = -np.stack([along + across, along - across], axis=1)
+    return np.asarray(both / np.linalg.norm(both, axis=2, keepdims=True))

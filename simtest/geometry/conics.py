@@ -6,33 +6,33 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
-from simtest.geometry.ellipse_fit import FittedConic
+from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 
 Array = npt.NDArray[np.float64]
 
 
-def backproject_conic(conic: FittedConic, camera: Camera) -> Array:
-    """Give the cone of sightlines through an image ellipse: C' = K^T C K [MB, section 2.3, step 3].
+def backproject_conic(conic: FittedConic | FittedConics, camera: Camera) -> Array:
+    """Give the cone of sightlines through an image ellipse, or each of several: C' = K^T C K [MB, section 2.3, step 3].
 
     The transforms are multiplied before the conic is touched, so that a small ellipse far from the origin keeps its
     digits.
 
     Parameters
     ----------
-    conic : FittedConic
+    conic : FittedConic or FittedConics
         In pixels.
     camera : Camera
         For K.
 
     Returns
     -------
-    ndarray, shape (3, 3)
+    ndarray, shape (3, 3) or (N, 3, 3)
         Symmetric; w^T C' w = 0 for the sightlines w of the ellipse's pixels. Scaled to unit norm.
     """
     H = conic.normalised_from_image @ camera.K
-    cone = H.T @ conic.normalised @ H
-    cone = (cone + cone.T) / 2
-    return np.asarray(cone / np.linalg.norm(cone))
+    cone = np.swapaxes(H, -1, -2) @ conic.normalised @ H
+    cone = (cone + np.swapaxes(cone, -1, -2)) / 2
+    return np.asarray(cone / np.linalg.norm(cone, axis=(-2, -1), keepdims=True))
 
 
 @dataclass(frozen=True)

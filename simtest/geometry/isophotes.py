@@ -1,14 +1,14 @@
-"""Isophotes of a highlight: the closed contour at a share of the smoothed peak that encloses it."""
+"""Isophotes of a highlight: the border of the region above a share of the smoothed peak that holds the peak."""
 
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from skimage.measure import find_contours
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
+from simtest.geometry.level_sets import LevelSet, level_set_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -48,13 +48,16 @@ class Patch:
         Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
     peak_value : float
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    peak_pixel : tuple of int
+        Column and row of the peak's pixel in the region.
     """
 
     values: Image | Array
     origin_px: tuple[int, int]
     peak_px: Array
     peak_value: float
-    _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
+    peak_pixel: tuple[int, int]
+    _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
     def cut(
@@ -92,21 +95,26 @@ class Patch:
         if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
             raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
         values = smoothed[y : y + height, x : x + width]
-        if not np.isfinite(values).all():
+        # Either end of the range shows NaN and infinity, at less than the price of a look at every value.
+        lowest, highest = float(values.min()), float(values.max())
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
             return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
         if peak is None:
             row, column = divmod(int(values.argmax()), values.shape[1])
         else:
             column, row = peak[0] - x, peak[1] - y
         value = float(values[row, column])
-        if value <= 0 or value <= float(values.min()):
-            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
+        if value <= 0 or value <= lowest:
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         corner = (x + origin_px[0], y + origin_px[1])
         peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
-        return cls(values, corner, peak_px, value)
+        return cls(values, corner, peak_px, value, (column, row))
 
-    def isophote(self, isovalue: float) -> Array | Failure:
-        """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
+    def crossings(self, isovalue: float) -> Array | Failure:
+        """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
+
+        The isophote is the outer border of the region above t times the peak that holds the peak. Its points lie where
+        it crosses the lines between the centres of neighbouring pixels.
 
         Parameters
         ----------
@@ -116,33 +124,30 @@ class Patch:
         Returns
         -------
         ndarray, shape (N, 2), or Failure
-            Closed polygon in the frame, px, first point repeated at the end; the largest if several enclose the peak.
+            In the frame, px, each point once.
 
         Raises
         ------
         InputError
             If t is outside (0, 1).
         """
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
+
+    def isophote(self, isovalue: float) -> Array | Failure:
+        """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end."""
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
+
+    def _level_set(self, isovalue: float) -> LevelSet | Failure:
         if not 0 < isovalue < 1:
             raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
-        if isovalue not in self._contours:
-            self._contours[isovalue] = self._trace(isovalue)
-        return self._contours[isovalue]
-
-    def _trace(self, isovalue: float) -> Array | Failure:
-        if min(self.values.shape) < 3:
-            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"region of {self.values.shape[1]} x {self.values.shape[0]} px")
-        best, best_area = None, 0.0
-        for contour in find_contours(self.values, isovalue * self.peak_value):
-            points = contour[:, ::-1] + PIXEL_CENTRE + self.origin_px
-            if len(points) < 4 or not np.array_equal(points[0], points[-1]):
-                continue
-            area = abs(polygon_area(points))
-            if area > best_area and encloses(points, self.peak_px):
-                best, best_area = points, area
-        if best is None:
-            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}")
-        return best
+        if isovalue not in self._level_sets:
+            found = level_set_around(self.values, self.peak_pixel, isovalue * self.peak_value)
+            self._level_sets[isovalue] = found or Failure(
+                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
+            )
+        return self._level_sets[isovalue]
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
@@ -155,12 +160,6 @@ def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
             if bend < 0:
                 position[axis] += float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
     return np.array(position)
-
-
-def polygon_area(points: Array) -> float:
-    """Give the signed area of a closed polygon, shape (N, 2), last point equal to the first (shoelace formula)."""
-    x, y = (points - points[0]).T
-    return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2)
 
 
 def encloses(points: Array, point: Array) -> bool:

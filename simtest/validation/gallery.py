@@ -10,6 +10,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.files import write_atomically
+from simtest.reconstruction import Specularity
 from simtest.rendering import Session
 from simtest.validation.cases import Case
 from simtest.validation.metrics import angle_deg
@@ -93,17 +94,17 @@ def _estimates(i: int, made: Realisation) -> list[dict[str, Any]]:
         if isinstance(result, Failure):
             entries.append(entry | {"status": str(result.reason)})
             continue
-        entries.append(entry | {"status": "ok"} | _drawn(result))
+        entries.append(entry | {"status": "ok"} | _drawn(specularity, result))
         if true_id is not None:
             entries[-1]["error_deg"] = float(angle_deg(result.normal, made.truths[true_id].highlight.normal))
     return entries
 
 
-def _drawn(estimate: Estimate) -> dict[str, Any]:
+def _drawn(specularity: Specularity, estimate: Estimate) -> dict[str, Any]:
     isophotes = []
-    for isophote in estimate.isophotes:
-        step = max(1, len(isophote.points) // CONTOUR_POINTS)
-        isophotes.append({"t": isophote.isovalue, "points": np.round(isophote.points[::step], 2).tolist()})
+    for t, points in specularity.contours(estimate):
+        step = max(1, len(points) // CONTOUR_POINTS)
+        isophotes.append({"t": t, "points": np.round(points[::step], 2).tolist()})
     return {
         "normal": estimate.normal.tolist(),
         "candidates": estimate.candidates.tolist(),

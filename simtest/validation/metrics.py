@@ -207,9 +207,21 @@ def lobe_curvature(scene: Scene) -> float:
 
 def table(made: list[dict[str, Any]], swept: dict[str, Any]) -> pl.DataFrame:
     """Make the table of results from rows; `swept` gives an example value for each swept parameter's column."""
-    extra = {name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}
-    schema = {**SCHEMA, **extra}
+    schema = _schema(swept)
     return pl.DataFrame([{name: row.get(name) for name in schema} for row in made], schema=schema)
+
+
+def completed(made: pl.DataFrame, swept: dict[str, Any]) -> pl.DataFrame:
+    """Give a table of results all columns of `table`, in its order; those that are missing are null."""
+    columns = [
+        (pl.col(name) if name in made.columns else pl.lit(None)).cast(dtype).alias(name)
+        for name, dtype in _schema(swept).items()
+    ]
+    return made.select(columns)
+
+
+def _schema(swept: dict[str, Any]) -> dict[str, pl.DataType]:
+    return {**SCHEMA, **{name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}}
 
 
 def _dtype(value: Any) -> pl.DataType:

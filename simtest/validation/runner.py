@@ -25,7 +25,7 @@ from simtest.spec import Experiment, Scene
 from simtest.spec.surface import AnatomySurface
 from simtest.validation import gallery
 from simtest.validation.cases import Case, expand, swept_example
-from simtest.validation.metrics import table
+from simtest.validation.metrics import completed, table
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.pool import Pool
@@ -170,8 +170,11 @@ class _Work:
                             progress(before + more, total, name)
 
                     item = self.folder / "gallery" / f"{index:04d}.npz" if index in shown else None
-                    rows = self._published(case, pool, step) if case.is_paper else self._rendered(case, item, step)
-                    write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
+                    if case.is_paper:
+                        made = completed(self._published(case, pool, step), swept)
+                    else:
+                        made = table(self._rendered(case, item, step), swept)
+                    write_atomically(_part_file(parts, index), made.write_parquet)
                 done += case.realisations
         if progress:
             progress(total, total, "done")
@@ -194,7 +197,7 @@ class _Work:
                 gallery.save(item, self.session, case, seen, made, again)
         return rows
 
-    def _published(self, case: Case, pool: Pool, step: Callable[[int], None]) -> list[dict[str, Any]]:
+    def _published(self, case: Case, pool: Pool, step: Callable[[int], None]) -> pl.DataFrame:
         """Make the rows of a case of the published protocol, in chunks over the workers."""
         experiment, numbers, setting = self.experiment, case.numbers(), case.paper_setting()
         common = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **case.swept}
@@ -205,11 +208,11 @@ class _Work:
             chunk = numbers[first : first + PAPER_CHUNK]
             seeds = [case.noise_seed(experiment, number) for number in chunk]
             tasks.append((setting, common, chunk, seeds, experiment.estimators))
-        rows: list[dict[str, Any]] = []
-        for done, made in enumerate(pool.map(paper_rows, tasks)):
+        made = []
+        for done, rows in enumerate(pool.map(paper_rows, tasks)):
             step(min(done * PAPER_CHUNK, len(numbers)))
-            rows += made
-        return rows
+            made.append(rows)
+        return pl.concat(made)
 
     def _view(self, scene: Scene) -> View:
         if self.session is None:

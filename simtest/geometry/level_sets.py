@@ -1,0 +1,97 @@
+"""The region above a level around a pixel, and where its outer border crosses the lines between pixel centres.
+
+These are the points of marching squares, whose contours are the region's border; a fit needs no order among them,
+and without it they are found several times faster than by tracing.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from skimage.measure import find_contours
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+Index = npt.NDArray[np.intp]
+
+_ABOVE, _REGION, _OUTSIDE = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """A 4-connected region of pixels above a level, its holes filled, with one pixel of margin on all sides.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, w)
+        Intensities.
+    inside : ndarray of bool, shape (h, w)
+        The region; the outermost rows and columns are outside of it.
+    level : float
+        The level.
+    corner : tuple of int
+        Column and row of the first pixel in the array that the region was found in.
+    """
+
+    values: Image | Array
+    inside: npt.NDArray[np.bool_]
+    level: float
+    corner: tuple[int, int]
+
+    def crossings(self) -> Array:
+        """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
+
+        Those between horizontal neighbours first, row by row, then those between vertical ones.
+        """
+        rows, columns = np.nonzero(self.inside[:, 1:] != self.inside[:, :-1])
+        rows_down, columns_down = np.nonzero(self.inside[1:] != self.inside[:-1])
+        across = len(rows)
+        points = np.empty((across + len(rows_down), 2))
+        points[:across, 0] = columns + self._share(rows, columns, rows, columns + 1)
+        points[:across, 1] = rows
+        points[across:, 0] = columns_down
+        points[across:, 1] = rows_down + self._share(rows_down, columns_down, rows_down + 1, columns_down)
+        points += self.corner
+        return points
+
+    def _share(self, row: Index, column: Index, next_row: Index, next_column: Index) -> Array:
+        """Give where the level lies between two neighbours, 0 at the first and 1 at the next."""
+        first = self.values[row, column].astype(float)
+        return np.asarray((self.level - first) / (self.values[next_row, next_column] - first))
+
+    def polygon(self) -> Array:
+        """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred."""
+        above = np.nextafter(self.level, np.inf)
+        values = self.values.astype(float)
+        clean = np.where(self.inside, np.maximum(values, above), np.minimum(values, self.level))
+        return np.asarray(find_contours(clean, self.level)[0][:, ::-1] + self.corner)
+
+
+def level_set_around(values: Image | Array, pixel: tuple[int, int], level: float) -> LevelSet | None:
+    """Find the region above a level that holds a pixel.
+
+    Parameters
+    ----------
+    values : ndarray, shape (H, W)
+        Finite intensities.
+    pixel : tuple of int
+        Column and row; its value lies above the level.
+    level : float
+        The level.
+
+    Returns
+    -------
+    LevelSet or None
+        None where the region reaches the array's border: its own border is not closed then.
+    """
+    marks = (values > level).view(np.uint8)
+    # Low values are connected across corners, high ones are not, as in marching squares for an ambiguous cell.
+    _, _, _, (x, y, width, height) = cv2.floodFill(marks, None, pixel, _REGION, flags=4)
+    rows, columns = marks.shape
+    if x == 0 or y == 0 or x + width == columns or y + height == rows:
+        return None
+    box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
+    around = np.where(marks[box] == _REGION, np.uint8(_REGION), np.uint8(0))
+    cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
+    return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))
