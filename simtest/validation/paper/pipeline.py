@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -28,6 +29,24 @@ KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
 
+@dataclass(frozen=True)
+class Stages:
+    """The pictures of one realisation on the way to its isophote; of the pipeline's outer region, shape (h, w).
+
+    Parameters
+    ----------
+    light : ndarray, shape (3,)
+        L, texture units, the camera's foot at the origin.
+    clean, noisy, smoothed : ndarray, shape (h, w)
+        Slanted view without noise, with it, and smoothed; not normalised.
+    """
+
+    light: Array
+    clean: Array
+    noisy: Array
+    smoothed: Array
+
+
 class Pipeline:
     """The published pipeline at one setting; what all realisations share is computed once.
 
@@ -48,9 +67,9 @@ class Pipeline:
         self.estimators = dict(estimators) if estimators else published
         self.region = region_of_interest(setting)
         self.outer = _grown(self.region, kernel_radius(setting), setting.size)
-        overhead = np.array([0.0, 0.0, setting.height])
+        self._overhead = np.array([0.0, 0.0, setting.height])
         self._positions = sample_positions(setting, self.outer)
-        self._fixed = picture(setting, overhead, self._positions) if setting.eps == 0 else None
+        self._fixed = picture(setting, self._overhead, self._positions) if setting.eps == 0 else None
 
     def realise(self, rng: np.random.Generator) -> dict[str, Estimate | Failure]:
         """Make one realisation.
@@ -65,22 +84,34 @@ class Pipeline:
         dict
             Estimate or Failure by estimator name.
         """
-        patch = self.patch(rng)
+        return self.reconstruct(self.patch(rng))
+
+    def reconstruct(self, patch: Patch | Failure) -> dict[str, Estimate | Failure]:
+        """Give estimate or Failure by estimator name for one realisation's region of interest."""
         return {name: run(estimator, patch, self.setting.camera) for name, estimator in self.estimators.items()}
 
     def patch(self, rng: np.random.Generator) -> Patch | Failure:
         """Give the smoothed region of interest of one realisation (see `realise`)."""
+        return self.cut(self.stages(rng).smoothed)
+
+    def stages(self, rng: np.random.Generator) -> Stages:
+        """Make the pictures of one realisation (see `realise`)."""
         setting = self.setting
-        clean = self._fixed
+        light, clean = self._overhead, self._fixed
         if clean is None:
-            clean = picture(setting, draw_light(setting, rng), self._positions)
-        frame = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
+            light = draw_light(setting, rng)
+            clean = picture(setting, light, self._positions)
+        noisy = smoothed = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
         if setting.smoothing_px > 0:
             side = 2 * kernel_radius(setting) + 1
-            frame = cv2.GaussianBlur(frame, (side, side), setting.smoothing_px, borderType=cv2.BORDER_REFLECT)
+            smoothed = cv2.GaussianBlur(noisy, (side, side), setting.smoothing_px, borderType=cv2.BORDER_REFLECT)
+        return Stages(light, clean, noisy, smoothed)
+
+    def cut(self, smoothed: Array) -> Patch | Failure:
+        """Cut the region of interest out of the smoothed outer region."""
         x, y, width, height = self.region
         box = (x - self.outer[0], y - self.outer[1], width, height)
-        return Patch.cut(frame, box, origin_px=self.outer[:2])
+        return Patch.cut(smoothed, box, origin_px=self.outer[:2])
 
 
 def kernel_radius(setting: PaperSetting) -> int:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.circle_pose import circle_pose
@@ -9,6 +11,7 @@ from simtest.seeds import from_integer
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import angle_deg
 from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.smoothing import smoothing_bias
 
 SURFACE = "published plane"
 
@@ -36,18 +39,25 @@ def paper_rows(
     list of dict
         In the order of the realisations.
     """
-    loaded = load_estimators(estimators)
-    if "circle_pose" in loaded:
-        loaded["circle_pose"] = lambda patch, camera: circle_pose(patch, camera, setting.isovalue)
-    pipeline = Pipeline(setting, loaded)
+    pipeline = pipeline_with(setting, estimators)
+    bias = smoothing_bias(setting)
+    law_deg = {"circle_pose": None if bias is None else float(np.degrees(bias))}
     shared = {**common, "surface": SURFACE, "reflectance": "phong", "noise_sigma": setting.sigma, "n_lights": 1}
     shared |= dict(zip(("truth_x", "truth_y", "truth_z"), setting.normal.tolist(), strict=True))
     rows = []
     for number, seed in zip(numbers, seeds, strict=True):
         for name, result in pipeline.realise(from_integer(seed)).items():
             row = {**shared, "realisation": number, "specularity": 0, "true_id": 0, "seed": seed, "estimator": name}
-            rows.append(row | _result(setting, result))
+            rows.append(row | {"error_law_deg": law_deg.get(name)} | _result(setting, result))
     return rows
+
+
+def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
+    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue."""
+    loaded = load_estimators(estimators)
+    if "circle_pose" in loaded:
+        loaded["circle_pose"] = lambda patch, camera: circle_pose(patch, camera, setting.isovalue)
+    return Pipeline(setting, loaded)
 
 
 def _result(setting: PaperSetting, result: Estimate | Failure) -> dict[str, Any]:
