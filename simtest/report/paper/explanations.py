@@ -13,7 +13,7 @@ NEAR_ZERO_SLANT = (
 ISOVALUE_MINIMUM = (
     "Noise moves the isophote by σ over the lobe's slope, relative to its axes by σ / (t (−ln t)), and a contour holds "
     "independent noise in proportion to its length, √(−ln t): the error is then least where t (−ln t)^(5/4) is "
-    "largest, at t = exp(−5/4) = 0.29. Here t is relative to the peak of the noisy frame after smoothing."
+    "largest, at t = exp(−5/4) = 0.29. A wider smoothing, whose bias falls slowly with t, moves the minimum up."
 )
 """Of the isovalue sweep's minimum."""
 

@@ -16,6 +16,7 @@ from simtest.report.paper.static import (
     ISOPHOTE_COLOUR,
     LAW_NAME,
     bounds,
+    failures_title,
     laws,
     log_limits,
     spread_bars,
@@ -56,20 +57,34 @@ def _sweep_layout(data: SweepFigure) -> dict[str, Any]:
     rows = len(data.sweeps)
     x: dict[str, Any] = {"title": {"text": escape(data.x.title)}, "zeroline": False, "automargin": True, "anchor": "y2"}
     if data.x.scale == "log":
-        x |= {"type": "log", "dtick": "D2", "exponentformat": "none"}
+        values = np.concatenate([one.shown_x for one in data.sweeps])
+        x |= {"type": "log", **_log_ticks(float(values.min()) / 1.5, float(values.max()) * 1.5)}
     y: dict[str, Any] = {"title": {"text": escape(data.y.title)}, "automargin": True, "domain": [_SHARE + 0.04, 1.0]}
     if data.y.scale == "log":
-        low, high = np.log10(log_limits(data))
-        y |= {"type": "log", "range": [low, high], "dtick": "D2", "exponentformat": "none"}
+        low, high = log_limits(data)
+        y |= {"type": "log", "range": [np.log10(low), np.log10(high)], **_log_ticks(low, high)}
     else:
         y |= {"range": data.y.limits, "zeroline": False}
     below = {
-        "title": {"text": "failures"}, "domain": [0.0, _SHARE - 0.02], "range": [-0.8, rows - 0.2],
+        "title": {"text": failures_title(data).replace("\n", "<br>")}, "ticks": "",
+        "domain": [0.0, _SHARE - 0.02], "range": [-0.8, rows - 0.2],
         "showticklabels": False, "showgrid": False, "zeroline": False, "automargin": True, "fixedrange": True,
     }  # fmt: skip
-    more = layout(540 + 24 * rows, xaxis=x, yaxis=y, yaxis2=below)
-    more["legend"] |= {"y": -0.2}
-    return more
+    return _legend_below(layout(540 + 24 * rows, xaxis=x, yaxis=y, yaxis2=below), len(data.sweeps) + 2)
+
+
+def _legend_below(made: dict[str, Any], entries: int) -> dict[str, Any]:
+    """Put the legend at the figure's lower edge, clear of the axis' title even where each entry takes a line."""
+    made["legend"] |= {"yref": "container", "y": 0.0, "yanchor": "bottom"}
+    made["margin"] |= {"b": 62 + 22 * entries}
+    return made
+
+
+def _log_ticks(low: float, high: float) -> dict[str, Any]:
+    """Give ticks at 1, 2 and 5 with their values in full: plotly's own leave out the power of ten."""
+    values = [digit * 10.0**power for power in range(-6, 7) for digit in (1, 2, 5)]
+    shown = [value for value in values if low <= value <= high]
+    return {"tickvals": shown, "ticktext": [f"{value:g}" for value in shown]}
 
 
 def _curve(figure: go.Figure, data: SweepFigure, index: int, colour: str, symbol: str) -> None:
@@ -134,8 +149,8 @@ def _failures(data: SweepFigure, index: int, mark: str) -> go.Scatter:
 def isocurves(data: IsocurveFigure) -> dict[str, go.Figure]:
     """Draw the three parts of Figure 1, by key."""
     together, apart = _plane(data.together), _plane(data.apart)
-    for radius, name in ((data.inner, "isophote r−"), (data.outer, "r+")):
-        together.add_annotation(x=0, y=radius, text=f"{name} = {radius:.5f} |V_Z|", showarrow=False, yshift=10)
+    for radius, name in ((data.inner, "r−"), (data.outer, "r+")):
+        together.add_annotation(x=0, y=radius, text=f"{name} = {radius:.5f}", showarrow=False, yshift=10)
     _mark(together, (0, 0), "cross-thin-open", "camera's foot, light's foot, BP")
     _mark(apart, (0, 0), "cross-thin-open", "camera's foot")
     _mark(apart, (2 * data.bp[0], 2 * data.bp[1]), "star", "light's foot")
@@ -155,9 +170,11 @@ def _plane(branches: tuple[Branch, ...]) -> go.Figure:
         figure.add_trace(go.Scatter(x=x, y=y, mode="lines", line=line, name=name, hovertemplate=hover))
     axis = {"range": [-REACH, REACH], "zeroline": False, "automargin": True, "constrain": "domain"}
     figure.update_layout(
-        layout(
-            430, xaxis=axis | {"title": {"text": "x (|V_Z|)"}},
-            yaxis=axis | {"title": {"text": "y (|V_Z|)"}, "scaleanchor": "x"},
+        _legend_below(
+            layout(
+                500, xaxis=axis | {"title": {"text": "x (|V_Z|)"}},
+                yaxis=axis | {"title": {"text": "y (|V_Z|)"}, "scaleanchor": "x"},
+            ), 5,
         )
     )  # fmt: skip
     return figure
@@ -189,5 +206,5 @@ def _radii(data: IsocurveFigure) -> go.Figure:
     y = {"title": {"text": "radius (|V_Z|)"}, "type": "log", "range": [-2, 2], "dtick": 1, "exponentformat": "none",
          "automargin": True}  # fmt: skip
     x = {"title": {"text": "κ = 1 − τ²"}, "range": [0, 1], "zeroline": False, "automargin": True}
-    figure.update_layout(layout(430, xaxis=x, yaxis=y))
+    figure.update_layout(_legend_below(layout(500, xaxis=x, yaxis=y), 5))
     return figure

@@ -38,9 +38,9 @@ class Parameter:
     def text(self, value: object) -> str:
         """Write a value of the rows with symbol and unit."""
         if isinstance(value, bool) or not isinstance(value, int | float):
-            return f"{self.symbol} = {value}"
+            return f"{self.symbol}\u00a0=\u00a0{value}"
         unit = {"%": "\u00a0%", "deg": "°", "px": "\u00a0px"}.get(self.unit.split(" ")[0], "")
-        return f"{self.symbol} = {value * self.factor:.6g}{unit}"
+        return f"{self.symbol}\u00a0=\u00a0{value * self.factor:.6g}{unit}"
 
 
 _KNOWN = (

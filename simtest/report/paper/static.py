@@ -115,13 +115,18 @@ def _draw_failures(ax: "Axes", data: SweepFigure, colours: Mapping[str, str]) ->
         ax.plot([0.012], [y], marks[sweep.label].matplotlib, color=colours[sweep.estimator], ms=5, clip_on=False,
                 transform=ax.get_yaxis_transform())  # fmt: skip
         for x, failed in zip(sweep.shown_x, sweep.failed, strict=True):
-            look = {"fontweight": "bold", "color": "#B00020"} if failed else {"color": "#555"}
+            look: dict[str, Any] = {"fontweight": "bold", "color": "#B00020"} if failed else {"color": "#555"}
             ax.text(x, y, f"{failed:.0f}", ha="center", va="center", fontsize=8.5, **look)
     ax.set_ylim(-0.8, rows - 0.2)
     ax.set_yticks([])
-    total = sorted({int(v) for sweep in data.sweeps for v in sweep.failed + sweep.answered})
-    ax.set_ylabel(f"failures\nof {' or '.join(str(t) for t in total)}", fontsize=9)
+    ax.set_ylabel(failures_title(data), fontsize=9)
     ax.set_xlabel(data.x.title)
+
+
+def failures_title(data: SweepFigure) -> str:
+    """Give the title of the failures' strip: of how many realisations."""
+    totals = sorted({int(total) for sweep in data.sweeps for total in sweep.failed + sweep.answered})
+    return f"failures\nof {' or '.join(str(total) for total in totals)}"
 
 
 def _handles(data: SweepFigure, colours: Mapping[str, str]) -> list[Any]:
