@@ -61,7 +61,10 @@ def exponent_slope(sweep: Sweep, law_slope: float, published: float) -> str:
         Slope that the article reports, deg per unit.
     """
     if not law_slope > 0:
-        return "The slope hangs on the smoothing's width, which the article does not state."
+        return (
+            "The slope hangs on the smoothing's width, which the article does not state. "
+            "This run has no prediction of the smoothing's bias to compare it with."
+        )
     width = float(sweep.fixed.get("smoothing_px") or DEFAULT_SMOOTHING_PX)
     return (
         f"The slope is the smoothing's bias, which grows with n s²: predicted without noise, {number(law_slope)}° per "

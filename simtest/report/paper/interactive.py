@@ -28,6 +28,8 @@ from simtest.report.style import NEUTRAL
 _SHARE = 0.2
 """Height of the failures' strip."""
 
+_CLOSE, _STAGGER = 0.09, 0.24
+
 
 def sweep(data: SweepFigure, colours: Mapping[str, str]) -> go.Figure:
     """Draw an error plot with its bars, bound, law and the failures' strip."""
@@ -138,8 +140,12 @@ def _failures(data: SweepFigure, index: int, mark: str) -> go.Scatter:
         for x, failed, ok, reasons in zip(one.x, one.failed, one.answered, one.reasons, strict=True)
     ]
     prefix = f"{mark} " if len(data.sweeps) > 1 else ""
+    # Numbers of close settings are set in two heights, so that narrow pages keep them apart.
+    x = np.log(one.shown_x) if data.x.scale == "log" else one.shown_x
+    close = x.size > 1 and np.diff(x).min() < _CLOSE * np.ptp(x)
+    height = len(data.sweeps) - 1 - index + (_STAGGER * (-1.0) ** np.arange(x.size) if close else np.zeros(x.size))
     return go.Scatter(
-        x=one.shown_x, y=np.full(one.x.size, len(data.sweeps) - 1 - index), yaxis="y2", mode="text",
+        x=one.shown_x, y=height, yaxis="y2", mode="text",
         text=[f"<b>{prefix}{v:.0f}</b>" if v else f"{prefix}0" for v in one.failed], hovertext=texts, hoverinfo="text",
         showlegend=False, legendgroup=label, cliponaxis=False, name=f"{label}, failures",
         textfont={"color": ["#D03030" if v else NEUTRAL for v in one.failed]},

@@ -37,6 +37,8 @@ class Parameter:
 
     def text(self, value: object) -> str:
         """Write a value of the rows with symbol and unit."""
+        if self.name == "recentre":
+            return "window at the BP" if value else "window at the foot"
         if isinstance(value, bool) or not isinstance(value, int | float):
             return f"{self.symbol}\u00a0=\u00a0{value}"
         unit = {"%": "\u00a0%", "deg": "°", "px": "\u00a0px"}.get(self.unit.split(" ")[0], "")
@@ -80,7 +82,7 @@ _KNOWN = (
     ),
     Parameter("size", "M", "picture and texture side", "px"),
     Parameter("height", "V_Z", "camera height", "texture units"),
-    Parameter("recentre", "window at the BP", "window at the BP"),
+    Parameter("recentre", "", "place of the window"),
 )  # fmt: skip
 
 PARAMETERS = {parameter.name: parameter for parameter in _KNOWN}

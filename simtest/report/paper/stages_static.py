@@ -31,9 +31,12 @@ def draw_panels(data: Stages, colour: str) -> list["Figure"]:
     """Draw each panel in a figure of its own, for narrow pages."""
     import matplotlib.pyplot as plt
 
+    x0, x1, y1, y0 = data.extent
+    flat = min(4.0 * (y1 - y0) / (x1 - x0), 4.0)
+    heights: dict[Any, float] = {_clean: flat + 0.8, _noisy: flat + 0.8, _smoothed: flat + 1.3}
     figures = []
     for panel in _PANELS:
-        figure, ax = plt.subplots(figsize=(4.6, 4.7), layout="constrained")
+        figure, ax = plt.subplots(figsize=(4.6, heights.get(panel, 4.7)), layout="constrained")
         panel(ax, data, colour)
         figures.append(figure)
     return figures
