@@ -160,7 +160,10 @@ def _why_slope(sweep: Sweep) -> str:
 
 
 def _u_shape(sweep: Sweep) -> tuple[str, bool]:
-    known = np.flatnonzero(np.isfinite(sweep.mean))
+    # Where most realisations failed, the others are a selection, and few.
+    known = np.flatnonzero(np.isfinite(sweep.mean) & (sweep.answered >= sweep.failed))
+    if known.size < 3:
+        return "fewer than three settings where at least half of the realisations answered", False
     least = known[int(sweep.mean[known].argmin())]
     error = np.nan_to_num(sweep.standard_error)
     inside = [i for i in known if LEAST_AT[0] - 1e-9 <= sweep.x[i] <= LEAST_AT[1] + 1e-9]
@@ -253,7 +256,8 @@ _CHECKS = (
     ),
     _Check(
         "isovalue", {}, f"U-shaped, minimum at {LEAST_AT[0]:g} to {LEAST_AT[1]:g}",
-        "both ends above the least mean, and a mean in that range equal to it, by 2 standard errors",
+        "of the settings where at least half answered, both ends above the least mean and a mean in that range equal to "
+        "it, by 2 standard errors",
         _u_shape, _says(explanations.ISOVALUE_MINIMUM),
     ),
     _Check(
