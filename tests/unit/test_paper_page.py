@@ -178,7 +178,7 @@ def test_the_slopes_explanation_is_computed(tmp_path):
     means = {30.0: 0.4, 75.0: 0.55, 120.0: 0.7}
     rows = rows_of("n", "exponent", means, law=lambda n: 0.0025 * n)
     reason = judged(tmp_path, rows)["about linear, slope about 10⁻² degrees per unit"].because
-    assert "0.0025° per unit at this run's s = 2 px" in reason
+    assert "0.0025° per unit is predicted at this run's s = 2 px" in reason
     assert "about 4 px" in reason
 
 

@@ -67,7 +67,7 @@ def exponent_slope(sweep: Sweep, law_slope: float, published: float) -> str:
         )
     width = float(sweep.fixed.get("smoothing_px") or DEFAULT_SMOOTHING_PX)
     return (
-        f"The slope is mainly the smoothing's bias, which grows with n s²: predicted without noise, {number(law_slope)}° per "
-        f"unit at this run's s = {width:g} px. The article does not state its width; its slope would belong to about "
-        f"{number(width * (published / law_slope) ** 0.5, 2)} px."
+        f"The slope is mainly the smoothing's bias, which grows with n s²: without noise {number(law_slope)}° per "
+        f"unit is predicted at this run's s = {width:g} px. The article does not state its width; "
+        f"its slope would belong to about {number(width * (published / law_slope) ** 0.5, 2)} px."
     )

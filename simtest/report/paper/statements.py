@@ -256,8 +256,8 @@ _CHECKS = (
     ),
     _Check(
         "isovalue", {}, f"U-shaped, minimum at {LEAST_AT[0]:g} to {LEAST_AT[1]:g}",
-        "of the settings where at least half answered, both ends above the least mean and a mean in that range equal to "
-        "it, by 2 standard errors",
+        "of the settings where at least half answered, both ends above the least mean and a mean in that range "
+        "equal to it, by 2 standard errors",
         _u_shape, _says(explanations.ISOVALUE_MINIMUM),
     ),
     _Check(
