@@ -161,7 +161,7 @@ def describe(index: int, specularity: Specularity) -> dict[str, Any]:
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "flags": list(result.flags),
             "isophotes": [
-                {"t": t, "points": np.round(points, 3).tolist()} for t, points in specularity.contours(result)
+                {"t": t, "points": np.round(points, 3).tolist()} for t, points in result.contours(specularity.patch)
             ],
             "ellipses": [isophote.conic.image.tolist() for isophote in result.isophotes],
         }

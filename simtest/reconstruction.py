@@ -37,13 +37,6 @@ class Specularity:
     patch: Patch | Failure
     estimates: dict[str, Estimate | Failure]
 
-    def contours(self, estimate: Estimate) -> list[tuple[float, npt.NDArray[np.float64]]]:
-        """Give the isophotes that an estimate used: isovalue and closed polygon, shape (N, 2), px."""
-        if isinstance(self.patch, Failure):
-            return []
-        traced = [(isophote.isovalue, self.patch.isophote(isophote.isovalue)) for isophote in estimate.isophotes]
-        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
-
 
 def reconstruct(
     frame: npt.ArrayLike,

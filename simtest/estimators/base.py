@@ -67,6 +67,13 @@ class Estimate:
     covariance: Array | None = None
     flags: tuple[str, ...] = field(default=())
 
+    def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
+        """Give the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
+        if isinstance(patch, Failure):
+            return []
+        traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in self.isophotes]
+        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
+
 
 BatchEstimator = Callable[[Sequence[Patch | Failure], Camera], list[Estimate | Failure]]
 """The same for several highlights seen by one camera; what is a Failure already stays one."""

@@ -67,6 +67,10 @@ class Case:
         """Give the setting of the published protocol; raises `InputError` where a value does not fit."""
         return paper_from_dict(self.data, self.where)
 
+    def paper_columns(self) -> dict[str, Any]:
+        """Give every parameter of the published protocol by key path, swept or not, for the rows' columns."""
+        return {f"paper.{name}": value for name, value in self.paper_setting().model_dump().items()}
+
     @property
     def name(self) -> str:
         """The case's place in the seed tree."""
@@ -222,5 +226,6 @@ def swept_example(cases: list[Case]) -> dict[str, Any]:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)
         if case.is_paper:
+            example |= {key: value for key, value in case.paper_columns().items() if key not in example}
             example["bound_deg"] = 0.0
     return example

@@ -10,7 +10,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.files import write_atomically
-from simtest.reconstruction import Specularity
+from simtest.geometry import Patch
 from simtest.rendering import Session
 from simtest.validation.cases import Case
 from simtest.validation.metrics import angle_deg
@@ -54,16 +54,31 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made)],
     }
 
-    def write(part: Path) -> None:
-        np.savez_compressed(
-            part,
-            frame=made.frame.astype(np.float16).astype(np.float32),
-            position=truth.position.astype(np.float32),
-            normal=truth.normal.astype(np.float32),
-            meta=np.array(json.dumps(meta, allow_nan=False)),
-        )
+    write_item(path, meta, made.frame, truth.position, truth.normal)
 
-    write_atomically(path, write)
+
+def write_item(path: Path, meta: dict[str, Any], frame: Any, position: Any, normal: Any, **more: Any) -> None:
+    """Write the file of one gallery item.
+
+    Parameters
+    ----------
+    path : Path
+        The .npz file.
+    meta : dict
+        All that is no picture.
+    frame : ndarray, shape (H, W) or (H, W, 3)
+        Share of full scale.
+    position, normal : ndarray, shape (h, w, 3)
+        Thinned truth, camera frame; NaN where there is no surface.
+    **more : ndarray
+        Further pictures.
+    """
+    # Half precision is enough to look at; stored wider, since it is read back as it is.
+    content = {"frame": np.asarray(frame).astype(np.float16).astype(np.float32)}
+    content |= {"position": np.asarray(position, np.float32), "normal": np.asarray(normal, np.float32)}
+    content |= {name: np.asarray(picture).astype(np.float16) for name, picture in more.items()}
+    text = np.array(json.dumps(meta, allow_nan=False))
+    write_atomically(path, lambda part: np.savez_compressed(part, **content, meta=text))  # type: ignore[arg-type]
 
 
 def _truth(j: int, judged: Any) -> dict[str, Any]:
@@ -85,24 +100,42 @@ def _estimates(i: int, made: Realisation) -> list[dict[str, Any]]:
     peak = [v + PIXEL_CENTRE for v in specularity.region.peak]
     if not isinstance(specularity.patch, Failure):
         peak = specularity.patch.peak_px.tolist()
-    entries = []
-    for name, result in specularity.estimates.items():
-        entry: dict[str, Any] = {
-            "specularity": i, "true_id": true_id, "estimator": name, "bp_px": peak, "error_deg": None, "normal": None,
-            "candidates": [], "look_px": None, "isophotes": [], "ellipses": [],
-        }  # fmt: skip
-        if isinstance(result, Failure):
-            entries.append(entry | {"status": str(result.reason)})
-            continue
-        entries.append(entry | {"status": "ok"} | _drawn(specularity, result))
-        if true_id is not None:
-            entries[-1]["error_deg"] = float(angle_deg(result.normal, made.truths[true_id].highlight.normal))
-    return entries
+    normal = None if true_id is None else made.truths[true_id].highlight.normal
+    place = {"specularity": i, "true_id": true_id, "bp_px": peak}
+    return [
+        place | {"estimator": name} | drawn(result, specularity.patch, normal)
+        for name, result in specularity.estimates.items()
+    ]
 
 
-def _drawn(specularity: Specularity, estimate: Estimate) -> dict[str, Any]:
+def drawn(result: Estimate | Failure, patch: Patch | Failure, truth: Any) -> dict[str, Any]:
+    """Give what a gallery item keeps of an estimator's answer.
+
+    Parameters
+    ----------
+    result : Estimate or Failure
+        The answer.
+    patch : Patch or Failure
+        What it looked at.
+    truth : ndarray, shape (3,), or None
+        The true normal, where there is one.
+    """
+    entry: dict[str, Any] = {
+        "error_deg": None, "error_oracle_deg": None, "normal": None, "candidates": [], "look_px": None,
+        "isophotes": [], "ellipses": [],
+    }  # fmt: skip
+    if isinstance(result, Failure):
+        return entry | {"status": str(result.reason)}
+    entry |= {"status": "ok"} | _drawn(result, patch)
+    if truth is not None:
+        entry["error_deg"] = float(angle_deg(result.normal, truth))
+        entry["error_oracle_deg"] = float(angle_deg(result.candidates, truth).min())
+    return entry
+
+
+def _drawn(estimate: Estimate, patch: Patch | Failure) -> dict[str, Any]:
     isophotes = []
-    for t, points in specularity.contours(estimate):
+    for t, points in estimate.contours(patch):
         step = max(1, len(points) // CONTOUR_POINTS)
         isophotes.append({"t": t, "points": np.round(points[::step], 2).tolist()})
     return {

@@ -9,13 +9,13 @@ import polars as pl
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.base import BatchEstimator
 from simtest.estimators.checked import one_by_one
 from simtest.estimators.circle_pose import circle_poses
 from simtest.seeds import from_integer
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import SCHEMA, angle_deg
 from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.smoothing import smoothing_bias
 
 SURFACE = "published plane"
 
@@ -43,25 +43,28 @@ def paper_rows(
     polars.DataFrame
         Columns of `metrics.SCHEMA` and of `common`, in the order of the realisations.
     """
-    pipeline = Pipeline(setting, _batched(estimators, setting))
+    pipeline = pipeline_with(setting, estimators)
     made = pipeline.realise(from_integer(seed) for seed in seeds)
     shared = {**common, "surface": SURFACE, "reflectance": "phong", "noise_sigma": setting.sigma, "n_lights": 1}
     shared |= dict(zip(("truth_x", "truth_y", "truth_z"), setting.normal.tolist(), strict=True))
     shared |= {"specularity": 0, "true_id": 0}
-    tables = [
-        pl.DataFrame(
-            {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}, schema_overrides=SCHEMA
-        ).with_columns(pl.lit(name).alias("estimator"), **{column: pl.lit(value) for column, value in shared.items()})
-        for name, results in made.items()
-    ]
-    return pl.concat(tables).sort("realisation", maintain_order=True)
+    bias = smoothing_bias(setting)
+    law_deg = {"circle_pose": None if bias is None else float(np.degrees(bias))}
+    tables = []
+    for name, results in made.items():
+        own = {**shared, "estimator": name, "error_law_deg": law_deg.get(name)}
+        columns = {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}
+        table = pl.DataFrame(columns, schema_overrides=SCHEMA)
+        tables.append(table.with_columns(**{column: pl.lit(value) for column, value in own.items()}))
+    return pl.concat(tables, how="vertical_relaxed").sort("realisation", maintain_order=True)
 
 
-def _batched(names: tuple[str, ...], setting: PaperSetting) -> dict[str, BatchEstimator]:
-    batched = {name: one_by_one(estimator) for name, estimator in load_estimators(names).items()}
+def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
+    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue."""
+    batched = {name: one_by_one(estimator) for name, estimator in load_estimators(estimators).items()}
     if "circle_pose" in batched:
         batched["circle_pose"] = partial(circle_poses, isovalue=setting.isovalue)
-    return batched
+    return Pipeline(setting, batched)
 
 
 def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[str, Any]:
