@@ -76,7 +76,8 @@ class Tracer:
             mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)),
         )
         si = self.scene.ray_intersect(ray)
-        self.refinement.apply(*(mi.Vector3d(np.ascontiguousarray(part.T)) for part in (origins, directions)), si)
+        origin, direction = (mi.Vector3d(np.ascontiguousarray(part.T)) for part in (origins, directions))
+        self.refinement.apply(origin, direction, si)
         total, diffuse = self._direct(si)
         indirect = mi.Spectrum(0)
         if path_depth > 2:

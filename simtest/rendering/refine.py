@@ -1,8 +1,8 @@
 """Hits on analytic shapes in double precision.
 
-Mitsuba's rays are single precision. At a silhouette the hit moves by the ray's rounding over the cosine of view, and the
-cosine of the light there is small itself: together a relative error of the radiance of 1e-4 and more, though the light
-is direct and the surface has a formula. So the hit is solved again from the ray as the camera gives it.
+Mitsuba's rays are single precision. At a silhouette the hit moves by the ray's rounding over the cosine of view, and
+the cosine of the light there is small itself: together a relative error of the radiance of 1e-4 and more, though the
+light is direct and the surface has a formula. So the hit is solved again from the ray as the camera gives it.
 """
 
 from typing import Any

@@ -131,7 +131,7 @@ def test_every_pixel_has_the_radiance_of_the_formula(session, name, exponent):
     assert dark > (10_000 if name == "sphere" else 0)
 
 
-# Mitsuba's own integrators ---------------------------------------------------------------------------------------------
+# Mitsuba's own integrators -----------------------------------------------------------------------------------------
 
 SIDE = 6
 """Points along each side of a pixel for its mean."""
