@@ -1,6 +1,7 @@
 """A scene as a Mitsuba XML file with its mesh, that Mitsuba itself loads and renders to the same picture."""
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,6 +38,7 @@ VIEW_MARGIN = 1.05
 """Half-size of an exported plane over the farthest point that is seen of it."""
 
 _CAMERA_KEYS = frozenset({"width", "height", "fx", "fy", "cx", "cy", "skew"})
+_RIG_KEYS = frozenset({"lights"})
 _LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power"})
 
 
@@ -96,7 +98,7 @@ def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
     if camera.skew != 0:
         yield "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"
     yield from _beyond(camera, _CAMERA_KEYS, "camera", "Mitsuba's perspective camera")
-    yield from _beyond(scene.rig, frozenset({"lights"}), "rig", "Mitsuba's point light")
+    yield from _beyond(scene.rig, _RIG_KEYS, "rig", "Mitsuba's point light")
     for i, light in enumerate(scene.rig.lights):
         yield from _beyond(light, _LIGHT_KEYS, f"rig.lights.{i}", "Mitsuba's point light")
 
@@ -232,4 +234,4 @@ def _head(scene: Scene) -> str:
         lines.append("One ray through each pixel's centre: a sampler of one stratum without jitter.")
     elif scene.render.samples_per_pixel == 1:
         lines.append(f"simtest sends one ray through each pixel's centre; here {SAMPLES} spread over the pixel.")
-    return "\n" + "\n".join(f"        {line.replace('--', '- -')}" for line in lines) + "\n    "
+    return "\n" + "\n".join(f"        {re.sub('-(?=-)', '- ', line)}" for line in lines) + "\n    "

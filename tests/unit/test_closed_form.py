@@ -191,3 +191,20 @@ def test_the_sampled_material_is_the_scenes(session):
     built = session._built.scene.shapes()[0].bsdf()
     assert type(built).__name__ == "Phong"
     assert bsdf_dict(session.scene.reflectance, session.plugin, diffuse_only=False)["type"] == session.plugin
+
+
+def test_colour_tints_the_base_alone():
+    """In the colour variant; last here, since the variant is the process's."""
+    scene = described(SURFACES["sphere"][0], [PLACES[5]], 50.0, 0.5, 0.5, False)
+    colour = (0.9, 0.45, 0.3)
+    tinted = scene.reflectance.model_copy(update={"colour": colour})
+    rendered = Session(scene.model_copy(update={"reflectance": tinted}), "llvm_ad_rgb").radiance()
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    P, N = sphere(sightlines(x, y))
+    lobe, _ = radiance(P, N, PLACES[5], 50.0, 0.5, 0.0, False)
+    base, _ = radiance(P, N, PLACES[5], 50.0, 0.0, 0.5, False)
+    assert rendered.total.shape == (HEIGHT, WIDTH, 3)
+    for channel, share in enumerate(colour):
+        expected = lobe + share * base
+        np.testing.assert_allclose(rendered.total[:, :, channel], expected, rtol=1e-4, atol=1e-7 * expected.max())
+        np.testing.assert_allclose(rendered.diffuse[:, :, channel], share * base, rtol=1e-4, atol=1e-7 * base.max())

@@ -143,6 +143,12 @@ def test_mitsuba_alone_loads_what_is_its_own(session, tmp_path):
     assert done.stdout.strip() == "(32, 32, 3) False", done.stderr
 
 
+def test_a_name_cannot_end_the_comment(tmp_path):
+    named = scene(SURFACES["plane"]).model_copy(update={"name": 'a --- b --> <x y="z">'})
+    root = ET.parse(simtest.export(named, tmp_path)[0]).getroot()
+    assert [child.tag for child in root][-3:] == ["sensor", "shape", "emitter"]
+
+
 def test_the_same_bytes_twice(tmp_path):
     folders = [tmp_path / name for name in ("one", "two")]
     first, second = ([file.read_bytes() for file in simtest.export(scene(SURFACES["quadric"]), f)] for f in folders)
