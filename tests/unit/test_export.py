@@ -65,7 +65,7 @@ REFLECTANCES = {
 CASES = [(name, "phong", AT_CAMERA if i % 2 else ASIDE) for i, name in enumerate(SURFACES) if name != "liver"]
 CASES.append(pytest.param("liver", "phong", ASIDE, marks=pytest.mark.slow))
 CASES += [("plane", name, ASIDE) for name in REFLECTANCES if name != "phong"]
-CASES += [("quadric", "rough plastic", ASIDE), ("colon", "rough conductor", ASIDE)]
+CASES += [("quadric", "rough plastic", ASIDE), ("quadric", "rough conductor", ASIDE)]
 
 
 @pytest.mark.parametrize(("surface", "reflectance", "light"), CASES, ids=str)
