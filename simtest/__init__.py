@@ -7,7 +7,7 @@ viewers.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from simtest.api import LabelledFrame, render, validate
+    from simtest.api import LabelledFrame, export, render, validate
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
     from simtest.geometry import Camera, Patch
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene
 
 _HOMES = {
-    "simtest.api": ("LabelledFrame", "render", "validate"),
+    "simtest.api": ("LabelledFrame", "export", "render", "validate"),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
     "simtest.geometry": ("Camera", "Patch"),
@@ -37,6 +37,7 @@ __all__ = [
     "Scene",
     "SimtestError",
     "Specularity",
+    "export",
     "load_camera",
     "load_experiment",
     "load_scene",

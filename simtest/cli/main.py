@@ -24,6 +24,7 @@ _COMMANDS = {
     "doctor": "Check the rendering backend.",
     "schema": "Print the JSON schema of a scene, experiment or camera file.",
     "render": "Render a scene with its ground truth.",
+    "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",
     "validate": "Run an experiment and write its report.",
 }

@@ -8,6 +8,7 @@ import numpy as np
 
 from simtest.geometry.camera import Camera
 from simtest.rendering.frames import Array, Radiance
+from simtest.rendering.refine import Refinement
 
 Rays = Callable[[Array], tuple[Array, Array]]
 
@@ -30,6 +31,8 @@ class Tracer:
         Radiant intensities.
     shadows : list of bool
         Whether a light's shadow rays are traced (not needed where it is at the camera).
+    refinement : Refinement
+        Solves the hits again in double precision.
     """
 
     mi: Any
@@ -38,6 +41,7 @@ class Tracer:
     lights: Array
     powers: list[float]
     shadows: list[bool]
+    refinement: Refinement
 
     def __post_init__(self) -> None:
         # Opaque, so that a moved light does not compile a new kernel.
@@ -72,9 +76,8 @@ class Tracer:
             mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)),
         )
         si = self.scene.ray_intersect(ray)
-        # Mitsuba interpolates the hit between the shape's corners; those of the plane lie so far beyond the view that
-        # 1e-3 mm are lost, a per mille of the radiance. The point along the ray keeps the digits of t.
-        si.p = dr.select(si.is_valid(), ray(si.t), si.p)
+        origin, direction = (mi.Vector3d(np.ascontiguousarray(part.T)) for part in (origins, directions))
+        self.refinement.apply(origin, direction, si)
         total, diffuse = self._direct(si)
         indirect = mi.Spectrum(0)
         if path_depth > 2:

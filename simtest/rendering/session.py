@@ -10,6 +10,7 @@ from simtest.geometry.camera import Camera
 from simtest.rendering import backend, highlights, integrate, phong
 from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps
 from simtest.rendering.materials import bsdf_dict, parameter_updates
+from simtest.rendering.refine import Refinement
 from simtest.rendering.shapes import make_shape
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
@@ -163,7 +164,10 @@ class Session:
         shadows = [float(np.linalg.norm(light.place_mm)) > COLOCATED_MM for light in self.scene.rig.lights]
         lights = self.to_model(np.array([light.place_mm for light in self.scene.rig.lights]))
         powers = [light.power for light in self.scene.rig.lights]
-        tracer = integrate.Tracer(self.mi, self._built.scene, self._built.diffuse_bsdf, lights, powers, shadows)
+        refinement = Refinement(self.mi, self._shape)
+        tracer = integrate.Tracer(
+            self.mi, self._built.scene, self._built.diffuse_bsdf, lights, powers, shadows, refinement
+        )
         effort = self.scene.render
         return integrate.render(
             tracer, self._rays, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed

@@ -83,9 +83,11 @@ def test_what_a_killed_run_left_is_swept_away(tmp_path):
     assert not any(file.exists() for file in leftovers)
 
 
-def test_a_set_value_below_a_swept_table_is_refused():
+def test_a_set_value_below_a_swept_table_is_refused(tmp_path):
+    file = tmp_path / "tables.toml"
+    file.write_text('[[groups]]\nscene = "plane"\nsweep = [{ reflectance = [{ type = "phong" }] }]\n')
     with pytest.raises(InputError, match=r"--set reflectance.diffuse: the experiment varies reflectance as a whole"):
-        load_experiment("reflectance", {"reflectance.diffuse": 0.2})
+        load_experiment(file, {"reflectance.diffuse": 0.2})
 
 
 def test_a_set_table_takes_the_place_of_sweeps_below_it():

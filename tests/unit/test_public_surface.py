@@ -25,6 +25,7 @@ PUBLIC = {
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",
     "Specularity": "simtest.reconstruction",
+    "export": "simtest.api",
     "load_camera": "simtest.spec.camera",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",
