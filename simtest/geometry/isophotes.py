@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
+from skimage.draw import polygon2mask
 from skimage.measure import find_contours
 
 from simtest.conventions import PIXEL_CENTRE
@@ -12,6 +14,7 @@ from simtest.errors import Failure, InputError, Reason
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 
 def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
@@ -19,14 +22,14 @@ def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
 
     Parameters
     ----------
-    frame : array_like, shape (H, W)
+    frame : array_like, shape (H, W) or (H, W, C)
         Intensities.
     sigma_px : float
         Standard deviation, px; 0 leaves the frame as it is.
 
     Returns
     -------
-    ndarray of float32, shape (H, W)
+    ndarray of float32, same shape
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if sigma_px <= 0:
@@ -48,12 +51,15 @@ class Patch:
         Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
     peak_value : float
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    saturated : ndarray of bool, shape (h, w), optional
+        Where the sensor is clipped; None where that is not known.
     """
 
     values: Image | Array
     origin_px: tuple[int, int]
     peak_px: Array
     peak_value: float
+    saturated: Mask | None = None
     _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -63,6 +69,7 @@ class Patch:
         box: tuple[int, int, int, int],
         peak: tuple[int, int] | None = None,
         origin_px: tuple[int, int] = (0, 0),
+        saturated: Mask | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -76,6 +83,8 @@ class Patch:
             Column and row of the peak's pixel; default the brightest of the region.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        saturated : ndarray of bool, shape (H, W), optional
+            Where the sensor is clipped. A peak on a clipped plateau lies at the plateau's centroid.
 
         Returns
         -------
@@ -102,8 +111,17 @@ class Patch:
         if value <= 0 or value <= float(values.min()):
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {float(values.min()):g}")
         corner = (x + origin_px[0], y + origin_px[1])
-        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
-        return cls(values, corner, peak_px, value)
+        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
+        plateau = None if clipped is None else _plateau(clipped, row, column)
+        if plateau is None:
+            place = _parabolic_peak(values, row, column)
+        else:
+            pixels = np.argwhere(plateau)[:, ::-1]
+            place = pixels.mean(axis=0)
+            # Where falloff was divided away the plateau is slanted, and highest at its rim.
+            column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
+            value = float(values[row, column])
+        return cls(values, corner, place + PIXEL_CENTRE + corner, value, clipped)
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
@@ -129,6 +147,20 @@ class Patch:
             self._contours[isovalue] = self._trace(isovalue)
         return self._contours[isovalue]
 
+    def inside(self, isovalue: float) -> Mask:
+        """Tell which of the region's pixels an isophote encloses, shape (h, w); all where it does not close."""
+        contour = self.isophote(isovalue)
+        if isinstance(contour, Failure):
+            return np.ones(self.values.shape, dtype=bool)
+        return np.asarray(polygon2mask(self.values.shape, (contour - PIXEL_CENTRE - self.origin_px)[:, ::-1]))
+
+    def saturated_share(self, isovalue: float) -> float | None:
+        """Give the share of the pixels inside an isophote that are clipped; None where that is not known."""
+        if self.saturated is None:
+            return None
+        inside = self.inside(isovalue)
+        return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
+
     def _trace(self, isovalue: float) -> Array | Failure:
         if min(self.values.shape) < 3:
             return Failure(Reason.NO_CLOSED_ISOPHOTE, f"region of {self.values.shape[1]} x {self.values.shape[0]} px")
@@ -143,6 +175,17 @@ class Patch:
         if best is None:
             return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}")
         return best
+
+
+def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
+    """Give the connected clipped pixels that hold a peak's pixel, small holes closed; None where it is not clipped."""
+    if not clipped.any():
+        return None
+    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
+    if not whole[row, column]:
+        return None
+    labels, _ = ndimage.label(whole, np.ones((3, 3)))
+    return np.asarray(labels == labels[row, column])
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:

@@ -53,10 +53,13 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made)],
     }
 
+    # Pictures are encoded once more where they are drawn.
+    linear = seen.scene.sensor.response.model().decode(made.frame)
+
     def write(part: Path) -> None:
         np.savez_compressed(
             part,
-            frame=made.frame.astype(np.float16).astype(np.float32),
+            frame=linear.astype(np.float16).astype(np.float32),
             position=truth.position.astype(np.float32),
             normal=truth.normal.astype(np.float32),
             meta=np.array(json.dumps(meta, allow_nan=False)),

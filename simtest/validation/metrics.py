@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import tangent_coordinates
@@ -30,9 +31,11 @@ SCHEMA: dict[str, pl.DataType] = {
     "mahalanobis2": pl.Float64(), "distance_mm": pl.Float64(), "kd_min": pl.Float64(), "kd_max": pl.Float64(),
     "eps_over_d": pl.Float64(), "noise_sigma": pl.Float64(), "peak_snr": pl.Float64(), "isovalue": pl.Float64(),
     "isovalues": pl.String(), "axis_ratio": pl.Float64(), "axis_ratio_law": pl.Float64(), "path_depth": pl.Int64(),
-    "n_lights": pl.Int64(),
+    "n_lights": pl.Int64(), "saturated_share": pl.Float64(),
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
+
+MISSED = "missed"
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def angle_deg(first: Array, second: Array) -> Array:
 
 def rows(
     context: RowContext, specularities: list[Specularity], truths: list[JudgedHighlight], matched: dict[int, int],
-    estimators: list[str],
+    estimators: list[str], unfound: str = MISSED,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Give the rows of one realisation: of each detection, and of each truth that no detection found.
 
@@ -80,6 +83,8 @@ def rows(
         Index of the truth by index of the detection.
     estimators : list of str
         Names, for the missed.
+    unfound : str
+        Status of the rows of truths that no detection found.
 
     Returns
     -------
@@ -94,7 +99,7 @@ def rows(
             made.append(row)
     for j, truth in enumerate(truths):
         if j not in matched.values():
-            missed = {"specularity": None, "true_id": j, "status": "missed"}
+            missed = {"specularity": None, "true_id": j, "status": unfound}
             made += [{**_base(context, truth), **missed, "estimator": name} for name in estimators]
     return made
 
@@ -132,6 +137,7 @@ def _result(
     row: dict[str, Any] = {}
     if not isinstance(specularity.patch, Failure):
         row["bp_x_px"], row["bp_y_px"] = (float(v) for v in specularity.patch.peak_px)
+        row["saturated_share"] = specularity.patch.saturated_share(HIGHLIGHT_ISOVALUE)
     if isinstance(result, Failure):
         return row | {"status": str(result.reason), "flags": result.detail}
     isovalues = [isophote.isovalue for isophote in result.isophotes]
