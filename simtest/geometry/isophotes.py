@@ -16,6 +16,9 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
+MIN_PLATEAU_PX = 12
+"""Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
+
 
 def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
     """Smooth a frame with a Gaussian.
@@ -84,7 +87,7 @@ class Patch:
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
         saturated : ndarray of bool, shape (H, W), optional
-            Where the sensor is clipped. A peak on a clipped plateau lies at the plateau's centroid.
+            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
 
         Returns
         -------
@@ -178,14 +181,15 @@ class Patch:
 
 
 def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
-    """Give the connected clipped pixels that hold a peak's pixel, small holes closed; None where it is not clipped."""
-    if not clipped.any():
+    """Give the connected clipped pixels that hold a peak's pixel, small holes closed; None where there is no plateau."""
+    if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
         return None
     whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
     if not whole[row, column]:
         return None
     labels, _ = ndimage.label(whole, np.ones((3, 3)))
-    return np.asarray(labels == labels[row, column])
+    plateau = np.asarray(labels == labels[row, column])
+    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX else None
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:

@@ -13,6 +13,7 @@ from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session
 from simtest.rendering.frames import Array
+from simtest.spec.profile import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.scene import Scene
 from simtest.validation import laws
@@ -36,6 +37,9 @@ SCHEMA: dict[str, pl.DataType] = {
 """Columns that always exist, in order; the swept parameters follow by their own names."""
 
 MISSED = "missed"
+
+EQUAL_KD = 1e-3
+"""Principal curvatures times distance that differ by less are those of a plane or a sphere."""
 
 
 @dataclass(frozen=True)
@@ -183,14 +187,17 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
 def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
     """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
 
-    With a light at the camera: circle pose (two candidates) on a curved surface. With an offset light: half the
-    angle between light and camera for estimators of one candidate.
+    With a light at the camera: circle pose (two candidates) on a curved surface; the shift by unknown vignetting for
+    estimators of one candidate. With an offset light: half the angle between light and camera for those.
     """
     highlight = truth.highlight
     light = np.array(scene.rig.lights[highlight.light].place_mm)
     offset = float(np.linalg.norm(light)) > 0
     if len(estimate.candidates) == 1:
-        return float(np.degrees(laws.bisector_angle(highlight.position, light))) if offset else None
+        unknown = not (scene.sensor.vignetting_known or scene.sensor.vignetting.model().is_uniform)
+        if offset and not unknown:
+            return float(np.degrees(laws.bisector_angle(highlight.position, light)))
+        return _vignetting_law_deg(scene, estimate, truth) if unknown and not offset else None
     if offset or len(estimate.isophotes) != 1:
         return None
     a, b = laws.isophote_half_axes(
@@ -198,6 +205,17 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     )
     error = float(np.degrees(laws.circle_pose_error(a, b)))
     return error if np.isfinite(error) else None
+
+
+def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
+    """Give the shift by unknown vignetting, deg; None for a table, and where the curvatures differ."""
+    highlight, vignetting = truth.highlight, scene.sensor.vignetting
+    if not isinstance(vignetting, CosineProfile) or abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
+        return None
+    off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
+    isovalues = [isophote.isovalue for isophote in estimate.isophotes] or [1.0]
+    shifts = laws.vignetting_shift(off_axis, vignetting.power, lobe_curvature(scene), highlight.kd_min, isovalues)
+    return float(np.degrees(shifts.mean())) if np.isfinite(shifts).all() else None
 
 
 def lobe_curvature(scene: Scene) -> float:
