@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.spec.camera import CameraSpec, load_camera
 from simtest.spec.profile import CosineProfile, Profile
 from simtest.spec.reading import Spec, read_toml, validate
-from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec
+from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
 
 
 class SensorCalibration(Spec):
@@ -21,6 +21,11 @@ class SensorCalibration(Spec):
     saturation_level: float | None = Field(
         None, gt=0, le=1e6, description="value, share of the largest, at and above which a pixel counts as clipped"
     )
+
+    @model_validator(mode="after")
+    def _electrons(self) -> "SensorCalibration":
+        check_electrons(self.full_well, self.read_noise)
+        return self
 
 
 class CalibrationSpec(Spec):

@@ -16,6 +16,12 @@ ReadNoise = Annotated[float, Field(ge=0, le=1e6)]
 Bits = Annotated[int, Field(ge=8, le=16)]
 
 
+def check_electrons(full_well: float | None, read_noise: float) -> None:
+    """Raise `ValueError` where a read noise in electrons has no full well that gives it its share of full scale."""
+    if read_noise > 0 and full_well is None:
+        raise ValueError(f"read_noise = {read_noise:g} electrons: needs full_well as well")
+
+
 class LinearResponse(Spec):
     """Values are proportional to light."""
 
@@ -117,8 +123,7 @@ class Sensor(Spec):
 
     @model_validator(mode="after")
     def _electrons(self) -> "Sensor":
-        if self.read_noise > 0 and self.full_well is None:
-            raise ValueError(f"read_noise = {self.read_noise:g} electrons: needs full_well as well")
+        check_electrons(self.full_well, self.read_noise)
         return self
 
     @property

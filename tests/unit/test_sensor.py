@@ -54,7 +54,9 @@ def test_point_spread_comes_before_vignetting_and_noise():
     falloff = collect(np.ones_like(radiance), sensor(**keys), CAMERA)
     np.testing.assert_allclose(both, smooth(radiance, 1.5) * falloff, rtol=1e-5, atol=1e-9)
     assert collect(radiance, sensor(point_spread_px=1.5), CAMERA).sum() == pytest.approx(1.0, rel=1e-4)
-    noise = capture(np.zeros((200, 200), np.float32), 1.0, sensor(point_spread_px=3.0, noise_sigma=0.1), from_integer(0))
+    noise = capture(
+        np.zeros((200, 200), np.float32), 1.0, sensor(point_spread_px=3.0, noise_sigma=0.1), from_integer(0)
+    )
     assert abs(np.mean(noise[1:] * noise[:-1])) < 1e-3 * 0.1
 
 
