@@ -78,10 +78,10 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
         If the rendering backend cannot be used.
     """
     session = Session(scene, variant)
-    seen = view(session, scene)
     truth = session.truth()
     if not truth.mask.any():
         raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")
+    seen = view(session, scene)
     image = seen.frame(scene.sensor.seed)
     return LabelledFrame(
         scene, session.camera, image, seen.radiance, truth, seen.truths, seen.full_scale, session.variant

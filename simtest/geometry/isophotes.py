@@ -181,7 +181,7 @@ class Patch:
 
 
 def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
-    """Give the connected clipped pixels that hold a peak's pixel, small holes closed; None where there is no plateau."""
+    """Give the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
     if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
         return None
     whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))

@@ -98,11 +98,11 @@ def test_malformed_files_name_the_key(tmp_path, text, message):
 
 
 def test_malformed_calibrations_are_refused():
-    with pytest.raises(InputError, match="must be a simtest.Camera"):
+    with pytest.raises(InputError, match=r"must be a simtest\.Camera"):
         Calibration("camera")
     with pytest.raises(InputError, match="saturation_level"):
         Calibration(CAMERA, saturation_level=0.0)
-    with pytest.raises(InputError, match=r"must be a simtest.Camera or simtest.Calibration"):
+    with pytest.raises(InputError, match=r"must be a simtest\.Camera or simtest\.Calibration"):
         reconstruct(spot(), "camera.toml")
 
 

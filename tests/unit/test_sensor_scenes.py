@@ -195,7 +195,8 @@ def test_a_dark_frame_is_zero_with_one_warning(session, sensor):
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_rows_of_a_dark_frame_are_failures(tmp_path, isolated, sigma):
     group = {"scene": "plane", "isolated": isolated, "set": {
-        "camera.width": 64, "camera.height": 64, "camera.fx": 64.0, "camera.fy": 64.0, "sensor": {**NO_LIGHT, "noise_sigma": sigma},
+        "camera.width": 64, "camera.height": 64, "camera.fx": 64.0, "camera.fy": 64.0,
+        "sensor": {**NO_LIGHT, "noise_sigma": sigma},
     }}  # fmt: skip
     experiment = Experiment.model_validate({"name": "dark", "realisations": 3, "groups": [group]})
     with pytest.warns(UserWarning, match="no light reaches the sensor") as caught:
