@@ -8,24 +8,27 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from simtest.api import LabelledFrame, export, render, validate
+    from simtest.calibration import Calibration
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
     from simtest.geometry import Camera, Patch
     from simtest.reconstruction import Specularity, reconstruct
-    from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene
+    from simtest.spec import Experiment, Scene, load_calibration, load_camera, load_experiment, load_scene
 
 _HOMES = {
     "simtest.api": ("LabelledFrame", "export", "render", "validate"),
+    "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
     "simtest.geometry": ("Camera", "Patch"),
     "simtest.reconstruction": ("Specularity", "reconstruct"),
-    "simtest.spec": ("Experiment", "Scene", "load_camera", "load_experiment", "load_scene"),
+    "simtest.spec": ("Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "BackendError",
+    "Calibration",
     "Camera",
     "Estimate",
     "Experiment",
@@ -38,6 +41,7 @@ __all__ = [
     "SimtestError",
     "Specularity",
     "export",
+    "load_calibration",
     "load_camera",
     "load_experiment",
     "load_scene",

@@ -22,7 +22,7 @@ APP = App(
 # Told here, since a sub-command's own text is loaded with it.
 _COMMANDS = {
     "doctor": "Check the rendering backend.",
-    "schema": "Print the JSON schema of a scene, experiment or camera file.",
+    "schema": "Print the JSON schema of a scene, experiment, camera or calibration file.",
     "render": "Render a scene with its ground truth.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
@@ -12,6 +13,10 @@ from simtest.geometry.level_sets import LevelSet, level_set_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+MIN_PLATEAU_PX = 12
+"""Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
 
 
 def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
@@ -19,14 +24,14 @@ def smooth(frame: npt.ArrayLike, sigma_px: float) -> Image:
 
     Parameters
     ----------
-    frame : array_like, shape (H, W)
+    frame : array_like, shape (H, W) or (H, W, C)
         Intensities.
     sigma_px : float
         Standard deviation, px; 0 leaves the frame as it is.
 
     Returns
     -------
-    ndarray of float32, shape (H, W)
+    ndarray of float32, same shape
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if sigma_px <= 0:
@@ -50,6 +55,8 @@ class Patch:
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
     peak_pixel : tuple of int
         Column and row of the peak's pixel in the region.
+    saturated : ndarray of bool, shape (h, w), optional
+        Where the sensor is clipped; None where that is not known.
     """
 
     values: Image | Array
@@ -57,6 +64,7 @@ class Patch:
     peak_px: Array
     peak_value: float
     peak_pixel: tuple[int, int]
+    saturated: Mask | None = None
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -66,6 +74,7 @@ class Patch:
         box: tuple[int, int, int, int],
         peak: tuple[int, int] | None = None,
         origin_px: tuple[int, int] = (0, 0),
+        saturated: Mask | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -79,6 +88,8 @@ class Patch:
             Column and row of the peak's pixel; default the brightest of the region.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        saturated : ndarray of bool, shape (H, W), optional
+            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
 
         Returns
         -------
@@ -107,8 +118,17 @@ class Patch:
         if value <= 0 or value <= lowest:
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         corner = (x + origin_px[0], y + origin_px[1])
-        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
-        return cls(values, corner, peak_px, value, (column, row))
+        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
+        plateau = None if clipped is None else _plateau(clipped, row, column)
+        if plateau is None:
+            place = _parabolic_peak(values, row, column)
+        else:
+            pixels = np.argwhere(plateau)[:, ::-1]
+            place = pixels.mean(axis=0)
+            # Where falloff was divided away the plateau is slanted, and highest at its rim.
+            column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
+            value = float(values[row, column])
+        return cls(values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped)
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
@@ -148,6 +168,36 @@ class Patch:
                 Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
             )
         return self._level_sets[isovalue]
+
+    def inside(self, isovalue: float) -> Mask:
+        """Tell which of the region's pixels an isophote encloses, shape (h, w); all where it does not close."""
+        found = self._level_set(isovalue)
+        if isinstance(found, Failure):
+            return np.ones(self.values.shape, dtype=bool)
+        mask = np.zeros(self.values.shape, dtype=bool)
+        height, width = found.inside.shape
+        x, y = found.corner
+        mask[y : y + height, x : x + width] = found.inside
+        return mask
+
+    def saturated_share(self, isovalue: float) -> float | None:
+        """Give the share of the pixels inside an isophote that are clipped; None where that is not known."""
+        if self.saturated is None:
+            return None
+        inside = self.inside(isovalue)
+        return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
+
+
+def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
+    """Give the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
+    if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
+        return None
+    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
+    if not whole[row, column]:
+        return None
+    labels, _ = ndimage.label(whole, np.ones((3, 3)))
+    plateau = np.asarray(labels == labels[row, column])
+    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX else None
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:

@@ -1,5 +1,6 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema."""
 
+from simtest.spec.calibration import CalibrationSpec, load_calibration
 from simtest.spec.camera import CameraSpec, load_camera
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
@@ -16,6 +17,7 @@ from simtest.spec.surface import (
 
 __all__ = [
     "AnatomySurface",
+    "CalibrationSpec",
     "CameraSpec",
     "CylinderSurface",
     "Experiment",
@@ -28,6 +30,7 @@ __all__ = [
     "Surface",
     "Uniform",
     "apply_settings",
+    "load_calibration",
     "load_camera",
     "load_experiment",
     "load_scene",

@@ -1,7 +1,6 @@
 """From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
 
 import itertools
-import json
 import math
 import shlex
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from simtest.resources import find, shown
 from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
+from simtest.spec.writing import toml_value
 
 
 @dataclass(frozen=True)
@@ -206,17 +206,8 @@ def _plain(value: Any) -> Any:
 
 
 def _toml(value: Any) -> str:
-    """Write a value so that ``--set key=value`` reads it back."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_quoted(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_quoted(item) for item in value) + "]"
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _quoted(value: Any) -> str:
-    # A JSON string is a TOML basic string.
-    return json.dumps(value) if isinstance(value, str) else _toml(value)
+    """Write a value so that ``--set key=value`` reads it back: text stays bare."""
+    return value if isinstance(value, str) else toml_value(value)
 
 
 def swept_example(cases: list[Case]) -> dict[str, Any]:

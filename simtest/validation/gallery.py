@@ -54,7 +54,9 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made)],
     }
 
-    write_item(path, meta, made.frame, truth.position, truth.normal)
+    # Pictures are encoded once more where they are drawn.
+    linear = seen.scene.sensor.response.model().decode(made.frame)
+    write_item(path, meta, linear, truth.position, truth.normal)
 
 
 def write_item(path: Path, meta: dict[str, Any], frame: Any, position: Any, normal: Any, **more: Any) -> None:

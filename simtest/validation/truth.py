@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import NoiseModel
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
 from simtest.detection import contrast, half_height_component
 from simtest.geometry import smooth
@@ -25,7 +26,8 @@ class JudgedHighlight:
     highlight : TrueHighlight
         Where it is.
     peak_snr : float
-        Peak above its surroundings over the noise; inf without noise, 0 where it has no closed isophote.
+        Peak above its surroundings over the standard deviation of the noise at the peak's level; inf without noise, 0
+        where it has no closed isophote.
     why_not : str
         Empty for a true isolated highlight, else the first condition that it fails.
     """
@@ -41,7 +43,7 @@ class JudgedHighlight:
 
 
 def judge(
-    highlights: list[TrueHighlight], radiance: Image, noise_sigma: float, full_scale: float
+    highlights: list[TrueHighlight], light: Image, noise: NoiseModel, full_scale: float, channels: int = 1
 ) -> list[JudgedHighlight]:
     """Judge each true highlight by the noise-free frame.
 
@@ -49,23 +51,32 @@ def judge(
     ----------
     highlights : list of TrueHighlight
         All points where the normal bisects light and camera.
-    radiance : ndarray of float32, shape (H, W)
-        Noise-free radiance.
-    noise_sigma : float
-        Share of full scale.
+    light : ndarray of float32, shape (H, W)
+        Noise-free radiance behind the lens, mean of the channels.
+    noise : NoiseModel
+        Of one channel.
     full_scale : float
-        Radiance at full scale.
+        Radiance at full scale; 0 where there is no light at all.
+    channels : int
+        How many channels were averaged.
 
     Returns
     -------
     list of JudgedHighlight
         In the same order.
     """
-    smoothed = smooth(radiance, DEFAULT_SMOOTHING_PX)
+    smoothed = smooth(light, DEFAULT_SMOOTHING_PX)
     peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
     owners = _owners(highlights, peaks)
-    noise = noise_sigma * full_scale
-    return [_judge(h, smoothed, peak, owners.get(peak) is h, noise) for h, peak in zip(highlights, peaks, strict=True)]
+
+    def sigma(peak: tuple[int, int]) -> float:
+        if full_scale <= 0:
+            return 0.0
+        return float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale
+
+    return [
+        _judge(h, smoothed, peak, owners.get(peak) is h, sigma(peak)) for h, peak in zip(highlights, peaks, strict=True)
+    ]
 
 
 def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:

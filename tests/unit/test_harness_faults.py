@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 
 import simtest
+from simtest.calibration import NoiseModel
 from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
@@ -110,7 +111,7 @@ def spot(x, lit):
 def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     y, x = np.mgrid[:60, :80] + 0.5
     radiance = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 50).astype(np.float32)
-    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, 0.0, 1.0)
+    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, NoiseModel(), 1.0)
     assert [j.why_not for j in judged] == ["in shadow", ""]
 
 

@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PUBLIC = {
     "BackendError": "simtest.errors",
+    "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.base",
     "Experiment": "simtest.spec.experiment",
@@ -26,6 +27,7 @@ PUBLIC = {
     "SimtestError": "simtest.errors",
     "Specularity": "simtest.reconstruction",
     "export": "simtest.api",
+    "load_calibration": "simtest.spec.calibration",
     "load_camera": "simtest.spec.camera",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",
