@@ -74,15 +74,20 @@ def cone_axes(cones: npt.ArrayLike) -> tuple[Array, Array]:
     vectors : ndarray, shape (..., 3, 3)
         Columns e1, e2, e3, right-handed, e3 with e3_z > 0 (the cone's axis, pointing into the scene).
     """
-    C = np.asarray(cones, dtype=float)
-    values, vectors = np.linalg.eigh(C)
+    values, vectors = _ordered(np.asarray(cones, dtype=float))
+    hand = np.sign(np.linalg.det(vectors))[..., None]
+    vectors[..., 0] *= hand
+    return values, vectors
+
+
+def _ordered(cones: Array) -> tuple[Array, Array]:
+    """Do as `cone_axes`, but of either hand."""
+    values, vectors = np.linalg.eigh(cones)
     # Two eigenvalues share a sign; eigh sorts upwards, so the middle one tells which.
     flipped = values[..., 1] < 0
     values = np.where(flipped[..., None], -values, values[..., ::-1])
     vectors = np.where(flipped[..., None, None], vectors, vectors[..., ::-1])
-    vectors = np.where(vectors[..., 2:3, 2:3] < 0, -vectors, vectors)
-    hand = np.sign(np.linalg.det(vectors))[..., None]
-    vectors = np.concatenate([vectors[..., :1] * hand[..., None], vectors[..., 1:]], axis=-1)
+    vectors *= np.where(vectors[..., 2:3, 2:3] < 0, -1.0, 1.0)
     return values, vectors
 
 
@@ -109,7 +114,7 @@ def circle_poses(cones: npt.ArrayLike) -> CirclePoses:
     """
     C = np.asarray(cones, dtype=float)
     finite = np.isfinite(C).all(axis=(1, 2))
-    values, vectors = cone_axes(np.where(finite[:, None, None], C, _ROUND))
+    values, vectors = _ordered(np.where(finite[:, None, None], C, _ROUND))
     l1, l2, l3 = values.T
     sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
     failures = {}

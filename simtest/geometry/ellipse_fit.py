@@ -146,57 +146,63 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
 def _fit_padded(contours: list[Array], length: int) -> FittedConics:
     """Fit contours of at most `length` points, B of them."""
     counts = np.array([len(xy) for xy in contours])
-    points = np.zeros((len(contours), 2, length))
-    for own, xy in zip(points, contours, strict=True):
-        own[:, : len(xy)] = xy.T
+    present = np.arange(length) < counts[:, None]
+    # One table for all steps: x^2, x y, y^2, x, y, 1. Fresh memory for each would cost more than the sums.
+    design = np.zeros((6, len(contours), length))
+    design[5] = present
+    points = design[3:5]
+    for i, xy in enumerate(contours):
+        points[:, i, : len(xy)] = xy.T
     failures = _Failures()
-    extent = np.abs(points).max(axis=(1, 2))
+    extent = np.abs(points).max(axis=(0, 2))
     failures.add(~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity")
     failures.add(extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
-    points[list(failures.found)] = 0.0
-    present = np.arange(length) < counts[:, None]
-    transforms = _normalise(points, present, counts, failures)
-    conics = _fit_normalised(transforms[:, :2, :2] @ points, present, failures)
+    points[:, list(failures.found)] = 0.0
+    transforms = _normalise(points, design[5], counts, failures)
+    conics = _fit_normalised(design, counts, failures)
     _check(conics, failures)
     return FittedConics(conics, transforms, failures.found)
 
 
-def _normalise(points: Array, present: npt.NDArray[np.bool_], counts: Array, failures: _Failures) -> Array:
-    """Centre points, shape (B, 2, n), in place; give the similarities to their principal axes and unit spread.
+def _normalise(points: Array, present: Array, counts: Array, failures: _Failures) -> Array:
+    """Move points, shape (2, B, n), to their centre, principal axes and unit spread; give the similarities.
 
     In the principal axes the moments of a long ellipse are graded, and no digits are lost between them.
     """
-    centre = np.zeros((len(points), 2))
+    centre = np.zeros((2, len(counts)))
     # Twice: far from the origin the first mean is off by its rounding, and the points would share that offset.
     for _ in range(2):
-        mean = points.sum(axis=2) / counts[:, None]
+        mean = points.sum(axis=2) / counts
         points -= mean[:, :, None]
-        points *= present[:, None]
+        points *= present
         centre += mean
-    (xx, xy), (_, yy) = (points @ points.transpose(0, 2, 1)).transpose(1, 2, 0)
+    (xx, xy), (_, yy) = np.einsum("ibn,jbn->ijb", points, points)
     scale = np.sqrt((xx + yy) / counts / 2)
-    together = ~(scale > 1e-12 * (1 + np.abs(centre).max(axis=1)))
+    together = ~(scale > 1e-12 * (1 + np.abs(centre).max(axis=0)))
     failures.add(together, Reason.DEGENERATE_CONIC, "all points coincide")
-    points[together] = 0.0
+    points[:, together] = 0.0
     scale[together] = 1.0
     angle = np.arctan2(2 * xy, xx - yy) / 2
     cos, sin = np.cos(angle) / scale, np.sin(angle) / scale
-    transforms = np.zeros((len(points), 3, 3))
+    transforms = np.zeros((len(counts), 3, 3))
     transforms[:, 0, 0] = transforms[:, 1, 1] = cos
     transforms[:, 0, 1], transforms[:, 1, 0] = sin, -sin
-    transforms[:, :2, 2] = -(transforms[:, :2, :2] @ centre[:, :, None])[:, :, 0]
+    transforms[:, :2, 2] = -(transforms[:, :2, :2] @ centre.T[:, :, None])[:, :, 0]
     transforms[:, 2, 2] = 1.0
+    points[:] = (transforms[:, :2, :2] @ points.transpose(1, 0, 2)).transpose(1, 0, 2)
     return transforms
 
 
-def _fit_normalised(points: Array, present: npt.NDArray[np.bool_], failures: _Failures) -> Array:
-    """Give conics of centred points, shape (B, 2, n), by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
+def _fit_normalised(design: Array, counts: Array, failures: _Failures) -> Array:
+    """Give conics of normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
 
-    The sums of x and of y are 0, so that the linear part and the constant part do not mix.
+    The last three of `design`, shape (6, B, n), are x, y and 1. The sums of x and of y are 0: the linear and the
+    constant part do not mix.
     """
-    x, y = points[:, 0], points[:, 1]
-    design = np.stack([x * x, x * y, y * y, x, y, present], axis=1)
-    S = design[:, :3] @ design.transpose(0, 2, 1)
+    x, y = design[3:5]
+    for row, (first, second) in enumerate(((x, x), (x, y), (y, y))):
+        np.multiply(first, second, out=design[row])
+    S = design[:3].transpose(1, 0, 2) @ design.transpose(1, 2, 0)
     S1, S2, (xx, xy, yy) = S[:, :, :3], S[:, :, 3:5], S[:, :, 5].T
     spread = xx * yy - xy * xy
     on_line = ~(spread > _LINE * (xx + yy) ** 2)
@@ -204,7 +210,7 @@ def _fit_normalised(points: Array, present: npt.NDArray[np.bool_], failures: _Fa
     # d, e and f that minimise the residual for given a, b, c: (d, e) = -linear (a, b, c), f = -constant (a, b, c).
     inverse = np.stack([yy, -xy, -xy, xx], axis=1) / np.where(on_line, 1.0, spread)[:, None]
     linear = inverse.reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
-    constant = S[:, :, 5] / present.sum(axis=1)[:, None]
+    constant = S[:, :, 5] / counts[:, None]
     M = S1 - S2 @ linear - S[:, :, 5, None] * constant[:, None, :]
     M = (M + M.transpose(0, 2, 1)) / 2
     # One eigenvalue of M is 0 on an exact ellipse; where two are, as on four points, many conics fit.

@@ -208,7 +208,7 @@ def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
             before, here, after = (float(v) for v in line[index - 1 : index + 2])
             bend = before - 2 * here + after
             if bend < 0:
-                position[axis] += float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+                position[axis] += min(max(0.5 * (before - after) / bend, -0.5), 0.5)
     return np.array(position)
 
 

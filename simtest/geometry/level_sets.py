@@ -13,7 +13,6 @@ from skimage.measure import find_contours
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
-Index = npt.NDArray[np.intp]
 
 _ABOVE, _REGION, _OUTSIDE = 1, 2, 3
 
@@ -44,21 +43,22 @@ class LevelSet:
 
         Those between horizontal neighbours first, row by row, then those between vertical ones.
         """
-        rows, columns = np.nonzero(self.inside[:, 1:] != self.inside[:, :-1])
-        rows_down, columns_down = np.nonzero(self.inside[1:] != self.inside[:-1])
-        across = len(rows)
-        points = np.empty((across + len(rows_down), 2))
-        points[:across, 0] = columns + self._share(rows, columns, rows, columns + 1)
-        points[:across, 1] = rows
-        points[across:, 0] = columns_down
-        points[across:, 1] = rows_down + self._share(rows_down, columns_down, rows_down + 1, columns_down)
+        width = self.inside.shape[1]
+        rows, columns = np.divmod(np.flatnonzero(self.inside[:, 1:] != self.inside[:, :-1]), width - 1)
+        first = rows * width + columns
+        below = np.flatnonzero(self.inside[1:] != self.inside[:-1])
+        rows_down, columns_down = np.divmod(below, width)
+        # Where the level lies between two neighbours, 0 at the first and 1 at the next.
+        values = np.ravel(self.values)
+        start = values[np.concatenate([first, below])].astype(float)
+        end = values[np.concatenate([first + 1, below + width])]
+        share = (self.level - start) / (end - start)
+        across = len(first)
+        points = np.empty((len(share), 2))
+        points[:across, 0], points[:across, 1] = columns + share[:across], rows
+        points[across:, 0], points[across:, 1] = columns_down, rows_down + share[across:]
         points += self.corner
         return points
-
-    def _share(self, row: Index, column: Index, next_row: Index, next_column: Index) -> Array:
-        """Give where the level lies between two neighbours, 0 at the first and 1 at the next."""
-        first = self.values[row, column].astype(float)
-        return np.asarray((self.level - first) / (self.values[next_row, next_column] - first))
 
     def polygon(self) -> Array:
         """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred."""

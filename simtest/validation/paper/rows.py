@@ -1,7 +1,7 @@
 """Rows of results for realisations of the published protocol."""
 
 import itertools
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -59,8 +59,9 @@ def paper_rows(
     return pl.concat(tables, how="vertical_relaxed").sort("realisation", maintain_order=True)
 
 
+@lru_cache(maxsize=2)
 def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
-    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue."""
+    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue; the last two are kept."""
     batched = {name: one_by_one(estimator) for name, estimator in load_estimators(estimators).items()}
     if "circle_pose" in batched:
         batched["circle_pose"] = partial(circle_poses, isovalue=setting.isovalue)
