@@ -217,7 +217,7 @@ def load(variant: str | None = None) -> Any:
         If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
-    if "drjit" in sys.modules:
+    if _drjit_loaded():
         if name.startswith("llvm"):
             _check_library_in_memory()
     else:
@@ -236,6 +236,11 @@ def load(variant: str | None = None) -> Any:
             cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
             raise BackendError(f"variant {name}: cannot be used here ({cause})") from error
     return mitsuba
+
+
+def _drjit_loaded() -> bool:
+    """Tell whether Dr.Jit has been imported, and has loaded its libLLVM: then there is nothing left to choose."""
+    return "drjit" in sys.modules
 
 
 def _set_library(needed: bool) -> None:
