@@ -12,7 +12,7 @@ from simtest import provenance
 from simtest.errors import InputError
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera
-from simtest.rendering import Radiance, Session, TruthMaps
+from simtest.rendering import Progress, Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
 from simtest.seeds import from_integer
 from simtest.sensor import expose, to_uint8
@@ -55,7 +55,7 @@ class LabelledFrame:
     variant: str
 
 
-def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
+def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
     """Render a labelled frame.
 
     Parameters
@@ -64,6 +64,8 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
         The scene; its noise hangs on ``sensor.seed``.
     variant : str, optional
         Mitsuba variant.
+    progress : callable, optional
+        Told after each part of the rendering: samples done, samples in all, and what is done.
 
     Returns
     -------
@@ -77,7 +79,8 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
         If the rendering backend cannot be used.
     """
     session = Session(scene, variant)
-    seen = view(session, scene)
+    # The truth starts from the hits that the labels are made of.
+    seen = view(session, scene, session.frame(progress).radiance)
     truth = session.truth()
     if not truth.mask.any():
         raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")

@@ -112,7 +112,8 @@ def _base(context: RowContext, truth: JudgedHighlight | None) -> dict[str, Any]:
     if truth is None:
         return row
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    # Of the light that made the highlight, at its true place.
+    light = scene.rig.true_mm()[highlight.light]
     row |= {
         "distance_mm": highlight.distance,
         "kd_min": highlight.kd_min,
@@ -181,7 +182,7 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     angle between light and camera for estimators of one candidate.
     """
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    light = scene.rig.true_mm()[highlight.light]
     offset = float(np.linalg.norm(light)) > 0
     if len(estimate.candidates) == 1:
         return float(np.degrees(laws.bisector_angle(highlight.position, light))) if offset else None

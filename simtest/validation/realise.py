@@ -65,7 +65,7 @@ class Realisation:
     matched: dict[int, int]
 
 
-def view(session: Session, scene: Scene) -> View:
+def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> View:
     """Render a scene and judge its true highlights.
 
     Parameters
@@ -74,13 +74,16 @@ def view(session: Session, scene: Scene) -> View:
         Is moved to the scene.
     scene : Scene
         The scene.
+    radiance : Radiance, optional
+        Of the scene, where it is rendered already.
 
     Returns
     -------
     View
     """
     session.update(scene)
-    radiance = session.radiance()
+    if radiance is None:
+        radiance = session.radiance()
     total = radiance.intensity
     peak = float(total.max())
     highlights = session.highlights(radiance)
