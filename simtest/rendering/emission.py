@@ -122,8 +122,7 @@ def _interpolate(mi: Any, knots: Any, values: Any, x: Any, entries: int) -> Any:
     """Interpolate a table linearly; the last value holds beyond it."""
     import drjit as dr
 
-    above = dr.binary_search(mi.UInt32(1), mi.UInt32(entries), lambda i: dr.gather(mi.Float, knots, i) < x)
-    upper = dr.minimum(above, entries - 1)
+    upper = dr.binary_search(1, entries - 1, lambda i: dr.gather(mi.Float, knots, i) < x)
     low, high = dr.gather(mi.Float, knots, upper - 1), dr.gather(mi.Float, knots, upper)
     share = dr.clip((x - low) / (high - low), 0, 1)
     return dr.lerp(dr.gather(mi.Float, values, upper - 1), dr.gather(mi.Float, values, upper), share)

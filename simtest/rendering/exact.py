@@ -35,7 +35,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
         return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
     import drjit as dr
 
-    asked = np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1)
+    asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
     # No NaN may enter the renderer.
     ray = mi.Ray3f(
         mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),

@@ -222,4 +222,3 @@ def as_radiance(parts: list[FloatImage]) -> Radiance:
         return own[0] if width == 1 else np.stack(own, axis=-1)
 
     return Radiance(image(0), image(1), image(2))
-

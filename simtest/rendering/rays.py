@@ -77,8 +77,12 @@ class Sightlines:
         self.camera_from_model = mi.Matrix3f(model_from_camera[:3, :3].T.tolist())
         numbers = {"fx": 1 / camera.fx, "fy": 1 / camera.fy, "cx": camera.cx, "cy": camera.cy, "skew": camera.skew}
         self._numbers = {name: mi.Float(value) for name, value in numbers.items()}
+        # A round field of view, which a camera may have: pixels whose centres lie outside see nothing.
+        mask = getattr(camera, "view_mask", None)
+        self._mask = None if mask is None else [mi.Float(v) for v in (mask.cx, mask.cy, mask.radius**2)]
         self._width, self._tiles = mi.UInt32(camera.width), mi.UInt32(-(-camera.width // TILE))
-        dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers, self._width, self._tiles)
+        dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
+        dr.make_opaque(self._mask, self._width, self._tiles)
 
     @property
     def tiled_size(self) -> tuple[int, int]:
@@ -144,7 +148,7 @@ class Sightlines:
         sightline : mitsuba.Vector3f
             The directions in the camera frame.
         active : mitsuba.Bool
-            False where the camera has no sightline.
+            False where the camera has no sightline or the pixel lies outside its round field of view.
         """
         import drjit as dr
 
@@ -157,16 +161,29 @@ class Sightlines:
             sightline = mi.Vector3f(a, b, 1) / dr.sqrt(a * a + b * b + 1)
         else:
             directions = self.camera.unproject(np.stack([np.array(x), np.array(y)], axis=-1).astype(np.float64))
-            seen = np.isfinite(directions).all(axis=-1)
+            seen = np.asarray(np.isfinite(directions).all(axis=-1))
             # No NaN may enter the renderer.
             directions = np.where(seen[:, None], directions, [0.0, 0.0, 1.0])
             sightline, active = mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)), mi.Bool(seen)
+        if self._mask is not None:
+            cx, cy, squared = self._mask
+            column, row = dr.floor(x) + PIXEL_CENTRE, dr.floor(y) + PIXEL_CENTRE
+            active &= dr.square(column - cx) + dr.square(row - cy) <= squared
         return mi.Ray3f(self._origin, self._rotation @ sightline), sightline, active
 
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
-        """Give origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3)."""
+        """Give origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
+
+        Outside the round field of view too; NaN where the camera has no sightline.
+        """
         directions = self.camera.unproject(points_px) @ self._pose[:3, :3].T
         return np.broadcast_to(self._pose[:3, 3], directions.shape), directions
+
+    def in_view(self, points_px: Array) -> tuple[Array, Array]:
+        """Give origins and directions as `in_model` does; NaN outside the round field of view."""
+        origins, directions = self.in_model(points_px)
+        mask = getattr(self.camera, "view_mask", None)
+        return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
 
 
 def untile(values: Any, size: tuple[int, int]) -> Any:

@@ -7,7 +7,6 @@ import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
 from simtest.errors import InputError
-from simtest.geometry.camera import Camera
 from simtest.rendering import backend, emission, exact, highlights, phong
 from simtest.rendering.direct import COLOCATED_MM, DirectLight, Material
 from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
@@ -70,6 +69,7 @@ class Session:
         self.rebuilds = 0
         self._built: _Built | None = None
         self._load_surface(scene)
+        self._set_camera(scene)
         self.update(scene)
 
     def update(self, scene: Scene) -> None:
@@ -87,13 +87,12 @@ class Session:
         """
         if scene.surface != self.scene.surface:
             self._load_surface(scene)
+            self._set_camera(scene)
         else:
             _check_places(scene, self.surface)
-            if scene.camera != self.scene.camera:
-                self._forget()  # of another camera
+            if scene.camera != self._camera_spec:
+                self._set_camera(scene)
         self.scene: Scene = scene
-        self.camera: Camera = scene.camera.model()
-        self.sightlines = Sightlines(self.mi, self.camera, self.surface.model_from_camera)
         reflectance = scene.reflectance
         material = (type(reflectance), getattr(reflectance, "normalised", None))
         key = (self._shape.key, material, tuple(emission.kind_of(light) for light in scene.rig.lights))
@@ -108,6 +107,11 @@ class Session:
         self._shape = surface.shape()
         self.surface: SurfaceModel = surface
         self.scene = scene
+        self._forget()
+
+    def _set_camera(self, scene: Scene) -> None:
+        self._camera_spec, self.camera = scene.camera, scene.camera.model()
+        self.sightlines = Sightlines(self.mi, self.camera, self.surface.model_from_camera)
         self._forget()
 
     def _forget(self) -> None:
@@ -230,7 +234,10 @@ class Session:
         shading_normal, geometric_normal : ndarray, shape (N, 3)
             Normals of the rendered shape, camera frame; NaN where the ray misses.
         """
-        origins, directions = self.sightlines.in_model(points_px)
+        return self._cast(*self.sightlines.in_model(points_px))
+
+    def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
+        """Cast rays of the model frame (see `cast`); a direction of NaN hits nothing."""
         hits, shading, geometric = self._hits(origins, directions)
         rotation = self.surface.model_from_camera[:3, :3]
         return exact.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
@@ -258,13 +265,13 @@ class Session:
         pixels = centres.reshape(-1, 2)
         if stride == 1 and self._centre:
             hits, shading, geometric = as_hits(self._centre)
-            points = exact.solve(self.surface, *self.sightlines.in_model(pixels), hits)
+            points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
-            points, shading, geometric = self.cast(pixels)
+            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels))
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])
 
     def lit(self, positions: Array, light: int) -> Any:
-        """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches without being blocked."""
+        """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
         place = self.scene.rig.true_mm()[light : light + 1]
         towards = positions - place
         distance = np.linalg.norm(towards, axis=1)

@@ -144,9 +144,7 @@ class Rig(Spec):
     """The lights that travel with the camera: a list, or a preset whose numbers can be overridden."""
 
     lights: tuple[LightSpec, ...] = Field((LightSpec(),), min_length=1, max_length=32)
-    preset: Preset | None = Field(
-        None, description="lights on a ring about the optical axis, in place of lights"
-    )
+    preset: Preset | None = Field(None, description="lights on a ring about the optical axis, in place of lights")
     count: int | None = Field(None, ge=1, le=32, description="of a preset: number of lights")
     radius_mm: float | None = Field(None, ge=0, le=1e6, description="of a preset: radius of the ring, mm")
     azimuth_deg: float | None = Field(
