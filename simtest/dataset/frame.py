@@ -78,7 +78,7 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
     BackendError
         If the rendering backend cannot be used.
     """
-    session = Session(scene, variant)
+    session = Session(scene, variant, labelled=True)
     # The truth starts from the hits that the labels are made of.
     seen = view(session, scene, session.frame(progress).radiance)
     truth = session.truth()

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
-from simtest.errors import InputError
 from simtest.rendering import backend, emission, exact, highlights, phong
 from simtest.rendering.direct import COLOCATED_MM, DirectLight, Material
 from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
@@ -14,6 +13,7 @@ from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
+from simtest.rendering.places import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.shapes import make_shape
 from simtest.spec.scene import Scene
@@ -47,6 +47,8 @@ class Session:
         The first scene.
     variant : str, optional
         Mitsuba variant; default by `simtest.rendering.backend.requested_variant`.
+    labelled : bool
+        Whether to prepare for `frame` when a scene is built, rather than at the first call.
 
     Attributes
     ----------
@@ -61,12 +63,13 @@ class Session:
         If the surface's file is malformed, the camera lies on the wrong side, or a light inside a body.
     """
 
-    def __init__(self, scene: Scene, variant: str | None = None) -> None:
+    def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
         self.mi = backend.load(variant)
         self.variant = str(self.mi.variant())
         self.plugin = phong.register(self.mi, self.variant)
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
+        self._labelled = labelled
         self._built: _Built | None = None
         self._load_surface(scene)
         self._set_camera(scene)
@@ -89,7 +92,8 @@ class Session:
             self._load_surface(scene)
             self._set_camera(scene)
         else:
-            _check_places(scene, self.surface)
+            if scene.rig != self.scene.rig:
+                check_lights(scene, self.surface)
             if scene.camera != self._camera_spec:
                 self._set_camera(scene)
         self.scene: Scene = scene
@@ -98,12 +102,15 @@ class Session:
         key = (self._shape.key, material, tuple(emission.kind_of(light) for light in scene.rig.lights))
         if self._built is None or self._built.key != key:
             self._built = self._build(key)
+        if self._labelled:
+            self._shape_labels()
         self._apply(self._built)
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here and leaves the session at its scene.
         surface = make_surface(scene.surface)
-        _check_places(scene, surface)
+        check_camera(scene, surface)
+        check_lights(scene, surface)
         self._shape = surface.shape()
         self.surface: SurfaceModel = surface
         self.scene = scene
@@ -194,13 +201,16 @@ class Session:
         -------
         Frame
         """
+        radiance, channels = self._render(self._shape_labels(), progress)
+        self._centre = channels
+        return Frame(radiance, as_labels(channels))
+
+    def _shape_labels(self) -> ShapeLabels:
         assert self._built is not None
         if self._built.labels is None:
             operators = self.surface.vertex_shape_operators()
             self._built.labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], operators)
-        radiance, channels = self._render(self._built.labels, progress)
-        self._centre = channels
-        return Frame(radiance, as_labels(channels))
+        return self._built.labels
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
         built, effort = self._built, self.scene.render
@@ -307,24 +317,3 @@ def _set(parameters: Any, suffix: str, value: Any) -> None:
     paths = [path for path in parameters.keys() if path.endswith(suffix)]  # noqa: SIM118 - no plain dict
     assert len(paths) == 1, (suffix, list(parameters.keys()))
     parameters[paths[0]] = value
-
-
-def _check_places(scene: Scene, surface: SurfaceModel) -> None:
-    """Raise `InputError` where the camera lies in the wall, or a light inside a body."""
-    pose = surface.model_from_camera
-    room = float(surface.clearance(pose[None, :3, 3])[0])
-    if not room > 0:
-        raise InputError(
-            f"scene {scene.name}: surface: the camera lies {-room:.3g} mm inside the wall; it must be in free space: "
-            "change surface.distance_mm, surface.tilt_deg or the curvature"
-        )
-    if not surface.solid:
-        return
-    places = scene.rig.true_mm()
-    rooms = surface.clearance(places @ pose[:3, :3].T + pose[:3, 3])
-    for i in np.flatnonzero(~(rooms > 0)):
-        place = ", ".join(f"{value:.4g}" for value in places[i])
-        raise InputError(
-            f"scene {scene.name}: rig.lights.{i} at ({place}) mm: lies {-rooms[i]:.3g} mm inside the "
-            f"{scene.surface.label}; a light must be in free space"
-        )
