@@ -27,9 +27,7 @@ FRAMES = 1000
 AOVS = "d:depth,p:position,s:sh_normal,g:geo_normal,i:shape_index,f:prim_index"
 
 
-def _scene(
-    samples: int = 16, light: dict[str, Any] | None = None, exponent: float = 50.0, fx: float = 400.0
-) -> Scene:
+def _scene(samples: int = 16, light: dict[str, Any] | None = None, exponent: float = 50.0, fx: float = 400.0) -> Scene:
     return scene_from_dict(
         {
             "surface": {"type": "anatomy", "path": "colon"},

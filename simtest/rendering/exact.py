@@ -64,10 +64,11 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
 def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
     """Make `RayHits` from single-precision values, shapes (N,), (N,) and (N, 2); a NaN distance is a miss."""
     missed = np.isnan(distance)
+    # What a miss left in its place may be no number: it is dropped before it is converted.
     return RayHits(
-        np.where(missed, np.inf, distance.astype(np.float64)),
-        np.where(missed, 0, face.astype(np.int64)),
-        np.where(missed[:, None], 0.0, barycentric.astype(np.float64)),
+        np.where(missed, np.float32(np.inf), distance).astype(np.float64),
+        np.where(missed, 0, face).astype(np.int64),
+        np.where(missed[:, None], np.float32(0), barycentric).astype(np.float64),
     )
 
 

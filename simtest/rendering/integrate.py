@@ -57,13 +57,17 @@ class Tracer:
     light: DirectLight
     material: Material
 
-    def _hit(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-        """Trace pixel positions; gives rays, their directions in the camera frame, hits and surface points."""
+    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Any, Any, Any, Any]:
+        """Trace pixel positions; gives rays, their directions in the camera frame, hits and surface points.
+
+        With `bent` the points know the derivatives of their normals.
+        """
         import drjit as dr
 
         ray, sightline, active = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(ray, True, active)
-        si = preliminary.compute_surface_interaction(ray, self.mi.RayFlags.All, active)
+        flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
+        si = preliminary.compute_surface_interaction(ray, +flags, active)
         # Mitsuba interpolates the hit between the shape's corners; those of the plane lie so far beyond the view that
         # 1e-3 mm are lost, a per mille of the radiance. The point along the ray keeps the digits of t.
         si.p = dr.select(si.is_valid(), ray(si.t), si.p)
@@ -106,7 +110,7 @@ class Tracer:
         count_of_parts = 0
         for block, (first, count) in enumerate(_blocks(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
-            ray, sightline, preliminary, si = self._hit(*self.sightlines.centre(lanes))
+            ray, sightline, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
             parts = self._parts(si, bounces, count, block, 0) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
