@@ -18,7 +18,10 @@ def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
     from simtest.spec import parse_settings
 
     refuse_file(out)
-    with progress_bar("finding the truth") as move:
-        frame = api.render(scene, parse_settings(settings or []), variant, move)
+    try:
+        with progress_bar("finding the truth") as move:
+            frame = api.render(scene, parse_settings(settings or []), variant, move)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("nothing is written") from None
     for file in write_frame(frame, out):
         print(file)
