@@ -338,8 +338,6 @@ SWEPT = {
 
 @pytest.mark.parametrize("name", SWEPT)
 def test_a_sweep_builds_once_compiles_once_and_gives_what_fresh_sessions_give(name):
-    import drjit as dr
-
     def step(i):
         profile = {"type": "cosine", "power": 1.0 + 0.5 * i}
         light = {"offset_mm": 1.0 + i, "power": 1.0 + i, "profile": profile, "direction": [0.1 * i, 0.0, 1.0]}
@@ -349,6 +347,8 @@ def test_a_sweep_builds_once_compiles_once_and_gives_what_fresh_sessions_give(na
 
     session = Session(step(0))
     session.frame()
+    import drjit as dr  # after the backend has chosen its libLLVM
+
     swept = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
