@@ -15,7 +15,7 @@ from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import FloatImage, Radiance
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.labels import ShapeLabels
-from simtest.rendering.rays import Lanes, Sightlines, untile
+from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
 from simtest.rendering.spectrum import channels
 
 Progress = Callable[[int, int, str], None]
@@ -57,21 +57,21 @@ class Tracer:
     light: DirectLight
     material: Material
 
-    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Any, Any, Any, Any]:
-        """Trace pixel positions; gives rays, their directions in the camera frame, hits and surface points.
+    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Any]:
+        """Trace pixel positions; gives rays, hits and surface points.
 
         With `bent` the points know the derivatives of their normals.
         """
         import drjit as dr
 
-        ray, sightline, active = self.sightlines.rays(x, y)
-        preliminary = self.scene.ray_intersect_preliminary(ray, True, active)
+        rays = self.sightlines.rays(x, y)
+        preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
         flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
-        si = preliminary.compute_surface_interaction(ray, +flags, active)
+        si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
         # Mitsuba interpolates the hit between the shape's corners; those of the plane lie so far beyond the view that
         # 1e-3 mm are lost, a per mille of the radiance. The point along the ray keeps the digits of t.
-        si.p = dr.select(si.is_valid(), ray(si.t), si.p)
-        return ray, sightline, preliminary, si
+        si.p = dr.select(si.is_valid(), rays.traced(si.t), si.p)
+        return rays, preliminary, si
 
     def _parts(self, si: Any, bounces: Bounces | None, count: int, block: int, sample: int) -> list[Any]:
         """Give the channels of direct light off the lobe and the base and, with bounces, of theirs."""
@@ -110,12 +110,12 @@ class Tracer:
         count_of_parts = 0
         for block, (first, count) in enumerate(_blocks(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
-            ray, sightline, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
+            rays, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
             parts = self._parts(si, bounces, count, block, 0) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
                 rotation = self.sightlines.camera_from_model
-                parts = parts + labels.trace(preliminary, si, ray, sightline, rotation)
+                parts = parts + labels.trace(preliminary, si, rays, rotation)
             rows.append(_evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
@@ -183,7 +183,7 @@ class Tracer:
         dr.make_opaque(number, end)
 
         def step(number: Any, *sums: Any) -> tuple[Any, ...]:
-            _, _, _, si = self._hit(*self.sightlines.sample(lanes, number))
+            _, _, si = self._hit(*self.sightlines.sample(lanes, number))
             parts = self._parts(si, None, 0, 0, 0)
             return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
@@ -196,7 +196,7 @@ class Tracer:
 
         which = self.mi.UInt32(number)
         dr.make_opaque(which)
-        _, _, _, si = self._hit(*self.sightlines.sample(lanes, which))
+        _, _, si = self._hit(*self.sightlines.sample(lanes, which))
         return self._parts(si, bounces, count, block, number)
 
 

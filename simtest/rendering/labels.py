@@ -11,6 +11,7 @@ import numpy as np
 from simtest.anatomy import RayHits
 from simtest.rendering.exact import pack_hits
 from simtest.rendering.frames import Array, FloatImage, Labels
+from simtest.rendering.rays import Rays
 
 CHANNELS = (
     "depth", "x", "y", "z", "normal_x", "normal_y", "normal_z", "geometric_x", "geometric_y", "geometric_z",
@@ -41,7 +42,7 @@ class ShapeLabels:
             upper = np.ascontiguousarray(shape_operators[:, rows, columns], dtype=np.float32)
             self._operators = mi.Float(upper.ravel())
 
-    def trace(self, preliminary: Any, si: Any, ray: Any, sightline: Any, rotation: Any) -> list[Any]:
+    def trace(self, preliminary: Any, si: Any, rays: Rays, rotation: Any) -> list[Any]:
         """Give the channels.
 
         Parameters
@@ -50,10 +51,8 @@ class ShapeLabels:
             The hits.
         si : mitsuba.SurfaceInteraction3f
             Of the same hits, with all derivatives.
-        ray : mitsuba.Ray3f
+        rays : Rays
             The rays.
-        sightline : mitsuba.Vector3f
-            Their directions in the camera frame.
         rotation : mitsuba.Matrix3f
             From the model frame to the camera frame.
 
@@ -67,11 +66,11 @@ class ShapeLabels:
         mi = self.mi
         seen = si.is_valid()
         # Rendered shapes are seen from either side.
-        facing = dr.select(dr.dot(si.n, ray.d) > 0, mi.Float(-1), mi.Float(1))
+        facing = dr.select(dr.dot(si.n, rays.traced.d) > 0, mi.Float(-1), mi.Float(1))
         shading, geometric = rotation @ mi.Vector3f(si.sh_frame.n), rotation @ (mi.Vector3f(si.n) * facing)
         a, b, c = self._second_form(preliminary, si, seen)
         mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
-        position = sightline * si.t
+        position = rays.sightline * si.t
         channels = [si.t, *position, *shading, *geometric, facing * mean - half, facing * mean + half]
         channels = [dr.select(seen, channel, dr.nan) for channel in channels]
         face = dr.reinterpret_array(mi.Float, preliminary.prim_index)

@@ -47,6 +47,29 @@ class Lanes:
     shift_y: Any
 
 
+@dataclass(frozen=True)
+class Rays:
+    """Rays of one launch.
+
+    Parameters
+    ----------
+    traced : mitsuba.Ray3f
+        Model frame, mm; unit directions.
+    origin, direction : mitsuba.Vector3d
+        The same in double precision.
+    sightline : mitsuba.Vector3f
+        The directions in the camera frame.
+    active : mitsuba.Bool
+        False where the camera has no sightline or the pixel lies outside its round field of view.
+    """
+
+    traced: Any
+    origin: Any
+    direction: Any
+    sightline: Any
+    active: Any
+
+
 class Sightlines:
     """The rays of a camera at its pose.
 
@@ -72,11 +95,11 @@ class Sightlines:
         self.in_kernel = is_pinhole(camera)
         self._pose = model_from_camera
         # Opaque, so that another camera or pose compiles no new kernel.
-        self._origin = mi.Point3f(*model_from_camera[:3, 3].tolist())
-        self._rotation = mi.Matrix3f(model_from_camera[:3, :3].tolist())
+        self._origin = mi.Vector3d(*model_from_camera[:3, 3].tolist())
+        self._rotation = mi.Matrix3d(model_from_camera[:3, :3].tolist())
         self.camera_from_model = mi.Matrix3f(model_from_camera[:3, :3].T.tolist())
         numbers = {"fx": 1 / camera.fx, "fy": 1 / camera.fy, "cx": camera.cx, "cy": camera.cy, "skew": camera.skew}
-        self._numbers = {name: mi.Float(value) for name, value in numbers.items()}
+        self._numbers = {name: mi.Float64(value) for name, value in numbers.items()}
         # A round field of view, which a camera may have: pixels whose centres lie outside see nothing.
         mask = getattr(camera, "view_mask", None)
         self._mask = None if mask is None else [mi.Float(v) for v in (mask.cx, mask.cy, mask.radius**2)]
@@ -133,7 +156,7 @@ class Sightlines:
         """Give the centres of the pixels, px."""
         return self.mi.Float(lanes.column) + PIXEL_CENTRE, self.mi.Float(lanes.row) + PIXEL_CENTRE
 
-    def rays(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    def rays(self, x: Any, y: Any) -> Rays:
         """Give the rays of pixel positions.
 
         Parameters
@@ -143,12 +166,7 @@ class Sightlines:
 
         Returns
         -------
-        ray : mitsuba.Ray3f
-            Model frame, mm; unit directions.
-        sightline : mitsuba.Vector3f
-            The directions in the camera frame.
-        active : mitsuba.Bool
-            False where the camera has no sightline or the pixel lies outside its round field of view.
+        Rays
         """
         import drjit as dr
 
@@ -156,20 +174,22 @@ class Sightlines:
         active = mi.Bool(True)
         if self.in_kernel:
             n = self._numbers
-            b = (y - n["cy"]) * n["fy"]
-            a = (x - n["cx"] - n["skew"] * b) * n["fx"]
-            sightline = mi.Vector3f(a, b, 1) / dr.sqrt(a * a + b * b + 1)
+            b = (mi.Float64(y) - n["cy"]) * n["fy"]
+            a = (mi.Float64(x) - n["cx"] - n["skew"] * b) * n["fx"]
+            sightline = mi.Vector3d(a, b, 1) / dr.sqrt(a * a + b * b + 1)
         else:
             directions = self.camera.unproject(np.stack([np.array(x), np.array(y)], axis=-1).astype(np.float64))
             seen = np.asarray(np.isfinite(directions).all(axis=-1))
             # No NaN may enter the renderer.
             directions = np.where(seen[:, None], directions, [0.0, 0.0, 1.0])
-            sightline, active = mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)), mi.Bool(seen)
+            sightline, active = mi.Vector3d(np.ascontiguousarray(directions.T)), mi.Bool(seen)
         if self._mask is not None:
             cx, cy, squared = self._mask
             column, row = dr.floor(x) + PIXEL_CENTRE, dr.floor(y) + PIXEL_CENTRE
             active &= dr.square(column - cx) + dr.square(row - cy) <= squared
-        return mi.Ray3f(self._origin, self._rotation @ sightline), sightline, active
+        direction = self._rotation @ sightline
+        traced = mi.Ray3f(mi.Point3f(self._origin), mi.Vector3f(direction))
+        return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
 
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
         """Give origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
