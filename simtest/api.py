@@ -13,7 +13,10 @@ __all__ = ["LabelledFrame", "export", "reconstruct", "render", "validate"]
 
 
 def render(
-    scene: Scene | str | Path, settings: Mapping[str, Any] | None = None, variant: str | None = None
+    scene: Scene | str | Path,
+    settings: Mapping[str, Any] | None = None,
+    variant: str | None = None,
+    progress: Progress | None = None,
 ) -> LabelledFrame:
     """Render a scene with its ground truth.
 
@@ -25,6 +28,8 @@ def render(
         Values that replace those of a scene file, by key path, such as ``{"surface.radius_mm": 5.0}``.
     variant : str, optional
         Mitsuba variant.
+    progress : callable, optional
+        Called with samples done, samples in all, and what is done; what it raises stops the frame.
 
     Returns
     -------
@@ -38,7 +43,7 @@ def render(
         If the rendering backend cannot be used.
     """
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return make_frame(described, variant)
+    return make_frame(described, variant, progress)
 
 
 def export(

@@ -67,8 +67,9 @@ def main() -> None:
         sys.exit(_say(str(error), BAD_USE))
     except SimtestError as error:
         sys.exit(_say(str(error), 1))
-    except KeyboardInterrupt:
-        sys.exit(_say("stopped; what is finished is kept, and the same command goes on from there", INTERRUPTED))
+    except KeyboardInterrupt as stopped:
+        kept = "what is finished is kept, and the same command goes on from there"
+        sys.exit(_say(f"stopped; {str(stopped) or kept}", INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

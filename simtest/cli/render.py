@@ -14,11 +14,16 @@ def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
         A scene file, or the name of a shipped scene.
     """
     from simtest import api
+    from simtest.cli.progress import progress_bar
     from simtest.dataset import write_frame
     from simtest.files import refuse_file
     from simtest.spec import parse_settings
 
     refuse_file(out)
-    frame = api.render(scene, parse_settings(settings or []), variant)
+    try:
+        with progress_bar("finding the truth") as move:
+            frame = api.render(scene, parse_settings(settings or []), variant, move)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("nothing is written") from None
     for file in write_frame(frame, out):
         print(file)

@@ -12,7 +12,7 @@ from simtest import provenance
 from simtest.errors import InputError
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera
-from simtest.rendering import Radiance, Session, TruthMaps
+from simtest.rendering import Progress, Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
 from simtest.sensor import to_uint8
 from simtest.spec import Scene
@@ -56,7 +56,7 @@ class LabelledFrame:
     variant: str
 
 
-def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
+def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
     """Render a labelled frame.
 
     Parameters
@@ -65,6 +65,8 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
         The scene; its noise hangs on ``sensor.seed``.
     variant : str, optional
         Mitsuba variant.
+    progress : callable, optional
+        Told after each part of the rendering: samples done, samples in all, and what is done.
 
     Returns
     -------
@@ -77,11 +79,13 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
     BackendError
         If the rendering backend cannot be used.
     """
-    session = Session(scene, variant)
+    session = Session(scene, variant, labelled=True)
+    # The truth starts from the hits that the labels are made of.
+    radiance = session.frame(progress).radiance
     truth = session.truth()
     if not truth.mask.any():
         raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")
-    seen = view(session, scene)
+    seen = view(session, scene, radiance)
     image = seen.frame(scene.sensor.seed)
     return LabelledFrame(
         scene, session.camera, image, seen.radiance, truth, seen.truths, seen.full_scale, session.variant
@@ -152,6 +156,8 @@ def _calibration_file(scene: Scene) -> str:
         stated["response"] = sensor.response.model_dump() if sensor.response_known else {"type": "linear"}
     if sensor.vignetting_known and not sensor.vignetting.model().is_uniform:
         stated["vignetting"] = sensor.vignetting.model_dump()
+    if (profile := scene.rig.known_emission()) is not None:
+        stated["emission"] = profile.model_dump()
     electrons = {"full_well": sensor.full_well, "read_noise": sensor.read_noise} if sensor.full_well else {}
     bits = (sensor.bits or _png_bits(sensor)) if sensor.encodes else 8
     stated["sensor"] = {**electrons, "bits": bits, "saturation_level": 1.0}

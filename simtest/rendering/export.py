@@ -38,8 +38,11 @@ VIEW_MARGIN = 1.05
 """Half-size of an exported plane over the farthest point that is seen of it."""
 
 _CAMERA_KEYS = frozenset({"width", "height", "fx", "fy", "cx", "cy", "skew"})
-_RIG_KEYS = frozenset({"lights"})
-_LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power"})
+# A preset's lights stand in `lights`; the seed draws the places that are rendered.
+_RIG_KEYS = frozenset(
+    {"lights", "preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each", "seed", "emission_known"}
+)
+_LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "direction", "position_error_mm"})
 
 
 def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
@@ -176,10 +179,10 @@ def _lights(scene: Scene, surface: SurfaceModel) -> dict[str, Any]:
     return {
         f"light_{i}": {
             "type": "point",
-            "position": (pose[:3, :3] @ np.array(light.place_mm) + pose[:3, 3]).tolist(),
+            "position": (pose[:3, :3] @ place + pose[:3, 3]).tolist(),
             "intensity": {"type": "uniform", "value": light.power},
         }
-        for i, light in enumerate(scene.rig.lights)
+        for i, (light, place) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
     }
 
 

@@ -6,7 +6,7 @@ One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 """
 
 from simtest.errors import BackendError
-from simtest.rendering import phong
+from simtest.rendering import emission, phong
 
 
 def register() -> None:
@@ -23,3 +23,4 @@ def register() -> None:
     if variant is None:
         raise BackendError("no Mitsuba variant is set; call mitsuba.set_variant before register")
     phong.register(mitsuba, variant)
+    emission.register(mitsuba, variant)

@@ -4,7 +4,7 @@ from simtest.spec.calibration import CalibrationSpec, load_calibration
 from simtest.spec.camera import CameraSpec, load_camera
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
-from simtest.spec.rig import LightSpec
+from simtest.spec.rig import Emission, LightSpec, Rig
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
 from simtest.spec.surface import (
     AnatomySurface,
@@ -20,11 +20,13 @@ __all__ = [
     "CalibrationSpec",
     "CameraSpec",
     "CylinderSurface",
+    "Emission",
     "Experiment",
     "Group",
     "LightSpec",
     "PlaneSurface",
     "QuadricSurface",
+    "Rig",
     "Scene",
     "SphereSurface",
     "Surface",

@@ -37,16 +37,17 @@ class Scene(Spec):
     render: Effort = Effort()
 
     def calibration(self) -> Calibration:
-        """Give what reconstruction is told of the scene's camera and sensor (``sensor.*_known``).
+        """Give what reconstruction is told of the scene's camera, sensor and light.
 
-        White noise is not told, since each frame shows it.
+        See the keys ``sensor.*_known`` and ``rig.emission_known``. White noise is not told: each frame shows it.
         """
-        sensor = self.sensor
+        sensor, emission = self.sensor, self.rig.known_emission()
         response = sensor.response.model() if sensor.response_known else Response()
         return Calibration(
             self.camera.model(),
             response=response,
             vignetting=sensor.vignetting.model() if sensor.vignetting_known else AngularProfile(),
+            emission=emission.model() if emission else AngularProfile(),
             noise=NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response),
             saturation_level=1.0 if sensor.clips else None,
         )

@@ -95,6 +95,9 @@ class Case:
         if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
             seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
             scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
+        if scene.rig.is_drawn:
+            seed = integer(experiment.seed, experiment.name, self.name, realisation, Stage.RIG)
+            scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"seed": seed})})
         return scene, drawn
 
     def noise_seed(self, experiment: Experiment, realisation: int) -> int:
@@ -107,6 +110,8 @@ class Case:
         values = {**self.settings, **drawn, "sensor.seed": self.noise_seed(experiment, realisation)}
         if scene.render.seed != self.data.get("render", {}).get("seed", 0):
             values["render.seed"] = scene.render.seed
+        if scene.rig.is_drawn:
+            values["rig.seed"] = scene.rig.seed
         return f"simtest render {shlex.quote(self.source)} {set_options(values)}"
 
 

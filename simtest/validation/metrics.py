@@ -121,7 +121,8 @@ def _base(context: RowContext, truth: JudgedHighlight | None) -> dict[str, Any]:
     if truth is None:
         return row
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    # Of the light that made the highlight, at its true place.
+    light = scene.rig.true_mm()[highlight.light]
     row |= {
         "distance_mm": highlight.distance,
         "kd_min": highlight.kd_min,
@@ -191,7 +192,7 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     estimators of one candidate. With an offset light: half the angle between light and camera for those.
     """
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    light = scene.rig.true_mm()[highlight.light]
     offset = float(np.linalg.norm(light)) > 0
     if len(estimate.candidates) == 1:
         unknown = not (scene.sensor.vignetting_known or scene.sensor.vignetting.model().is_uniform)

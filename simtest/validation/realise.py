@@ -80,7 +80,7 @@ class Realisation:
     matched: dict[int, int]
 
 
-def view(session: Session, scene: Scene) -> View:
+def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> View:
     """Render a scene and judge its true highlights.
 
     Parameters
@@ -89,13 +89,16 @@ def view(session: Session, scene: Scene) -> View:
         Is moved to the scene.
     scene : Scene
         The scene.
+    radiance : Radiance, optional
+        Of the scene, where it is rendered already.
 
     Returns
     -------
     View
     """
     session.update(scene)
-    radiance = session.radiance()
+    if radiance is None:
+        radiance = session.radiance()
     light = collect(radiance.total, scene.sensor, session.camera)
     seen = light if light.ndim == 2 else light.mean(axis=2, dtype=np.float32)
     highlights = session.highlights(radiance)

@@ -315,6 +315,22 @@ def test_an_unknown_variant_exits_1(here, monkeypatch, variable):
     assert "variant 'scalar_mono': cannot be used; allowed: " in errors[0]
 
 
+def test_a_stopped_render_writes_nothing(here, monkeypatch, tmp_path):
+    """Ctrl-C waits for the end of a step."""
+
+    def render(scene, settings, variant, progress):
+        progress(1, 10, "rendering")
+        os.kill(os.getpid(), signal.SIGINT)
+        progress(2, 10, "rendering")
+        raise AssertionError("not stopped")
+
+    monkeypatch.setattr(api, "render", render)
+    code, output, errors = here("render", "plane", "--out", tmp_path / "frame")
+    assert (code, output) == (130, "")
+    assert errors[-1] == "simtest: stopped; nothing is written"
+    assert not (tmp_path / "frame").exists()
+
+
 # Validation ------------------------------------------------------------------------------------------------------
 
 
