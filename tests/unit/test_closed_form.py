@@ -30,7 +30,7 @@ PLACES = [
     (0.0, 12.0, 6.0),
     (20.0, 0.0, 5.0),
     (-2.0, 3.0, 7.0),
-    (30.0, 10.0, 14.0),
+    (30.0, 10.0, 2.0),
     (0.3, -0.2, 9.0),
 ]
 """mm, camera frame: at the camera, beside, before and behind it, grazing, and next to the surface."""

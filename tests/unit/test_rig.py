@@ -136,7 +136,7 @@ RIG = [
     {"offset_mm": 2.0, "azimuth_deg": 90.0, "spot_deg": 70.0, "soft_edge_deg": 15.0},
     {"offset_mm": 1.0},
 ]
-GLOSSY = {"type": "phong", "exponent": 20.0, "diffuse": 0.4, "normalised": True}
+GLOSSY = {"type": "phong", "exponent": 20.0, "specular": 0.6, "diffuse": 0.4, "normalised": True}
 BALL = {"type": "sphere", "radius_mm": 6.0, "tilt_deg": 10.0}
 INSIDE = {"type": "sphere", "radius_mm": 9.0, "side": "inside"}
 
