@@ -7,26 +7,39 @@ viewers.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from simtest.api import LabelledFrame, render, validate
+    from simtest.api import LabelledFrame, export, render, validate
+    from simtest.calibration import Calibration
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
     from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask
     from simtest.reconstruction import Specularity, reconstruct
-    from simtest.spec import Experiment, Scene, load_camera, load_experiment, load_scene, save_camera
+    from simtest.spec import (
+        Experiment,
+        Scene,
+        load_calibration,
+        load_camera,
+        load_experiment,
+        load_scene,
+        save_camera,
+    )
 
 _HOMES = {
-    "simtest.api": ("LabelledFrame", "render", "validate"),
+    "simtest.api": ("LabelledFrame", "export", "render", "validate"),
+    "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
     "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "ViewMask"),
     "simtest.reconstruction": ("Specularity", "reconstruct"),
-    "simtest.spec": ("Experiment", "Scene", "load_camera", "load_experiment", "load_scene", "save_camera"),
-}
+    "simtest.spec": (
+        "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
+    ),
+}  # fmt: skip
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "BackendError",
     "BrownConrady",
+    "Calibration",
     "Camera",
     "Estimate",
     "Experiment",
@@ -40,6 +53,8 @@ __all__ = [
     "SimtestError",
     "Specularity",
     "ViewMask",
+    "export",
+    "load_calibration",
     "load_camera",
     "load_experiment",
     "load_scene",

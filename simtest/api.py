@@ -9,11 +9,14 @@ from simtest.reconstruction import reconstruct
 from simtest.spec import Experiment, Scene, load_experiment, load_scene
 from simtest.validation.runner import Progress
 
-__all__ = ["LabelledFrame", "reconstruct", "render", "validate"]
+__all__ = ["LabelledFrame", "export", "reconstruct", "render", "validate"]
 
 
 def render(
-    scene: Scene | str | Path, settings: Mapping[str, Any] | None = None, variant: str | None = None
+    scene: Scene | str | Path,
+    settings: Mapping[str, Any] | None = None,
+    variant: str | None = None,
+    progress: Progress | None = None,
 ) -> LabelledFrame:
     """Render a scene with its ground truth.
 
@@ -25,6 +28,8 @@ def render(
         Values that replace those of a scene file, by key path, such as ``{"surface.radius_mm": 5.0}``.
     variant : str, optional
         Mitsuba variant.
+    progress : callable, optional
+        Called with samples done, samples in all, and what is done; what it raises stops the frame.
 
     Returns
     -------
@@ -38,7 +43,44 @@ def render(
         If the rendering backend cannot be used.
     """
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return make_frame(described, variant)
+    return make_frame(described, variant, progress)
+
+
+def export(
+    scene: Scene | str | Path,
+    out: str | Path,
+    settings: Mapping[str, Any] | None = None,
+    variant: str | None = None,
+) -> list[Path]:
+    """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, a scene file, or the name of a shipped scene.
+    out : str or Path
+        Folder, made if need be.
+    settings : mapping, optional
+        Values that replace those of a scene file, by key path.
+    variant : str, optional
+        Mitsuba variant that parses the scene; the files are the same for all.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    InputError
+        If the scene is malformed, its camera or a light has what Mitsuba cannot express, or `out` cannot be written.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    from simtest.rendering.export import export_scene
+
+    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    return export_scene(described, Path(out), variant)
 
 
 def validate(

@@ -24,6 +24,7 @@ class BackendError(SimtestError, RuntimeError):
 class Reason(StrEnum):
     """Why a reconstruction gave no normal. The values are the `status` column of the results."""
 
+    NO_LIGHT = "no_light"
     NO_PEAK = "no_peak"
     NO_CLOSED_ISOPHOTE = "no_closed_isophote"
     TOO_FEW_POINTS = "too_few_points"

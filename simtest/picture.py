@@ -4,6 +4,7 @@ import csv
 import json
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest import provenance
+from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, InputError
 from simtest.estimators.base import drawable
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction import DEFAULT_ESTIMATORS, Specularity, reconstruct
-from simtest.sensor import from_srgb
-from simtest.spec import describe_camera, load_camera
+from simtest.spec import describe_camera, load_calibration
 
 MAX_PIXELS = 100_000_000
 
@@ -69,7 +70,7 @@ def reconstruct_picture(
     fov_deg: float | None = None,
     estimators: Sequence[str] | None = None,
     roi: str | None = None,
-    encoding: str = "srgb",
+    encoding: str | None = None,
 ) -> tuple[int, list[Path]]:
     """Reconstruct the normals of a picture and write them.
 
@@ -80,15 +81,16 @@ def reconstruct_picture(
     out : Path
         Folder, made if need be.
     camera_file : Path, optional
-        Calibration; this or `fov_deg` must be given, not both.
+        Calibration or camera file; this or `fov_deg` must be given, not both.
     fov_deg : float, optional
         Horizontal field of view, deg.
     estimators : sequence of str, optional
         Names; default all three of the package.
     roi : str, optional
         "x,y,w,h" in px; default: detected.
-    encoding : {"srgb", "linear"}
-        How the picture's values are encoded. Isophotes are those of linear values.
+    encoding : {"srgb", "linear"}, optional
+        How the picture's values are encoded, where the calibration does not state the response; default sRGB.
+        Isophotes are those of linear values.
 
     Returns
     -------
@@ -108,28 +110,37 @@ def reconstruct_picture(
     height, width = picture.shape[:2]
     cautions = []
     if camera_file is not None:
-        camera = load_camera(camera_file)
+        calibration = load_calibration(camera_file)
     else:
         assert fov_deg is not None
-        camera = Camera.from_fov(fov_deg, width, height)
+        calibration = Calibration(Camera.from_fov(fov_deg, width, height))
         cautions.append(f"no calibration: all angles depend on the field of view of {fov_deg:g} deg being right")
         warnings.warn(cautions[-1], stacklevel=2)
+    calibration, camera = _completed(calibration, encoding), calibration.camera
     names = list(estimators or DEFAULT_ESTIMATORS)
-    linear = from_srgb(picture) if encoding == "srgb" else picture
-    found = reconstruct(linear, camera, names, roi=_parse_roi(roi) if roi is not None else None)
+    found = reconstruct(picture, calibration, names, roi=_parse_roi(roi) if roi is not None else None)
     if not found:
         cautions.append("no specularity found that stands out of the noise and closes inside the frame; try --roi")
         warnings.warn(cautions[-1], stacklevel=2)
     document = {
         "image": str(image),
         "camera": describe_camera(camera),
-        "encoding": encoding,
+        "encoding": calibration.response.kind if calibration.response else "linear",
         "warnings": cautions,
         "frame": "camera: x right, y down, z forward; normals are unit and face the camera",
         "specularities": [describe(i, specularity, camera) for i, specularity in enumerate(found)],
         "provenance": provenance.environment(),
     }
     return len(found), _write(out, document, picture, camera)
+
+
+def _completed(calibration: Calibration, encoding: str | None) -> Calibration:
+    """Add what every picture has: an encoding, and a largest value, at which it is clipped."""
+    if calibration.response is not None and encoding is not None:
+        raise InputError(f"--encoding {encoding}: the calibration states the response; give one of them")
+    response = calibration.response or (Response() if encoding == "linear" else Response("srgb"))
+    level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
+    return replace(calibration, response=response, saturation_level=level)
 
 
 def _parse_roi(text: str) -> tuple[int, int, int, int]:
@@ -156,7 +167,9 @@ def describe(index: int, specularity: Specularity, camera: Camera) -> dict[str, 
             "isovalues": [isophote.isovalue for isophote in result.isophotes],
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "flags": list(result.flags),
-            "isophotes": [{"t": i.isovalue, "points": np.round(i.points, 3).tolist()} for i in result.isophotes],
+            "isophotes": [
+                {"t": t, "points": np.round(points, 3).tolist()} for t, points in result.contours(specularity.patch)
+            ],
             "ellipses": [i.conic.image.tolist() for i in result.isophotes if i.conic is not None],
             "cones": [isophote.cone.tolist() for isophote in result.isophotes],
             "curves": [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],

@@ -2,18 +2,22 @@
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.calibration import Calibration, CorrectedFrame
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
 from simtest.detection import Region, detect, estimate_noise
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.checked import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.resources import shown
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
 MAX_SMOOTHING_PX = 50
@@ -40,7 +44,7 @@ class Specularity:
 
 def reconstruct(
     frame: npt.ArrayLike,
-    camera: Camera,
+    camera: Camera | Calibration,
     estimators: Sequence[str] | Mapping[str, Estimator] = DEFAULT_ESTIMATORS,
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float = DEFAULT_SMOOTHING_PX,
@@ -51,9 +55,11 @@ def reconstruct(
     Parameters
     ----------
     frame : array_like, shape (H, W) or (H, W, C)
-        Linear intensities of any scale; channels are averaged.
-    camera : Camera
-        Calibration of the same size.
+        Linear intensities of any scale, or values as encoded where the calibration states the response; channels are
+        averaged.
+    camera : Camera or Calibration
+        Of the same size. What a calibration knows is undone before smoothing: the response, then vignetting and
+        emission.
     estimators : sequence of str, or mapping
         Names as registered, or the estimators themselves by name.
     roi : tuple of int, optional
@@ -66,7 +72,9 @@ def reconstruct(
     Returns
     -------
     list of Specularity
-        The brightest first; empty where the frame holds no isolated specularity.
+        The brightest first; empty where the frame holds no isolated specularity. Estimates whose isophotes enclose
+        clipped pixels have the flag ``saturated``; those that reach to where too little light is left for the whole
+        correction, ``vignetted``.
 
     Raises
     ------
@@ -74,31 +82,63 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN or infinity; if an
         argument is of the wrong kind or out of range.
     """
-    intensity = check_frame(frame, camera)
+    calibration = _calibration(camera)
+    view = calibration.camera
+    corrected = calibration.correct(check_frame(frame, view))
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
     roi = None if roi is None else _check_roi(roi)
     chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
-    seen = camera.seen
-    smoothed = smooth(intensity, smoothing_px, seen)
+    seen, clipped = view.seen, corrected.saturated
+    smoothed = smooth(corrected.intensity, smoothing_px, seen)
     if roi is not None:
-        patch = Patch.cut(smoothed, roi, seen=seen)
+        patch = Patch.cut(smoothed, roi, saturated=clipped, seen=seen)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
-        regions = detect(smoothed, estimate_noise(intensity, seen), isolated, seen)
-        found = [(region, Patch.cut(smoothed, region.box, region.peak, seen=seen)) for region in regions]
+        regions = detect(smoothed, _noise(corrected, calibration, smoothing_px), isolated, seen)
+        found = [(r, Patch.cut(smoothed, r.box, r.peak, saturated=clipped, seen=seen)) for r in regions]
     return [
-        Specularity(region, patch, {name: run(estimator, patch, camera) for name, estimator in chosen.items()})
+        Specularity(
+            region,
+            patch,
+            {name: _flagged(run(made, patch, view), patch, corrected.limited) for name, made in chosen.items()},
+        )
         for region, patch in found
     ]
 
 
-def check_frame(frame: npt.ArrayLike, camera: Camera) -> npt.NDArray[np.float32]:
-    """Give a frame as float32 intensities, shape (H, W); raise `InputError` where it does not fit the camera."""
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
+def _noise(corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float) -> float | Image:
+    """Give the noise of a corrected frame before smoothing: estimated where it is white, then amplified with it."""
+    seen = calibration.camera.seen
+    white = estimate_noise(corrected.linear, seen)
+    if calibration.noise.is_silent and corrected.gain is None:
+        return white
+    known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)
+    noise = np.maximum(white, known)
+    return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
+
+
+def _flagged(result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None) -> Estimate | Failure:
+    """Add the flags that hang on the frame, not on the estimator."""
+    if isinstance(result, Failure) or isinstance(patch, Failure):
+        return result
+    masks = {"saturated": patch.saturated}
+    if limited is not None:
+        (x, y), (height, width) = patch.origin_px, patch.values.shape
+        masks["vignetted"] = limited[y : y + height, x : x + width]
+    touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
+    if not touched:
+        return result
+    isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
+    used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
+    flags = tuple(name for name, mask in touched.items() if (mask & used).any())
+    return replace(result, flags=(*result.flags, *flags))
+
+
+def check_frame(frame: npt.ArrayLike, camera: Camera) -> Image:
+    """Give a frame as float32 values, shape (H, W) or (H, W, C); raise `InputError` where it does not fit."""
     try:
         given = np.asarray(frame)
     except (TypeError, ValueError):
@@ -109,24 +149,29 @@ def check_frame(frame: npt.ArrayLike, camera: Camera) -> npt.NDArray[np.float32]
         raise InputError(f"frame holds values of type {given.dtype}: must be an array of real numbers")
     # What float32 cannot hold becomes infinite and is refused below.
     with np.errstate(all="ignore"):
-        image = _intensity(given.astype(np.float32), camera)
-    if not np.isfinite(image).all():
-        bad = int(np.count_nonzero(~np.isfinite(image)))
-        raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
-    return image
-
-
-def _intensity(image: npt.NDArray[np.float32], camera: Camera) -> npt.NDArray[np.float32]:
+        image = given.astype(np.float32)
     if image.ndim not in (2, 3) or image.size == 0:
         raise InputError(f"frame has shape {image.shape}: must be (H, W) or (H, W, C)")
-    if image.ndim == 3:
-        image = image.mean(axis=2, dtype=np.float32)
-    if image.shape != (camera.height, camera.width):
+    if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
             "the size of the camera's calibration"
         )
+    # The channels' mean may be beyond what float32 holds.
+    with np.errstate(all="ignore"):
+        finite = np.isfinite(image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32))
+    if not finite.all():
+        bad = int(np.count_nonzero(~finite))
+        raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
     return image
+
+
+def _calibration(camera: Camera | Calibration) -> Calibration:
+    if isinstance(camera, Calibration):
+        return camera
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
+    return Calibration(camera)
 
 
 def _check_names(names: Sequence[str]) -> Sequence[str]:

@@ -17,6 +17,7 @@ class Stage(IntEnum):
     RENDER = 1
     SENSOR = 2
     VIEWPOINT = 3
+    RIG = 4
 
 
 def key(text: str) -> int:

@@ -68,6 +68,10 @@ class Plane(_Analytic):
         reach = PLANE_REACH * self.distance
         return Shape("plane", False, {"to_model": np.diag([reach, reach, 1.0, 1.0])}, None, "plane")
 
+    def clearance(self, points: Array) -> Array:
+        """Give z (see `SurfaceModel.clearance`)."""
+        return np.asarray(points[:, 2])
+
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with z = 0 (see `SurfaceModel.points`)."""
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -80,11 +84,19 @@ class Plane(_Analytic):
 class _Round(_Analytic):
     """A sphere or cylinder through the anchor, its centre on the far side or, seen from inside, on the near side."""
 
+    _across = np.ones(3)
+
     def __init__(self, spec: SphereSurface | CylinderSurface) -> None:
         super().__init__(spec)
         self.radius = spec.radius_mm
         self.inside = spec.side == "inside"
+        self.solid = not self.inside
         self.centre = np.array([0.0, 0.0, self.radius if self.inside else -self.radius])
+
+    def clearance(self, points: Array) -> Array:
+        """Give the distance to the wall (see `SurfaceModel.clearance`)."""
+        outwards = np.linalg.norm((points - self.centre) * self._across, axis=1) - self.radius
+        return -outwards if self.inside else outwards
 
     def _distance(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Root of |o + t d - centre|^2 = R^2: the near one from outside, the far one from inside."""
@@ -120,6 +132,8 @@ class Sphere(_Round):
 class Cylinder(_Round):
     """A cylinder through the anchor, its axis along y."""
 
+    _across = np.array([1.0, 0.0, 1.0])
+
     def shape(self) -> Shape:
         """Give Mitsuba's cylinder: unit radius about z from 0 to 1, turned to y."""
         half = CYLINDER_REACH * self.distance
@@ -132,7 +146,7 @@ class Cylinder(_Round):
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the cylinder; S = (I - N N^T - y y^T)/R (see `SurfaceModel.points`)."""
-        across = np.array([1.0, 0.0, 1.0])
+        across = self._across
         distance = self._distance(origins * across, directions * across, hits)
         normal = (origins + distance[:, None] * directions - self.centre) * across / self.radius
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -159,6 +173,22 @@ class Quadric(_Analytic):
         mesh = TriangleMesh(vertices, grid_faces(QUADRIC_CELLS, QUADRIC_CELLS), normals)
         return Shape("mesh", False, {}, mesh, f"quadric {k1!r} {k2!r} {reach!r}")
 
+    def clearance(self, points: Array) -> Array:
+        """Give F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""
+        k = self.curvatures
+        value = points[:, 2] + np.sum(k * points**2, axis=1) / 2
+        return np.asarray(value / np.linalg.norm(k * points + [0.0, 0.0, 1.0], axis=1))
+
+    def vertex_shape_operators(self) -> Array:
+        """Give S at the grid's vertices (see `SurfaceModel.vertex_shape_operators`)."""
+        mesh = self.shape().mesh
+        assert mesh is not None
+        return self._shape_operator(mesh.vertices)[1]
+
+    def _shape_operator(self, points: Array) -> tuple[Array, Array]:
+        gradient = self.curvatures * points + [0.0, 0.0, 1.0]
+        return implicit_shape_operator(gradient, np.broadcast_to(np.diag(self.curvatures), (len(points), 3, 3)))
+
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the quadric at the root next to the rendered hit (see `SurfaceModel.points`)."""
         k = self.curvatures
@@ -174,8 +204,7 @@ class Quadric(_Analytic):
         distance = np.take_along_axis(roots, gap.argmin(axis=0)[None], axis=0)[0]
         distance = np.where(np.isfinite(gap.min(axis=0)), distance, np.nan)
         P = origins + distance[:, None] * directions
-        gradient = k * P + [0.0, 0.0, 1.0]
-        normal, S = implicit_shape_operator(gradient, np.broadcast_to(np.diag(k), (len(P), 3, 3)))
+        normal, S = self._shape_operator(P)
         return pack_points(origins, directions, distance, normal, S)
 
 

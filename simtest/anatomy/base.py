@@ -111,13 +111,28 @@ class SurfaceModel(ABC):
     ----------
     model_from_camera : ndarray, shape (4, 4)
         Rigid transform from the camera frame to the model frame, mm.
+    solid : bool
+        Whether the far side is matter, in which no light can be; a shell (a lumen, a sphere seen from inside) has
+        free space beyond its wall.
     """
 
     model_from_camera: Array
+    solid: bool = True
 
     @abstractmethod
     def shape(self) -> Shape:
         """Give what the renderer builds, in the model frame."""
+
+    @abstractmethod
+    def clearance(self, points: Array) -> Array:
+        """Give the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive on its free side.
+
+        The sign is exact; the amount may be that of the first order.
+        """
+
+    def vertex_shape_operators(self) -> Array | None:
+        """Give S at the vertices of the rendered mesh, shape (V, 3, 3), 1/mm, for its normals; None without a mesh."""
+        return None
 
     @abstractmethod
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:

@@ -78,7 +78,7 @@ def build(recipe: ColonRecipe) -> _Build:
 
 
 class Colon(SurfaceModel):
-    """A generated colon with a camera inside.
+    """A generated colon with a camera inside; a shell.
 
     Parameters
     ----------
@@ -92,6 +92,8 @@ class Colon(SurfaceModel):
     InputError
         If the recipe gives no usable tube.
     """
+
+    solid = False
 
     def __init__(self, recipe: ColonRecipe, viewpoint: int) -> None:
         self._build = build(recipe)
@@ -109,6 +111,12 @@ class Colon(SurfaceModel):
     def shape(self) -> Shape:
         """Give the mesh of about 200,000 triangles, with exact vertices and normals, open at both ends."""
         return Shape("mesh", False, {}, self._build.mesh, self._build.key)
+
+    def vertex_shape_operators(self) -> Array:
+        """Give S at the mesh's vertices by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
+        mesh, places = self._build.mesh, np.empty((len(self._build.mesh.vertices), 2))
+        places[mesh.faces.ravel()] = self._build.corners.reshape(-1, 2)
+        return self._build.tube.normal_and_shape_operator(places[:, 0], places[:, 1])[1]
 
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), model frame, to the wall, mm; positive in the lumen."""

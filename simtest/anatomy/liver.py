@@ -281,6 +281,11 @@ class Liver(SurfaceModel):
         """Give the closed mesh of even triangles, with exact vertices and normals."""
         return Shape("mesh", False, {}, self._build.mesh, self._build.key)
 
+    def vertex_shape_operators(self) -> Array:
+        """Give S at the mesh's vertices by the level set (see `SurfaceModel.vertex_shape_operators`)."""
+        at = self._build.body.evaluate(self._build.mesh.vertices)
+        return implicit_shape_operator(at.gradient, at.hessian)[1]
+
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive outside."""
         return self._build.clearance(points)

@@ -206,6 +206,7 @@ class MeshSurface(SurfaceModel):
             pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
         else:
             pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
+        self.solid = not self._prepared.lumen
         self.model_from_camera = pose
 
     @property
@@ -216,6 +217,10 @@ class MeshSurface(SurfaceModel):
     def shape(self) -> Shape:
         """Give the subdivided mesh; winding and normals on the camera's side."""
         return Shape("mesh", False, {}, self._prepared.mesh, self._prepared.key)
+
+    def vertex_shape_operators(self) -> Array:
+        """Give the fitted S at the vertices (see `SurfaceModel.vertex_shape_operators`)."""
+        return self._prepared.shape_operators
 
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), to the mesh, mm; positive on the camera's side."""

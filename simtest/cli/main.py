@@ -22,8 +22,9 @@ APP = App(
 # Told here, since a sub-command's own text is loaded with it.
 _COMMANDS = {
     "doctor": "Check the rendering backend.",
-    "schema": "Print the JSON schema of a scene, experiment or camera file.",
+    "schema": "Print the JSON schema of a scene, experiment, camera or calibration file.",
     "render": "Render a scene with its ground truth.",
+    "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",
     "validate": "Run an experiment and write its report.",
 }
@@ -66,8 +67,9 @@ def main() -> None:
         sys.exit(_say(str(error), BAD_USE))
     except SimtestError as error:
         sys.exit(_say(str(error), 1))
-    except KeyboardInterrupt:
-        sys.exit(_say("stopped; what is finished is kept, and the same command goes on from there", INTERRUPTED))
+    except KeyboardInterrupt as stopped:
+        kept = "what is finished is kept, and the same command goes on from there"
+        sys.exit(_say(f"stopped; {str(stopped) or kept}", INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

@@ -31,8 +31,11 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Show a bar while the body runs; gives the callable that moves it (done, total, what)."""
+def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
+    """Show a bar while the body runs; gives the callable that moves it (done, total, what).
+
+    `afterwards` is what the body does when all steps are done. A single step shows no bar.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -53,9 +56,11 @@ def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
 
         def move(done: int, total: int, what: str) -> None:
             check()
+            if done == total and not bar.live.is_started:
+                return
             # Not before the first step: bad input is told in one line.
             bar.start()
-            bar.update(task, completed=done, total=total, description="writing the report" if done == total else what)
+            bar.update(task, completed=done, total=total, description=afterwards if done == total else what)
 
         try:
             yield move

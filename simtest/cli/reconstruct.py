@@ -14,14 +14,18 @@ def reconstruct(
     *,
     out: Out,
     camera: Annotated[
-        Path | None, Parameter(help="Calibration: simtest's TOML, or a file of OpenCV, ROS or MATLAB.")
+        Path | None,
+        Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
     ] = None,
     fov: Annotated[
         float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")
     ] = None,
     estimators: Estimators = None,
     roi: Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")] = None,
-    encoding: Annotated[Literal["srgb", "linear"], Parameter(help="How the picture's values are encoded.")] = "srgb",
+    encoding: Annotated[
+        Literal["srgb", "linear"] | None,
+        Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
+    ] = None,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, normals.ply, overlay.png.
 

@@ -6,17 +6,24 @@ from simtest.cli.options import Out, Settings, Variant
 def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
+    A sensor with a response, bits, saturation, vignetting or a full well also gets calibration.toml.
+
     Parameters
     ----------
     scene : str
         A scene file, or the name of a shipped scene.
     """
     from simtest import api
+    from simtest.cli.progress import progress_bar
     from simtest.dataset import write_frame
     from simtest.files import refuse_file
     from simtest.spec import parse_settings
 
     refuse_file(out)
-    frame = api.render(scene, parse_settings(settings or []), variant)
+    try:
+        with progress_bar("finding the truth") as move:
+            frame = api.render(scene, parse_settings(settings or []), variant, move)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("nothing is written") from None
     for file in write_frame(frame, out):
         print(file)

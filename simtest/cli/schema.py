@@ -4,7 +4,7 @@ import json
 from typing import Literal
 
 
-def schema(of: Literal["scene", "experiment", "camera"] = "scene", /) -> None:
+def schema(of: Literal["scene", "experiment", "camera", "calibration"] = "scene", /) -> None:
     """Print the JSON schema of a file.
 
     Parameters
@@ -14,7 +14,12 @@ def schema(of: Literal["scene", "experiment", "camera"] = "scene", /) -> None:
     """
     from pydantic import BaseModel
 
-    from simtest.spec import CameraSpec, Experiment, Scene
+    from simtest.spec import CalibrationSpec, CameraSpec, Experiment, Scene
 
-    models: dict[str, type[BaseModel]] = {"scene": Scene, "experiment": Experiment, "camera": CameraSpec}
+    models: dict[str, type[BaseModel]] = {
+        "scene": Scene,
+        "experiment": Experiment,
+        "camera": CameraSpec,
+        "calibration": CalibrationSpec,
+    }
     print(json.dumps(models[of].model_json_schema(), indent=2))

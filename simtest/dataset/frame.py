@@ -12,11 +12,12 @@ from simtest import provenance
 from simtest.errors import InputError
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera
-from simtest.rendering import Radiance, Session, TruthMaps
+from simtest.rendering import Progress, Radiance, Session, TruthMaps
 from simtest.rendering.bitmap import write_exr
-from simtest.seeds import from_integer
-from simtest.sensor import expose, to_uint8
+from simtest.sensor import to_uint8
 from simtest.spec import Scene, camera_toml, describe_camera
+from simtest.spec.sensor import Sensor
+from simtest.spec.writing import toml_tables
 from simtest.validation.realise import view
 from simtest.validation.truth import JudgedHighlight
 
@@ -32,7 +33,7 @@ class LabelledFrame:
     camera : Camera
         Calibration.
     image : ndarray of float32, shape (H, W) or (H, W, 3)
-        The sensor's frame, full scale 1.
+        The sensor's frame, full scale 1, as encoded by the sensor's response.
     radiance : Radiance
         Linear, split by its way.
     truth : TruthMaps
@@ -40,7 +41,7 @@ class LabelledFrame:
     highlights : list of JudgedHighlight
         All true highlights; `isolated` tells which count.
     full_scale : float
-        Radiance that became 1.
+        Radiance behind the lens that became 1.
     variant : str
         Mitsuba variant.
     """
@@ -55,7 +56,7 @@ class LabelledFrame:
     variant: str
 
 
-def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
+def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
     """Render a labelled frame.
 
     Parameters
@@ -64,6 +65,8 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
         The scene; its noise hangs on ``sensor.seed``.
     variant : str, optional
         Mitsuba variant.
+    progress : callable, optional
+        Told after each part of the rendering: samples done, samples in all, and what is done.
 
     Returns
     -------
@@ -76,19 +79,21 @@ def make_frame(scene: Scene, variant: str | None = None) -> LabelledFrame:
     BackendError
         If the rendering backend cannot be used.
     """
-    session = Session(scene, variant)
-    seen = view(session, scene)
+    session = Session(scene, variant, labelled=True)
+    # The truth starts from the hits that the labels are made of.
+    radiance = session.frame(progress).radiance
     truth = session.truth()
     if not truth.mask.any():
         raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")
-    image = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, from_integer(scene.sensor.seed))
+    seen = view(session, scene, radiance)
+    image = seen.frame(scene.sensor.seed)
     return LabelledFrame(
         scene, session.camera, image, seen.radiance, truth, seen.truths, seen.full_scale, session.variant
     )
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz, frame.json and camera.toml.
+    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml for a sensor that needs it.
 
     Parameters
     ----------
@@ -110,18 +115,55 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
     make_folder(out)
     try:
-        write_atomically(files[0], lambda part: part.write_bytes(_png(frame.image)))
+        write_atomically(files[0], lambda part: part.write_bytes(_png(frame)))
         write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
         write_atomically(files[2], lambda part: np.savez_compressed(part, **_truth(frame)))
         write_json(files[3], _description(frame))
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
+        if _is_calibrated(frame.scene.sensor):
+            files.append(out / "calibration.toml")
+            write_atomically(files[5], lambda part: part.write_text(_calibration_file(frame.scene), encoding="utf-8"))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return files
 
 
-def _png(image: npt.NDArray[np.float32]) -> bytes:
-    picture = to_uint8(image)
+def _is_calibrated(sensor: Sensor) -> bool:
+    """Tell whether there is more to know of a sensor than its camera."""
+    return sensor.clips or sensor.full_well is not None or not sensor.vignetting.model().is_uniform
+
+
+def _png_bits(sensor: Sensor) -> int:
+    """Give the bits of frame.png: what is not quantised loses least with 16."""
+    return 16 if sensor.encodes and (sensor.bits or 16) > 8 else 8
+
+
+def _calibration_file(scene: Scene) -> str:
+    """Give what reconstruction may know of frame.png, as `simtest reconstruct --camera` reads it."""
+    sensor = scene.sensor
+    stated: dict[str, dict[str, Any]] = {"camera": scene.camera.model_dump(exclude_none=True)}
+    if not sensor.encodes:
+        stated["response"] = {"type": "srgb"}
+    else:
+        stated["response"] = sensor.response.model_dump() if sensor.response_known else {"type": "linear"}
+    if sensor.vignetting_known and not sensor.vignetting.model().is_uniform:
+        stated["vignetting"] = sensor.vignetting.model_dump()
+    if (profile := scene.rig.known_emission()) is not None:
+        stated["emission"] = profile.model_dump()
+    electrons = {"full_well": sensor.full_well, "read_noise": sensor.read_noise} if sensor.full_well else {}
+    bits = (sensor.bits or _png_bits(sensor)) if sensor.encodes else 8
+    stated["sensor"] = {**electrons, "bits": bits, "saturation_level": 1.0}
+    return "# What is known of frame.png; pixel centres at integer + 0.5.\n" + toml_tables(stated)
+
+
+def _png(frame: LabelledFrame) -> bytes:
+    """Give the picture: what the sensor itself encoded, or else the sRGB-encoded frame."""
+    sensor = frame.scene.sensor
+    if sensor.encodes:
+        kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
+        picture = np.rint(np.asarray(frame.image, dtype=float) * np.iinfo(kind).max).astype(kind)
+    else:
+        picture = to_uint8(frame.image)
     ok, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[:, :, ::-1])
     assert ok
     return bytes(encoded)
@@ -161,12 +203,23 @@ FIELDS = {
 
 
 def _description(frame: LabelledFrame) -> dict[str, Any]:
+    sensor = frame.scene.sensor
+    fields = dict(FIELDS)
+    encoding: dict[str, Any] = {}
+    if sensor.encodes:
+        fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
+        encoding["encoding"] = {
+            "response": sensor.response.model_dump(mode="json"),
+            "bits": sensor.bits,
+            "png_bits": _png_bits(sensor),
+        }
     return {
         "scene": frame.scene.model_dump(mode="json"),
         "camera": describe_camera(frame.camera),
         "full_scale": frame.full_scale,
+        **encoding,
         "highlights": [_highlight(judged) for judged in frame.highlights],
-        "fields": FIELDS,
+        "fields": fields,
         "provenance": {**provenance.environment(), "variant": frame.variant},
     }
 

@@ -68,15 +68,15 @@ class Component:
     closed: bool
 
 
-def detect(smoothed: Image, noise: float, isolated: bool = True, seen: Mask | None = None) -> list[Region]:
+def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: Mask | None = None) -> list[Region]:
     """Find the specularities of a frame.
 
     Parameters
     ----------
     smoothed : ndarray of float32, shape (H, W)
         Smoothed intensities.
-    noise : float
-        Standard deviation of the unsmoothed frame's noise, frame units.
+    noise : float, or ndarray of float32, shape (H, W)
+        Standard deviation of the unsmoothed frame's noise, frame units; in each pixel, where it differs.
     isolated : bool
         Leave out those whose isophote at t = 0.5 reaches the frame's border, or that of the view.
     seen : ndarray of bool, shape (H, W), optional
@@ -93,7 +93,8 @@ def detect(smoothed: Image, noise: float, isolated: bool = True, seen: Mask | No
         image[~seen] = 0
     if min(image.shape) < 3 or image.max() <= 0:
         return []
-    threshold = max(HIGHLIGHT_CONTRAST_SIGMA * noise, NOISE_FREE_SHARE * float(image.max()))
+    least = NOISE_FREE_SHARE * float(image.max())
+    threshold = np.broadcast_to(np.maximum(HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise), least), image.shape)
     taken = np.zeros(image.shape, dtype=bool)
     regions = []
     for row, column in _local_maxima(image, threshold):
@@ -107,15 +108,21 @@ def detect(smoothed: Image, noise: float, isolated: bool = True, seen: Mask | No
         if isolated and not found.closed:
             continue
         height_above = contrast(image, found, float(image[row, column]), seen)
-        if height_above >= threshold and np.count_nonzero(mask) >= MIN_AREA_PX:
+        if height_above >= threshold[row, column] and np.count_nonzero(mask) >= MIN_AREA_PX:
             regions.append(Region(_expanded_box(found, image.shape), (column, row), height_above))
     return regions
 
 
-def _local_maxima(image: Image, threshold: float) -> list[tuple[int, int]]:
-    """Give rows and columns of the local maxima above a threshold, the brightest first."""
+def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tuple[int, int]]:
+    """Give rows and columns of the local maxima above their threshold, the brightest first."""
     highest = cv2.dilate(image, np.ones((3, 3), np.uint8))
-    rows, columns = np.nonzero((image >= highest) & (image > threshold))
+    maxima = (image >= highest) & (image > threshold.astype(np.float32))
+    rows, columns = np.nonzero(maxima)
+    if len(rows) > MAX_PEAKS:
+        # The pixels of one clipped plateau must not crowd out the other peaks.
+        labels, _ = ndimage.label(maxima, np.ones((3, 3)))
+        _, first = np.unique(labels[rows, columns], return_index=True)
+        rows, columns = rows[first], columns[first]
     order = np.argsort(-image[rows, columns], kind="stable")[:MAX_PEAKS]
     return [(int(rows[i]), int(columns[i])) for i in order]
 

@@ -6,19 +6,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from simtest.errors import Failure, Reason
+from simtest.errors import Failure
 from simtest.geometry import (
     Camera,
     CirclePose,
     FittedConic,
     Patch,
-    backproject_conic,
     circle_pose,
     cone_of_conic,
     cone_rays,
-    fit_ellipse,
+    fit_ellipses,
 )
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.fitting_planes import FORWARD, fitting_planes
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +31,7 @@ class FittedIsophote:
     isovalue : float
         t.
     points : ndarray, shape (N, 2)
-        Contour, px.
+        Where the contour crosses the lines between pixel centres, px, in no order.
     conic : FittedConic or None
         Ellipse, px; None where the lens distorts, since the fitted curve is then no ellipse in the image.
     cone : ndarray, shape (3, 3)
@@ -45,7 +44,7 @@ class FittedIsophote:
     points: Array
     conic: FittedConic | None
     cone: Array
-    sightline: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    sightline: Array = field(default_factory=lambda: FORWARD)
 
     def pose(self) -> CirclePose | Failure:
         """Give what the cone says about a circle (see `simtest.geometry.circle_pose`)."""
@@ -89,11 +88,21 @@ class Estimate:
     covariance: Array | None = None
     flags: tuple[str, ...] = field(default=())
 
+    def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
+        """Give the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
+        if isinstance(patch, Failure):
+            return []
+        traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in self.isophotes]
+        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
+
 
 def drawable(curve: Array) -> list[list[float]]:
     """Give a curve, shape (N, 2), px, as lists for a JSON file; points that the lens does not image are left out."""
     return np.round(curve[np.isfinite(curve).all(axis=1)], 3).tolist()
 
+
+BatchEstimator = Callable[[Sequence[Patch | Failure], Camera], list[Estimate | Failure]]
+"""The same for several highlights seen by one camera; what is a Failure already stays one."""
 
 Estimator = Callable[[Patch, Camera], Estimate | Failure]
 """An estimator: a callable that takes the patch of a highlight and the camera.
@@ -118,44 +127,40 @@ def fit_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophot
     -------
     FittedIsophote or Failure
     """
-    points = patch.isophote(isovalue)
-    if isinstance(points, Failure):
-        return points
-    if camera.distortion is not None:
-        return _fit_on_sightlines(isovalue, points, camera)
-    # The last point repeats the first and would count twice.
-    conic = fit_ellipse(points[:-1])
-    if isinstance(conic, Failure):
-        return conic
-    return FittedIsophote(isovalue, points, conic, backproject_conic(conic, camera))
-
-
-def _fit_on_sightlines(isovalue: float, points: Array, camera: Camera) -> FittedIsophote | Failure:
-    """Fit an ellipse where a lens has none in its image: in the plane across the contour's mean sightline.
-
-    A cone of sightlines cuts every such (gnomonic) plane in an ellipse.
-    """
-    rays = camera.unproject(points[:-1])
-    mean = rays.mean(axis=0)
-    length = float(np.linalg.norm(mean))
-    if not length > 0:
-        return Failure(Reason.NOT_FINITE, "the lens images nothing at points of the isophote")
-    sightline = mean / length
-    first, second = tangent_basis(sightline[None])
-    plane_from_camera = np.concatenate([first, second, sightline[None]])
-    across = rays @ plane_from_camera.T
-    if across[:, 2].min() <= 0:
-        return Failure(Reason.NOT_AN_ELLIPSE, "the isophote reaches 90 deg from its mean sightline")
-    conic = fit_ellipse(across[:, :2] / across[:, 2:])
-    if isinstance(conic, Failure):
-        return conic
-    return FittedIsophote(isovalue, points, None, cone_of_conic(conic, plane_from_camera), sightline)
+    return _fit([isovalue], [patch.crossings(isovalue)], camera)[0]
 
 
 def fit_isophotes(
     patch: Patch, camera: Camera, isovalues: Sequence[float]
 ) -> tuple[list[FittedIsophote], list[Failure]]:
     """Fit several isophotes (see `fit_isophote`); gives those that succeeded and the failures of the others."""
-    results = [fit_isophote(patch, camera, t) for t in isovalues]
+    results = _fit(isovalues, [patch.crossings(t) for t in isovalues], camera)
     fitted = [result for result in results if isinstance(result, FittedIsophote)]
     return fitted, [result for result in results if isinstance(result, Failure)]
+
+
+def fit_isophote_of_each(
+    patches: Sequence[Patch | Failure], camera: Camera, isovalue: float
+) -> list[FittedIsophote | Failure]:
+    """Fit the isophote of the same value of several patches (see `fit_isophote`)."""
+    contours = [patch if isinstance(patch, Failure) else patch.crossings(isovalue) for patch in patches]
+    return _fit([isovalue] * len(patches), contours, camera)
+
+
+def _fit(
+    isovalues: Sequence[float], contours: Sequence[Array | Failure], camera: Camera
+) -> list[FittedIsophote | Failure]:
+    """Fit ellipses to contours at their isovalues, each in its fitting plane; failures are passed on."""
+    traced = {i: contour for i, contour in enumerate(contours) if not isinstance(contour, Failure)}
+    planes = fitting_planes(list(traced.values()), camera)
+    conics = fit_ellipses(planes.points)
+    cones = cone_of_conic(conics, planes.plane_from_camera)
+    results: dict[int, FittedIsophote | Failure] = {i: c for i, c in enumerate(contours) if isinstance(c, Failure)}
+    for place, (i, points) in enumerate(traced.items()):
+        conic = planes.failures.get(place) or conics[place]
+        if isinstance(conic, Failure):
+            results[i] = conic
+        else:
+            in_image = conic if camera.distortion is None else None
+            results[i] = FittedIsophote(isovalues[i], points, in_image, cones[place], planes.sightlines[place])
+    return [results[i] for i in range(len(contours))]

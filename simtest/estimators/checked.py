@@ -3,7 +3,7 @@
 import numpy as np
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.base import Estimate, Estimator
+from simtest.estimators.base import BatchEstimator, Estimate, Estimator
 from simtest.geometry import Camera, Patch
 
 UNIT_TOLERANCE = 1e-6
@@ -38,6 +38,11 @@ def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimat
         return _problem(result, patch, camera) or result
     except Exception as error:
         return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+
+
+def one_by_one(estimator: Estimator) -> BatchEstimator:
+    """Give an estimator that takes several patches, each run as by `run`."""
+    return lambda patches, camera: [run(estimator, patch, camera) for patch in patches]
 
 
 def _problem(estimate: Estimate, patch: Patch, camera: Camera) -> Failure | None:

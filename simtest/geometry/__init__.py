@@ -1,10 +1,10 @@
 """NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
 
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.circle_pose import CirclePose, circle_pose, cone_axes
+from simtest.geometry.circle_pose import CirclePose, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
 from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
-from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse
+from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
 from simtest.geometry.isophotes import Patch, smooth
 
 __all__ = [
@@ -19,10 +19,12 @@ __all__ = [
     "ViewMask",
     "backproject_conic",
     "circle_pose",
+    "circle_poses",
     "cone_axes",
     "cone_of_conic",
     "cone_rays",
     "ellipse_of_conic",
     "fit_ellipse",
+    "fit_ellipses",
     "smooth",
 ]

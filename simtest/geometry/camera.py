@@ -52,7 +52,8 @@ class ViewMask:
     def contains(self, points_px: npt.ArrayLike) -> Mask:
         """Tell which pixel positions, shape (..., 2), lie inside the circle."""
         points = np.asarray(points_px, dtype=float)
-        return np.asarray(np.hypot(points[..., 0] - self.cx, points[..., 1] - self.cy) <= self.radius)
+        # Squared, as the renderer tells it too.
+        return np.asarray((points[..., 0] - self.cx) ** 2 + (points[..., 1] - self.cy) ** 2 <= self.radius**2)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Circle pose from one conic [F91; MB, section 2.3, step 4] and the axis of the back-projected cone."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,17 +33,40 @@ class CirclePose:
     centres: Array
 
 
-FORWARD = (0.0, 0.0, 1.0)
+@dataclass(frozen=True)
+class CirclePoses:
+    """What each of N cones says about a circle (see `CirclePose`).
+
+    Parameters
+    ----------
+    normals : ndarray, shape (N, 2, 3)
+    axes : ndarray, shape (N, 3)
+    axis_ratios : ndarray, shape (N,)
+    centres : ndarray, shape (N, 2, 3)
+    failures : mapping
+        Failure by the cone's number; the other entries of such a cone mean nothing.
+    """
+
+    normals: Array
+    axes: Array
+    axis_ratios: Array
+    centres: Array
+    failures: Mapping[int, Failure]
+
+    def __getitem__(self, index: int) -> CirclePose | Failure:
+        failure = self.failures.get(index)
+        ratio = float(self.axis_ratios[index])
+        return failure or CirclePose(self.normals[index], self.axes[index], ratio, self.centres[index])
 
 
-def cone_axes(cones: npt.ArrayLike, sightline: npt.ArrayLike = FORWARD) -> tuple[Array, Array]:
+def cone_axes(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> tuple[Array, Array]:
     """Give eigenvalues and eigenvectors of cones in the order of circle pose: l1 >= l2 > 0 > l3.
 
     Parameters
     ----------
     cones : array_like, shape (..., 3, 3)
         Symmetric matrices of signature (2, 1) or (1, 2).
-    sightline : array_like, shape (3,) or (..., 3)
+    sightlines : array_like, shape (3,) or (..., 3), optional
         Any direction on the side of the cone that is meant; default forward. A fisheye also sees cones whose axis
         points backwards.
 
@@ -53,48 +77,71 @@ def cone_axes(cones: npt.ArrayLike, sightline: npt.ArrayLike = FORWARD) -> tuple
     vectors : ndarray, shape (..., 3, 3)
         Columns e1, e2, e3, right-handed, e3 on the sightline's side (the cone's axis, pointing into the scene).
     """
-    C = np.asarray(cones, dtype=float)
-    values, vectors = np.linalg.eigh(C)
+    values, vectors = _ordered(np.asarray(cones, dtype=float), sightlines)
+    hand = np.sign(np.linalg.det(vectors))[..., None]
+    vectors[..., 0] *= hand
+    return values, vectors
+
+
+def _ordered(cones: Array, sightlines: npt.ArrayLike | None) -> tuple[Array, Array]:
+    """Do as `cone_axes`, but of either hand."""
+    values, vectors = np.linalg.eigh(cones)
     # Two eigenvalues share a sign; eigh sorts upwards, so the middle one tells which.
     flipped = values[..., 1] < 0
     values = np.where(flipped[..., None], -values, values[..., ::-1])
     vectors = np.where(flipped[..., None, None], vectors, vectors[..., ::-1])
-    side = np.sum(vectors[..., 2] * np.asarray(sightline, dtype=float), axis=-1)
-    vectors = np.where(side[..., None, None] < 0, -vectors, vectors)
-    hand = np.sign(np.linalg.det(vectors))[..., None]
-    vectors = np.concatenate([vectors[..., :1] * hand[..., None], vectors[..., 1:]], axis=-1)
+    side = vectors[..., 2, 2] if sightlines is None else np.sum(vectors[..., 2] * np.asarray(sightlines), axis=-1)
+    vectors *= np.where(side < 0, -1.0, 1.0)[..., None, None]
     return values, vectors
 
 
-def circle_pose(cone: npt.ArrayLike, sightline: npt.ArrayLike = FORWARD) -> CirclePose | Failure:
-    """Give the two normals of a circle seen as a conic [MB, section 2.3; F91].
+def circle_pose(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None) -> CirclePose | Failure:
+    """Give the two normals of a circle seen as a conic (see `circle_poses`), shapes (3, 3) and (3,)."""
+    return circle_poses(np.asarray(cone, dtype=float)[None], sightline)[0]
+
+
+def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> CirclePoses:
+    """Give the two normals of each circle seen as a conic [MB, section 2.3; F91].
 
     g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence
     its distance, is not observable.
 
     Parameters
     ----------
-    cone : array_like, shape (3, 3)
+    cones : array_like, shape (N, 3, 3)
         C' = K^T C K, any scale and sign.
-    sightline : array_like, shape (3,)
-        Any direction on the side of the cone that is meant; default forward.
+    sightlines : array_like, shape (N, 3) or (3,), optional
+        Any direction on the side of each cone that is meant; default forward.
 
     Returns
     -------
-    CirclePose or Failure
-        A Failure if C' is not finite or not the cone of an ellipse.
+    CirclePoses
+        A Failure for each C' that is not finite or not the cone of an ellipse.
     """
-    C = np.asarray(cone, dtype=float)
-    if not np.isfinite(C).all():
-        return Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
-    (l1, l2, l3), vectors = cone_axes(C, sightline)
-    if not (l1 >= l2 > 0 > l3):
-        return Failure(Reason.DEGENERATE_CONIC, f"eigenvalues {l1:.3g}, {l2:.3g}, {l3:.3g} are not those of a cone")
-    e1, _, e3 = vectors.T
+    C = np.asarray(cones, dtype=float)
+    finite = np.isfinite(C).all(axis=(1, 2))
+    values, vectors = _ordered(np.where(finite[:, None, None], C, _ROUND), sightlines)
+    l1, l2, l3 = values.T
+    sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
+    failures = {}
+    for index in np.flatnonzero(~(finite & sound)).tolist():
+        detail = f"eigenvalues {l1[index]:.3g}, {l2[index]:.3g}, {l3[index]:.3g} are not those of a cone"
+        cone = Failure(Reason.DEGENERATE_CONIC, detail)
+        failures[index] = cone if finite[index] else Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
+    # The values of a round cone stand in for those that are none.
+    l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
+    e1, e3 = vectors[:, :, 0], vectors[:, :, 2]
     g, h = np.sqrt((l1 - l2) / (l1 - l3)), np.sqrt((l2 - l3) / (l1 - l3))
-    normals = -np.stack([g * e1 + h * e3, -g * e1 + h * e3])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = _pair(e1 * g[:, None], e3 * h[:, None])
     # C'^-1 N in the eigenbasis; the centre lies in front of the camera, on the axis' side.
-    centres = -np.stack([g / l1 * e1 + h / l3 * e3, -g / l1 * e1 + h / l3 * e3])
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    return CirclePose(normals, e3, float(np.sqrt(l2 / l1)), centres)
+    centres = _pair(e1 * (g / l1)[:, None], e3 * (h / l3)[:, None])
+    return CirclePoses(normals, e3, np.sqrt(l2 / l1), centres, failures)
+
+
+_ROUND = np.diag([1.0, 1.0, -1.0])
+
+
+def _pair(across: Array, along: Array) -> Array:
+    """Give the unit vectors along -(+-across + along), shape (N, 2, 3)."""
+    both = -np.stack([along + across, along - across], axis=1)
+    return np.asarray(both / np.linalg.norm(both, axis=2, keepdims=True))

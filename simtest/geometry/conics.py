@@ -7,62 +7,62 @@ import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
 from simtest.geometry.circle_pose import cone_axes
-from simtest.geometry.ellipse_fit import FittedConic
+from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 
 Array = npt.NDArray[np.float64]
 
 
-def backproject_conic(conic: FittedConic, camera: Camera) -> Array:
-    """Give the cone of sightlines through an image ellipse: C' = K^T C K [MB, section 2.3, step 3].
+def backproject_conic(conic: FittedConic | FittedConics, camera: Camera) -> Array:
+    """Give the cone of sightlines through an image ellipse, or each of several: C' = K^T C K [MB, section 2.3, step 3].
 
     The transforms are multiplied before the conic is touched, so that a small ellipse far from the origin keeps its
     digits.
 
     Parameters
     ----------
-    conic : FittedConic
+    conic : FittedConic or FittedConics
         In pixels.
     camera : Camera
         For K.
 
     Returns
     -------
-    ndarray, shape (3, 3)
+    ndarray, shape (3, 3) or (N, 3, 3)
         Symmetric; w^T C' w = 0 for the sightlines w of the ellipse's pixels. Scaled to unit norm.
     """
     return cone_of_conic(conic, camera.K)
 
 
-def cone_of_conic(conic: FittedConic, plane_from_camera: Array) -> Array:
-    """Give the cone of directions through an ellipse of a plane: C' = A^T C A.
+def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -> Array:
+    """Give the cone of directions through an ellipse of a plane, or each of several: C' = A^T C A.
 
     Parameters
     ----------
-    conic : FittedConic
+    conic : FittedConic or FittedConics
         In the plane's coordinates.
-    plane_from_camera : ndarray, shape (3, 3)
+    plane_from_camera : ndarray, shape (3, 3) or (N, 3, 3)
         A, from the camera frame to the plane's homogeneous coordinates: K for pixels, a rotation for a gnomonic plane.
 
     Returns
     -------
-    ndarray, shape (3, 3)
+    ndarray, shape (3, 3) or (N, 3, 3)
         Symmetric, camera frame, scaled to unit norm.
     """
     H = conic.normalised_from_image @ plane_from_camera
-    cone = H.T @ conic.normalised @ H
-    cone = (cone + cone.T) / 2
-    return np.asarray(cone / np.linalg.norm(cone))
+    cone = np.swapaxes(H, -1, -2) @ conic.normalised @ H
+    cone = (cone + np.swapaxes(cone, -1, -2)) / 2
+    return np.asarray(cone / np.linalg.norm(cone, axis=(-2, -1), keepdims=True))
 
 
-def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike = (0.0, 0.0, 1.0), count: int = 73) -> Array:
+def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None, count: int = 73) -> Array:
     """Give directions along the cone of an ellipse, to draw it through any lens.
 
     Parameters
     ----------
     cone : array_like, shape (3, 3)
         C', camera frame.
-    sightline : array_like, shape (3,)
-        Any direction on the side of the cone that is meant.
+    sightline : array_like, shape (3,), optional
+        Any direction on the side of the cone that is meant; default forward.
     count : int
         Number of directions; the first is repeated at the end.
 

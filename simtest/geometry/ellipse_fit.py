@@ -1,11 +1,13 @@
-"""Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled."""
+"""Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled, of many contours at once."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
+from simtest.geometry.ellipse_pencil import constrained_minimum
 
 Array = npt.NDArray[np.float64]
 
@@ -17,6 +19,19 @@ MAX_COORDINATE = 1e150
 
 MAX_AXIS_RATIO = 1e4
 """A fitted ellipse longer than this over its width is a line."""
+
+_STEP = 64
+"""Contours are padded to a multiple of this many points. Their own length alone decides, so that a fit's last bits
+do not depend on what else is in the batch."""
+
+_LINE = 1e-14
+"""A share of the squared second moments' trace below which their determinant is rounding."""
+
+_RANK = 1e-15
+"""A share of the largest moment below which an eigenvalue is rounding."""
+
+_AT_ONCE = 2**16
+"""Padded points that are worked on at once: more would leave the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +46,7 @@ class FittedConic:
     normalised : ndarray, shape (3, 3)
         Symmetric, in the centred coordinates, positive outside.
     normalised_from_image : ndarray, shape (3, 3)
-        Similarity from pixels to the centred coordinates.
+        Similarity from pixels to the centred coordinates, along the points' principal axes.
     """
 
     normalised: Array
@@ -42,6 +57,41 @@ class FittedConic:
         """The conic in pixels, shape (3, 3)."""
         T = self.normalised_from_image
         return np.asarray(T.T @ self.normalised @ T)
+
+
+@dataclass(frozen=True)
+class FittedConics:
+    """Ellipses of several contours (see `FittedConic`).
+
+    Parameters
+    ----------
+    normalised, normalised_from_image : ndarray, shape (N, 3, 3)
+        As of `FittedConic`; those of a failed fit mean nothing.
+    failures : mapping
+        Failure by the contour's number.
+    """
+
+    normalised: Array
+    normalised_from_image: Array
+    failures: Mapping[int, Failure] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.normalised)
+
+    def __getitem__(self, index: int) -> FittedConic | Failure:
+        failure = self.failures.get(index)
+        return failure or FittedConic(self.normalised[index], self.normalised_from_image[index])
+
+
+class _Failures:
+    """The first failure of each contour."""
+
+    def __init__(self) -> None:
+        self.found: dict[int, Failure] = {}
+
+    def add(self, which: npt.NDArray[np.bool_], reason: Reason, detail: str) -> None:
+        for index in np.flatnonzero(which):
+            self.found.setdefault(int(index), Failure(reason, detail))
 
 
 def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
@@ -57,60 +107,135 @@ def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
     FittedConic or Failure
         A Failure for fewer than 6 points, values that are not finite, points on a line, or no elliptic solution.
     """
-    xy = np.asarray(points, dtype=float)
-    if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < MIN_POINTS:
-        return Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
-    if not np.isfinite(xy).all():
-        return Failure(Reason.NOT_FINITE, "contour points hold NaN or infinity")
-    if np.abs(xy).max() > MAX_COORDINATE:
-        return Failure(Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
-    centre = xy.mean(axis=0)
-    scale = float(np.sqrt(((xy - centre) ** 2).sum(axis=1).mean() / 2))
-    if not scale > 1e-12 * (1 + float(np.abs(centre).max())):
-        return Failure(Reason.DEGENERATE_CONIC, "all points coincide")
-    coefficients = _fit_normalised((xy - centre) / scale)
-    if isinstance(coefficients, Failure):
-        return coefficients
-    a, b, c, d, e, f = coefficients
-    conic = np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, f]])
-    if np.trace(conic[:2, :2]) < 0:
-        conic = -conic
-    failure = _check(conic)
-    if failure is not None:
-        return failure
-    transform = np.array([[1 / scale, 0, -centre[0] / scale], [0, 1 / scale, -centre[1] / scale], [0, 0, 1.0]])
-    return FittedConic(conic / np.linalg.norm(conic), transform)
+    return fit_ellipses([points])[0]
 
 
-def _fit_normalised(xy: Array) -> Array | Failure:
-    """Give a x^2 + b x y + c y^2 + d x + e y + f = 0 by Halir & Flusser's reduced 3 x 3 eigenproblem."""
-    x, y = xy.T
-    quadratic, linear = np.stack([x * x, x * y, y * y], axis=1), np.stack([x, y, np.ones_like(x)], axis=1)
-    S1, S2, S3 = quadratic.T @ quadratic, quadratic.T @ linear, linear.T @ linear
-    try:
-        T = -np.linalg.solve(S3, S2.T)
-        M = S1 + S2 @ T
-        reduced = np.stack([M[2] / 2, -M[1], M[0] / 2])
-        _, vectors = np.linalg.eig(reduced)
-    except np.linalg.LinAlgError:
-        return Failure(Reason.DEGENERATE_CONIC, "the points lie on a line")
-    # The two solutions that are no ellipse may coincide, as on a circle; rounding then makes them a complex pair.
-    real = np.abs(vectors.imag).max(axis=0) <= 1e-9
-    vectors = np.real(vectors)
-    condition = np.where(real, 4 * vectors[0] * vectors[2] - vectors[1] ** 2, -np.inf)
-    if not (condition > 0).any():
-        return Failure(Reason.NOT_AN_ELLIPSE, "the fit has no elliptic solution")
-    quadratic_part = vectors[:, int(np.argmax(condition))]
-    return np.concatenate([quadratic_part, T @ quadratic_part])
+def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
+    """Fit an ellipse to each of several contours (see `fit_ellipse`).
+
+    Parameters
+    ----------
+    contours : sequence of array_like, shape (N_i, 2)
+        Pixels.
+
+    Returns
+    -------
+    FittedConics
+        In the order of the contours.
+    """
+    count = len(contours)
+    normalised, transforms = np.tile(np.eye(3), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1))
+    failures: dict[int, Failure] = {}
+    alike: dict[int, list[int]] = {}
+    arrays = [np.asarray(points, dtype=float) for points in contours]
+    for index, xy in enumerate(arrays):
+        if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < MIN_POINTS:
+            failures[index] = Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
+        else:
+            alike.setdefault(-(-len(xy) // _STEP) * _STEP, []).append(index)
+    for length, members in alike.items():
+        at_once = max(1, _AT_ONCE // length)
+        for first in range(0, len(members), at_once):
+            part = members[first : first + at_once]
+            fitted = _fit_padded([arrays[i] for i in part], length)
+            normalised[part], transforms[part] = fitted.normalised, fitted.normalised_from_image
+            failures |= {part[i]: failure for i, failure in fitted.failures.items()}
+    return FittedConics(normalised, transforms, failures)
 
 
-def _check(conic: Array) -> Failure | None:
-    """Refuse a conic that is no real ellipse, or so long that it is a line."""
-    low, high = np.linalg.eigvalsh(conic[:2, :2])
-    if not np.isfinite(conic).all():
-        return Failure(Reason.NOT_FINITE, "the fit overflowed")
-    if low <= 0 or np.linalg.det(conic) >= 0:
-        return Failure(Reason.NOT_AN_ELLIPSE, "the fitted conic is no real ellipse")
-    if high > MAX_AXIS_RATIO**2 * low:
-        return Failure(Reason.DEGENERATE_CONIC, f"axes differ by more than a factor {MAX_AXIS_RATIO:g}")
-    return None
+def _fit_padded(contours: list[Array], length: int) -> FittedConics:
+    """Fit contours of at most `length` points, B of them."""
+    counts = np.array([len(xy) for xy in contours])
+    present = np.arange(length) < counts[:, None]
+    # One table for all steps: x^2, x y, y^2, x, y, 1. Fresh memory for each would cost more than the sums.
+    design = np.zeros((6, len(contours), length))
+    design[5] = present
+    points = design[3:5]
+    for i, xy in enumerate(contours):
+        points[:, i, : len(xy)] = xy.T
+    failures = _Failures()
+    extent = np.abs(points).max(axis=(0, 2))
+    failures.add(~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity")
+    failures.add(extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
+    points[:, list(failures.found)] = 0.0
+    transforms = _normalise(points, design[5], counts, failures)
+    conics = _fit_normalised(design, counts, failures)
+    _check(conics, failures)
+    return FittedConics(conics, transforms, failures.found)
+
+
+def _normalise(points: Array, present: Array, counts: Array, failures: _Failures) -> Array:
+    """Move points, shape (2, B, n), to their centre, principal axes and unit spread; give the similarities.
+
+    In the principal axes the moments of a long ellipse are graded, and no digits are lost between them.
+    """
+    centre = np.zeros((2, len(counts)))
+    # Twice: far from the origin the first mean is off by its rounding, and the points would share that offset.
+    for _ in range(2):
+        mean = points.sum(axis=2) / counts
+        points -= mean[:, :, None]
+        points *= present
+        centre += mean
+    (xx, xy), (_, yy) = np.einsum("ibn,jbn->ijb", points, points)
+    scale = np.sqrt((xx + yy) / counts / 2)
+    together = ~(scale > 1e-12 * (1 + np.abs(centre).max(axis=0)))
+    failures.add(together, Reason.DEGENERATE_CONIC, "all points coincide")
+    points[:, together] = 0.0
+    scale[together] = 1.0
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    cos, sin = np.cos(angle) / scale, np.sin(angle) / scale
+    transforms = np.zeros((len(counts), 3, 3))
+    transforms[:, 0, 0] = transforms[:, 1, 1] = cos
+    transforms[:, 0, 1], transforms[:, 1, 0] = sin, -sin
+    transforms[:, :2, 2] = -(transforms[:, :2, :2] @ centre.T[:, :, None])[:, :, 0]
+    transforms[:, 2, 2] = 1.0
+    points[:] = (transforms[:, :2, :2] @ points.transpose(1, 0, 2)).transpose(1, 0, 2)
+    return transforms
+
+
+def _fit_normalised(design: Array, counts: Array, failures: _Failures) -> Array:
+    """Give conics of normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
+
+    The last three of `design`, shape (6, B, n), are x, y and 1. The sums of x and of y are 0: the linear and the
+    constant part do not mix.
+    """
+    x, y = design[3:5]
+    for row, (first, second) in enumerate(((x, x), (x, y), (y, y))):
+        np.multiply(first, second, out=design[row])
+    S = design[:3].transpose(1, 0, 2) @ design.transpose(1, 2, 0)
+    S1, S2, (xx, xy, yy) = S[:, :, :3], S[:, :, 3:5], S[:, :, 5].T
+    spread = xx * yy - xy * xy
+    on_line = ~(spread > _LINE * (xx + yy) ** 2)
+    failures.add(on_line, Reason.DEGENERATE_CONIC, "the points lie on a line")
+    # d, e and f that minimise the residual for given a, b, c: (d, e) = -linear (a, b, c), f = -constant (a, b, c).
+    inverse = np.stack([yy, -xy, -xy, xx], axis=1) / np.where(on_line, 1.0, spread)[:, None]
+    linear = inverse.reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
+    constant = S[:, :, 5] / counts[:, None]
+    M = S1 - S2 @ linear - S[:, :, 5, None] * constant[:, None, :]
+    M = (M + M.transpose(0, 2, 1)) / 2
+    # One eigenvalue of M is 0 on an exact ellipse; where two are, as on four points, many conics fit.
+    trace, rounding = np.trace(M, axis1=1, axis2=2), _RANK * np.trace(S1, axis1=1, axis2=2)
+    minors = (trace**2 - (M**2).sum(axis=(1, 2))) / 2
+    many = ~((trace > rounding) & (minors > rounding * trace))
+    failures.add(many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse")
+    # A circle's problem stands in for those without a solution.
+    M[many | on_line] = np.eye(3)
+    quadratic = constrained_minimum(M)
+    a, b, c = quadratic.T
+    d, e = -(linear @ quadratic[:, :, None])[:, :, 0].T
+    f = -(constant * quadratic).sum(axis=1)
+    conics = np.stack([a, b / 2, d / 2, b / 2, c, e / 2, d / 2, e / 2, f], axis=1)
+    conics *= (np.where(a + c < 0, -1.0, 1.0) / np.linalg.norm(conics, axis=1))[:, None]
+    return np.asarray(conics.reshape(-1, 3, 3))
+
+
+def _check(conics: Array, failures: _Failures) -> None:
+    """Refuse conics that are no real ellipse, or so long that they are lines."""
+    a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
+    high = (a + c + np.hypot(a - c, 2 * b)) / 2
+    # low as the product over high: the difference would cancel.
+    low = (a * c - b * b) / high
+    not_real = ~((low > 0) & (np.linalg.det(conics) < 0))
+    failures.add(not_real, Reason.NOT_AN_ELLIPSE, "the fitted conic is no real ellipse")
+    too_long = ~(high <= MAX_AXIS_RATIO**2 * low)
+    failures.add(too_long, Reason.DEGENERATE_CONIC, f"axes differ by more than a factor {MAX_AXIS_RATIO:g}")

@@ -1,18 +1,22 @@
-"""Isophotes of a highlight: the closed contour at a share of the smoothed peak that encloses it."""
+"""Isophotes of a highlight: the border of the region above a share of the smoothed peak that holds the peak."""
 
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from skimage.measure import find_contours
+from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
+from simtest.geometry.level_sets import LevelSet, level_set_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+
+MIN_PLATEAU_PX = 12
+"""Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
 
 
 def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
@@ -20,7 +24,7 @@ def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> I
 
     Parameters
     ----------
-    frame : array_like, shape (H, W)
+    frame : array_like, shape (H, W) or (H, W, C)
         Intensities.
     sigma_px : float
         Standard deviation, px; 0 leaves the frame as it is.
@@ -30,15 +34,15 @@ def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> I
 
     Returns
     -------
-    ndarray of float32, shape (H, W)
+    ndarray of float32, same shape
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if seen is None:
         return _blurred(image, sigma_px)
-    weights = _blurred(seen.astype(np.float32), sigma_px)
-    return np.asarray(
-        np.divide(_blurred(np.where(seen, image, 0), sigma_px), weights, where=seen, out=np.zeros_like(image))
-    )
+    inside = seen if image.ndim == 2 else seen[:, :, None]
+    weights = _blurred(seen.astype(np.float32), sigma_px).reshape(inside.shape)
+    blurred = _blurred(np.where(inside, image, np.float32(0)), sigma_px)
+    return np.asarray(np.divide(blurred, weights, where=inside, out=np.zeros_like(image)))
 
 
 def _blurred(image: Image, sigma_px: float) -> Image:
@@ -61,6 +65,10 @@ class Patch:
         Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
     peak_value : float
         Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    peak_pixel : tuple of int
+        Column and row of the peak's pixel in the region.
+    saturated : ndarray of bool, shape (h, w), optional
+        Where the sensor is clipped; None where that is not known.
     seen : ndarray of bool, shape (h, w), optional
         The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
     """
@@ -69,8 +77,10 @@ class Patch:
     origin_px: tuple[int, int]
     peak_px: Array
     peak_value: float
+    peak_pixel: tuple[int, int]
+    saturated: Mask | None = None
     seen: Mask | None = None
-    _contours: dict[float, Array | Failure] = field(default_factory=dict, compare=False, repr=False)
+    _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
     def cut(
@@ -79,6 +89,7 @@ class Patch:
         box: tuple[int, int, int, int],
         peak: tuple[int, int] | None = None,
         origin_px: tuple[int, int] = (0, 0),
+        saturated: Mask | None = None,
         seen: Mask | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
@@ -93,6 +104,8 @@ class Patch:
             Column and row of the peak's pixel; default the brightest of the region.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        saturated : ndarray of bool, shape (H, W), optional
+            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
         seen : ndarray of bool, shape (H, W), optional
             The frame's pixels inside the camera's view mask; default all.
 
@@ -111,23 +124,38 @@ class Patch:
         if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
             raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
         values = smoothed[y : y + height, x : x + width]
-        if not np.isfinite(values).all():
+        # Either end of the range shows NaN and infinity, at less than the price of a look at every value.
+        lowest, highest = float(values.min()), float(values.max())
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
             return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
         if peak is None:
             row, column = divmod(int(values.argmax()), values.shape[1])
         else:
             column, row = peak[0] - x, peak[1] - y
         value = float(values[row, column])
-        seen = None if seen is None else seen[y : y + height, x : x + width]
-        least = float(values.min() if seen is None else values.min(where=seen, initial=np.inf))
-        if value <= 0 or value <= least:
-            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {least:g}")
+        if seen is not None:
+            seen = seen[y : y + height, x : x + width]
+            lowest = float(values.min(where=seen, initial=np.inf))
+        if value <= 0 or value <= lowest:
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         corner = (x + origin_px[0], y + origin_px[1])
-        peak_px = _parabolic_peak(values, row, column) + PIXEL_CENTRE + corner
-        return cls(values, corner, peak_px, value, seen)
+        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
+        plateau = None if clipped is None else _plateau(clipped, row, column)
+        if plateau is None:
+            place = _parabolic_peak(values, row, column)
+        else:
+            pixels = np.argwhere(plateau)[:, ::-1]
+            place = pixels.mean(axis=0)
+            # Where falloff was divided away the plateau is slanted, and highest at its rim.
+            column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
+            value = float(values[row, column])
+        return cls(values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen)
 
-    def isophote(self, isovalue: float) -> Array | Failure:
-        """Trace the closed isophote around the peak by marching squares [MB, section 2.3, step 1].
+    def crossings(self, isovalue: float) -> Array | Failure:
+        """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
+
+        The isophote is the outer border of the region above t times the peak that holds the peak. Its points lie where
+        it crosses the lines between the centres of neighbouring pixels.
 
         Parameters
         ----------
@@ -137,33 +165,60 @@ class Patch:
         Returns
         -------
         ndarray, shape (N, 2), or Failure
-            Closed polygon in the frame, px, first point repeated at the end; the largest if several enclose the peak.
+            In the frame, px, each point once.
 
         Raises
         ------
         InputError
             If t is outside (0, 1).
         """
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
+
+    def isophote(self, isovalue: float) -> Array | Failure:
+        """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end."""
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
+
+    def _level_set(self, isovalue: float) -> LevelSet | Failure:
         if not 0 < isovalue < 1:
             raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
-        if isovalue not in self._contours:
-            self._contours[isovalue] = self._trace(isovalue)
-        return self._contours[isovalue]
+        if isovalue not in self._level_sets:
+            found = level_set_around(self.values, self.peak_pixel, isovalue * self.peak_value, self.seen)
+            self._level_sets[isovalue] = found or Failure(
+                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
+            )
+        return self._level_sets[isovalue]
 
-    def _trace(self, isovalue: float) -> Array | Failure:
-        if min(self.values.shape) < 3:
-            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"region of {self.values.shape[1]} x {self.values.shape[0]} px")
-        best, best_area = None, 0.0
-        for contour in find_contours(self.values, isovalue * self.peak_value, mask=self.seen):
-            points = contour[:, ::-1] + PIXEL_CENTRE + self.origin_px
-            if len(points) < 4 or not np.array_equal(points[0], points[-1]):
-                continue
-            area = abs(polygon_area(points))
-            if area > best_area and encloses(points, self.peak_px):
-                best, best_area = points, area
-        if best is None:
-            return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}")
-        return best
+    def inside(self, isovalue: float) -> Mask:
+        """Tell which of the region's pixels an isophote encloses, shape (h, w); all seen where it does not close."""
+        found = self._level_set(isovalue)
+        if isinstance(found, Failure):
+            return np.ones(self.values.shape, dtype=bool) if self.seen is None else self.seen
+        mask = np.zeros(self.values.shape, dtype=bool)
+        height, width = found.inside.shape
+        x, y = found.corner
+        mask[y : y + height, x : x + width] = found.inside
+        return mask
+
+    def saturated_share(self, isovalue: float) -> float | None:
+        """Give the share of the pixels inside an isophote that are clipped; None where that is not known."""
+        if self.saturated is None:
+            return None
+        inside = self.inside(isovalue)
+        return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
+
+
+def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
+    """Give the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
+    if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
+        return None
+    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
+    if not whole[row, column]:
+        return None
+    labels, _ = ndimage.label(whole, np.ones((3, 3)))
+    plateau = np.asarray(labels == labels[row, column])
+    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX else None
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
@@ -174,14 +229,8 @@ def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
             before, here, after = (float(v) for v in line[index - 1 : index + 2])
             bend = before - 2 * here + after
             if bend < 0:
-                position[axis] += float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+                position[axis] += min(max(0.5 * (before - after) / bend, -0.5), 0.5)
     return np.array(position)
-
-
-def polygon_area(points: Array) -> float:
-    """Give the signed area of a closed polygon, shape (N, 2), last point equal to the first (shoelace formula)."""
-    x, y = (points - points[0]).T
-    return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2)
 
 
 def encloses(points: Array, point: Array) -> bool:

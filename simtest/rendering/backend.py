@@ -217,14 +217,11 @@ def load(variant: str | None = None) -> Any:
         If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
-    if name.startswith("llvm") and not _llvm_active():
-        chosen, tried = choose_library()
-        if chosen is None:
-            raise BackendError(no_library_message(tried))
-        for failed in tried[:-1]:
-            if failed.origin == LIBRARY_VARIABLE:
-                warnings.warn(f"{LIBRARY_VARIABLE}={failed.path}: {failed.verdict}; using {chosen.path}", stacklevel=2)
-        os.environ[LIBRARY_VARIABLE] = chosen.path
+    if _drjit_loaded():
+        if name.startswith("llvm"):
+            _check_library_in_memory()
+    else:
+        _set_library(needed=name.startswith("llvm"))
     import mitsuba
 
     usable = [v for v in mitsuba.variants() if re.fullmatch(r"(llvm|cuda)_ad_(mono|rgb)", v)]
@@ -241,10 +238,42 @@ def load(variant: str | None = None) -> Any:
     return mitsuba
 
 
-def _llvm_active() -> bool:
-    """Tell whether Dr.Jit has loaded its libLLVM already: then there is nothing left to choose."""
-    active = sys.modules["mitsuba"].variant() if "mitsuba" in sys.modules else None
-    return bool(active and active.startswith("llvm"))
+def _drjit_loaded() -> bool:
+    """Tell whether Dr.Jit has been imported, and has loaded its libLLVM: then there is nothing left to choose."""
+    return "drjit" in sys.modules
+
+
+def _set_library(needed: bool) -> None:
+    """Tell Dr.Jit which libLLVM to load, whatever the variant: it does so once, when it is imported."""
+    chosen, tried = choose_library()
+    if chosen is None:
+        if needed:
+            raise BackendError(no_library_message(tried))
+        return
+    for failed in tried[:-1]:
+        if failed.origin == LIBRARY_VARIABLE:
+            warnings.warn(f"{LIBRARY_VARIABLE}={failed.path}: {failed.verdict}; using {chosen.path}", stacklevel=3)
+    os.environ[LIBRARY_VARIABLE] = chosen.path
+
+
+def _check_library_in_memory() -> None:
+    """Refuse a libLLVM that something else has loaded before and that would end the process."""
+    for path in _mapped_libraries():
+        verdict = probe(Candidate("in memory", path)).verdict
+        if verdict != "ok":
+            raise BackendError(
+                f"libLLVM {path}, loaded before simtest could choose: {verdict}; import simtest's renderer (or call "
+                "simtest.render) before drjit or mitsuba"
+            )
+
+
+def _mapped_libraries() -> list[str]:
+    """Give the libLLVM files that are mapped into this process; none where the system does not tell."""
+    try:
+        maps = Path("/proc/self/maps").read_text()
+    except OSError:
+        return []
+    return sorted(set(re.findall(r"/\S*libLLVM[^/\s]*\.so\S*", maps)))
 
 
 def library_in_use() -> str | None:

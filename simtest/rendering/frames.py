@@ -1,20 +1,12 @@
 """What a session gives: radiance, ground-truth maps and the true highlights."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 FloatImage = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
-
-
-def scattered(values: npt.NDArray[Any], where: npt.NDArray[np.bool_], fill: float) -> npt.NDArray[Any]:
-    """Put values, shape (M, ...), at the M places marked in `where`, shape (N,), and `fill` at the others."""
-    whole = np.full((len(where), *values.shape[1:]), fill, dtype=values.dtype)
-    whole[where] = values
-    return whole
 
 
 @dataclass(frozen=True)
@@ -46,6 +38,60 @@ class Radiance:
     def intensity(self) -> FloatImage:
         """Mean of the channels, shape (H, W): what estimators see."""
         return self.total if self.channels == 1 else self.total.mean(axis=2, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What was rendered at each pixel's centre, single precision, camera frame; NaN where there is no surface.
+
+    Of a mesh these are the hit triangle's, with normals and shape operators interpolated between its corners;
+    `TruthMaps` holds the exact values of the smooth surface.
+
+    Parameters
+    ----------
+    depth : ndarray of float32, shape (H, W)
+        Distance along the ray, mm.
+    position : ndarray of float32, shape (H, W, 3)
+        mm.
+    normal, geometric_normal : ndarray of float32, shape (H, W, 3)
+        Unit normals: that of the shading, as it is, and that of the triangle, facing the camera.
+    k_min, k_max : ndarray of float32, shape (H, W)
+        Principal curvatures, 1/mm, convex towards the camera positive; NaN also where a mesh's could not be fitted.
+    instance : ndarray of int32, shape (H, W)
+        Number of the surface, from 0; -1 where there is none.
+    face : ndarray of int32, shape (H, W)
+        Triangle of a mesh, 0 for other shapes; -1 where there is none.
+    """
+
+    depth: FloatImage
+    position: FloatImage
+    normal: FloatImage
+    geometric_normal: FloatImage
+    k_min: FloatImage
+    k_max: FloatImage
+    instance: npt.NDArray[np.int32]
+    face: npt.NDArray[np.int32]
+
+    @property
+    def mask(self) -> npt.NDArray[np.bool_]:
+        """Where there is a surface, shape (H, W)."""
+        return self.instance >= 0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame with its labels.
+
+    Parameters
+    ----------
+    radiance : Radiance
+        Of as many samples a pixel as the scene asks for.
+    labels : Labels
+        At the pixels' centres.
+    """
+
+    radiance: Radiance
+    labels: Labels
 
 
 @dataclass(frozen=True)

@@ -82,10 +82,9 @@ def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight
         The brightest first.
     """
     camera = session.camera
-    grid = _seed_grid(session, stride)
+    grid, places = _seed_grid(session, stride), session.scene.rig.true_mm()
     found = []
-    for index, light in enumerate(session.scene.rig.lights):
-        place = np.array(light.place_mm)
+    for index, place in enumerate(places):
         seeds = _seeds(grid[0], grid[1], place, stride)
         solutions = _newton(session, seeds, place)
         solutions = _distinct(solutions[camera.contains(solutions)])

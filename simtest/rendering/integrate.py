@@ -1,20 +1,42 @@
-"""Radiance along given rays: direct light in closed form, further bounces by Mitsuba's path integrator."""
+"""Traces a frame: one ray through each pixel's centre, or several samples a pixel, in launches of bounded size.
 
-from collections.abc import Callable
+A frame of one sample goes row by row, so that nothing has to be sorted; its labels come out of the same kernel. Several
+samples go in tiles of 4 x 4 pixels and are summed in registers, so that memory does not grow with their number.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from simtest.geometry.camera import Camera
-from simtest.rendering.frames import Array, Radiance, scattered
+from simtest.rendering.direct import DirectLight, Material
+from simtest.rendering.frames import FloatImage, Radiance
+from simtest.rendering.indirect import Bounces
+from simtest.rendering.labels import ShapeLabels
+from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
+from simtest.rendering.refine import Refinement
+from simtest.rendering.spectrum import channels
 
-Rays = Callable[[Array], tuple[Array, Array]]
+Progress = Callable[[int, int, str], None]
+"""Called with samples traced, samples in all, and what is done; may raise to stop."""
+
+LANES = 2**22
+"""Pixels of one launch: they bound the memory."""
+
+RAYS = 2**24
+"""Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between two."""
+
+SUMMED = 64
+"""Samples of a pixel that are summed in single precision; above that, sums are added in double precision."""
+
+Sums = npt.NDArray[np.float64]
 
 
-@dataclass
+@dataclass(frozen=True)
 class Tracer:
-    """Traces rays in one Mitsuba scene lit by point lights.
+    """Traces one scene.
 
     Parameters
     ----------
@@ -22,142 +44,185 @@ class Tracer:
         mitsuba with the variant set.
     scene : mitsuba.Scene
         Holds one surface and the lights (the latter for further bounces).
-    diffuse_bsdf : mitsuba.BSDF
-        The surface's material without its specular part.
-    lights : ndarray, shape (L, 3)
-        Positions in the model frame, mm.
-    powers : list of float
-        Radiant intensities.
-    shadows : list of bool
-        Whether a light's shadow rays are traced (not needed where it is at the camera).
+    sightlines : Sightlines
+        Of the camera.
+    light : DirectLight
+        The rig.
+    material : Material
+        The surface's.
+    refinement : Refinement
+        Solves the hits again in double precision.
     """
 
     mi: Any
     scene: Any
-    diffuse_bsdf: Any
-    lights: Array
-    powers: list[float]
-    shadows: list[bool]
+    sightlines: Sightlines
+    light: DirectLight
+    material: Material
+    refinement: Refinement
 
-    def __post_init__(self) -> None:
-        # Opaque, so that a moved light does not compile a new kernel.
-        import drjit as dr
+    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Any]:
+        """Trace pixel positions; gives rays, hits and surface points.
 
-        self._places = [self.mi.Point3f(*place.tolist()) for place in self.lights]
-        self._powers = [self.mi.Float(power) for power in self.powers]
-        dr.make_opaque(self._places, self._powers)
+        With `bent` the points know the derivatives of their normals.
+        """
+        rays = self.sightlines.rays(x, y)
+        preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
+        flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
+        si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
+        self.refinement.apply(rays.origin, rays.direction, si)
+        return rays, preliminary, si
 
-    def trace(self, origins: Array, directions: Array, path_depth: int, seed: int) -> tuple[Array, Array, Array]:
-        """Give the radiance towards the rays' origins.
+    def _parts(self, si: Any, bounces: Bounces | None, count: int, block: int, sample: int) -> list[Any]:
+        """Give the channels of direct light off the lobe and the base and, with bounces, of theirs."""
+        specular, diffuse = self.light.radiance(self.scene, self.material, si)
+        parts = [*specular, *diffuse]
+        if bounces is not None:
+            parts += [*bounces.radiance(si, count, block, sample)]
+        return parts
+
+    # One sample --------------------------------------------------------------------------------------------------
+
+    def centres(
+        self, bounces: Bounces | None, radiance: bool, labels: ShapeLabels | None, progress: Progress | None = None
+    ) -> tuple[list[FloatImage], list[FloatImage]]:
+        """Trace the ray through each pixel's centre.
 
         Parameters
         ----------
-        origins, directions : ndarray, shape (N, 3)
-            Model frame, mm; unit directions, NaN where there is no ray: no radiance comes from there.
-        path_depth : int
-            2: direct light alone; more: up to path_depth - 1 bounces.
-        seed : int
-            For the bounces.
+        bounces : Bounces, optional
+            Further bounces.
+        radiance : bool
+            Whether to compute the radiance.
+        labels : ShapeLabels, optional
+            Whose labels to give beside it.
+        progress : callable, optional
+            Told after each launch.
 
         Returns
         -------
-        specular, diffuse, indirect : ndarray, shape (N, C)
-            C channels of the variant.
+        parts, labels : list of ndarray of float32, shape (H, W)
+            Channels of the radiance and of the labels; empty where not asked for.
         """
+        camera = self.sightlines.camera
+        pixels = camera.width * camera.height
+        rows: list[list[FloatImage]] = []
+        count_of_parts = 0
+        for block, (first, count) in enumerate(_blocks(pixels)):
+            lanes = self.sightlines.lanes(first, count, False, 0)
+            rays, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
+            parts = self._parts(si, bounces, count, block, 0) if radiance else []
+            count_of_parts = len(parts)
+            if labels is not None:
+                rotation = self.sightlines.camera_from_model
+                parts = parts + labels.trace(preliminary, si, rays, rotation)
+            rows.append(_evaluate(parts, count))
+            if progress:
+                progress(first + count, pixels, "rendering")
+        shape = (camera.height, camera.width)
+        maps = [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
+                for pieces in zip(*rows, strict=True)]  # fmt: skip
+        return maps[:count_of_parts], maps[count_of_parts:]
+
+    # Several samples ---------------------------------------------------------------------------------------------
+
+    def mean(
+        self, samples: int, seed: int, bounces: Bounces | None, progress: Progress | None = None
+    ) -> list[FloatImage]:
+        """Give the mean radiance over the pixels' area.
+
+        Parameters
+        ----------
+        samples : int
+            For each pixel.
+        seed : int
+            Of their places.
+        bounces : Bounces, optional
+            Further bounces.
+        progress : callable, optional
+            Told after each launch.
+
+        Returns
+        -------
+        list of ndarray of float32, shape (H, W)
+            Channels of the radiance.
+        """
+        height, width = self.sightlines.tiled_size
+        camera, total = self.sightlines.camera, height * width * samples
+        blocks: list[npt.NDArray[np.float32]] = []
+        for block, (first, count) in enumerate(_blocks(height * width)):
+            lanes = self.sightlines.lanes(first, count, True, seed)
+            sums: Sums | None = None
+            for start, stop in self._runs(samples, count, bounces):
+                if bounces is None and self.sightlines.in_kernel:
+                    parts = self._looped(lanes, start, stop)
+                else:
+                    parts = self._single(lanes, start, bounces, count, block)
+                added = np.stack(_evaluate(parts, count)).astype(np.float64)
+                sums = added if sums is None else sums + added
+                if progress:
+                    progress(first * samples + count * stop, total, "rendering")
+            assert sums is not None
+            blocks.append((sums / samples).astype(np.float32))
+        maps = untile(np.concatenate(blocks, axis=1), (height, width))
+        return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
+
+    def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
+        """Cut a pixel's samples into the runs of single launches."""
+        looped = bounces is None and self.sightlines.in_kernel
+        step = max(1, min(SUMMED, RAYS // count)) if looped else 1
+        for start in range(0, samples, step):
+            yield start, min(start + step, samples)
+
+    def _looped(self, lanes: Lanes, start: int, stop: int) -> list[Any]:
+        """Sum direct light over samples by a loop inside the kernel."""
         import drjit as dr
 
-        mi = self.mi
-        rays = np.asarray(np.isfinite(directions).all(axis=1))
-        if not rays.any():
-            # Dr.Jit ends the process on a kernel without rays.
-            nothing = np.zeros((len(rays), dr.size_v(mi.Spectrum)))
-            return nothing, nothing, nothing
-        if not rays.all():
-            specular, diffuse, indirect = self.trace(origins[rays], directions[rays], path_depth, seed)
-            return scattered(specular, rays, 0), scattered(diffuse, rays, 0), scattered(indirect, rays, 0)
-        ray = mi.Ray3f(
-            mi.Point3f(np.ascontiguousarray(origins.T, dtype=np.float32)),
-            mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)),
-        )
-        si = self.scene.ray_intersect(ray)
-        # Mitsuba interpolates the hit between the shape's corners; those of the plane lie so far beyond the view that
-        # 1e-3 mm are lost, a per mille of the radiance. The point along the ray keeps the digits of t.
-        si.p = dr.select(si.is_valid(), ray(si.t), si.p)
-        total, diffuse = self._direct(si)
-        indirect = mi.Spectrum(0)
-        if path_depth > 2:
-            indirect = self._indirect(si, len(directions), path_depth, seed)
-        specular = dr.maximum(total - diffuse, 0)
-        dr.eval(specular, diffuse, indirect)
-        specular, diffuse, indirect = (
-            np.broadcast_to(np.array(part, dtype=np.float64).T, (len(directions), dr.size_v(mi.Spectrum)))
-            for part in (specular, diffuse, indirect)
-        )
-        return specular, diffuse, indirect
+        mi, zeros = self.mi, [self.mi.Float(0) for _ in range(2 * channels(self.mi))]
+        number, end = mi.UInt32(start), mi.UInt32(stop)
+        dr.make_opaque(number, end)
 
-    def _direct(self, si: Any) -> tuple[Any, Any]:
-        """Sum over the lights: intensity over squared distance times f cos(theta), whole and of the diffuse base."""
+        def step(number: Any, *sums: Any) -> tuple[Any, ...]:
+            _, _, si = self._hit(*self.sightlines.sample(lanes, number))
+            parts = self._parts(si, None, 0, 0, 0)
+            return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
+
+        _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
+        return sums
+
+    def _single(self, lanes: Lanes, number: int, bounces: Bounces | None, count: int, block: int) -> list[Any]:
+        """Trace one sample of each pixel."""
         import drjit as dr
 
-        mi = self.mi
-        bsdf, context = si.bsdf(), mi.BSDFContext()
-        total, diffuse = mi.Spectrum(0), mi.Spectrum(0)
-        for place, power, shadow in zip(self._places, self._powers, self.shadows, strict=True):
-            towards = place - si.p
-            squared = dr.squared_norm(towards)
-            wo = si.to_local(towards * dr.rsqrt(squared))
-            active = si.is_valid()
-            if shadow:
-                active &= ~self.scene.ray_test(si.spawn_ray_to(place), active)
-            falloff = dr.select(active, power / squared, 0)
-            total += falloff * bsdf.eval(context, si, wo, active)
-            diffuse += falloff * self.diffuse_bsdf.eval(context, si, wo, active)
-        return total, diffuse
-
-    def _indirect(self, si: Any, count: int, path_depth: int, seed: int) -> Any:
-        """Sample one bounce off the surface and follow it with Mitsuba's path integrator."""
-        import drjit as dr
-
-        mi = self.mi
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count)
-        sample, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
-        bounced = si.spawn_ray(si.to_world(sample.wo))
-        integrator = mi.load_dict({"type": "path", "max_depth": path_depth - 1, "rr_depth": path_depth})
-        active = si.is_valid() & dr.any(weight > 0)
-        incoming, _, _ = integrator.sample(self.scene, sampler, mi.RayDifferential3f(bounced), None, active)
-        return dr.select(active, weight * incoming, 0)
+        which = self.mi.UInt32(number)
+        dr.make_opaque(which)
+        _, _, si = self._hit(*self.sightlines.sample(lanes, which))
+        return self._parts(si, bounces, count, block, number)
 
 
-def render(tracer: Tracer, rays: Rays, camera: Camera, samples: int, path_depth: int, seed: int) -> Radiance:
-    """Render a frame.
+def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
+    """Cut a number of pixels into runs: first, count."""
+    for first in range(0, pixels, LANES):
+        yield first, min(LANES, pixels - first)
 
-    Parameters
-    ----------
-    tracer : Tracer
-        The scene.
-    rays : callable
-        From pixel positions, shape (N, 2), to origins and directions in the model frame.
-    camera : Camera
-        For the frame's size.
-    samples : int
-        1: through the pixels' centres; more: uniform over each pixel.
-    path_depth, seed : int
-        See `Tracer.trace`.
 
-    Returns
-    -------
-    Radiance
-    """
-    centres = camera.pixel_centres().reshape(-1, 2)
-    generator = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=(samples,))))
-    sums: list[Any] = [0.0, 0.0, 0.0]
-    for _ in range(samples):
-        points = centres if samples == 1 else centres + generator.uniform(-0.5, 0.5, centres.shape)
-        traced = tracer.trace(*rays(points), path_depth, int(generator.integers(2**32)))
-        sums = [total + part for total, part in zip(sums, traced, strict=True)]
-    shape = (camera.height, camera.width, -1)
-    parts = [np.asarray(total / samples, dtype=np.float32).reshape(shape) for total in sums]
-    if parts[0].shape[2] == 1:
-        parts = [part[:, :, 0] for part in parts]
-    return Radiance(*parts)
+def _evaluate(values: list[Any], count: int) -> list[FloatImage]:
+    """Compute all channels in one kernel; a constant one is spread out."""
+    import drjit as dr
+
+    # Together: each alone would trace the rays again.
+    dr.eval(values)
+    return [np.broadcast_to(np.array(value, dtype=np.float32), (count,)) for value in values]
+
+
+def as_radiance(parts: list[FloatImage]) -> Radiance:
+    """Make a `Radiance` from channels: of the lobe, of the base and, if there are any, of further bounces."""
+    width = 1 if len(parts) in (2, 3) else 3
+
+    def image(first: int) -> FloatImage:
+        own = parts[first * width : (first + 1) * width]
+        if not own:
+            own = [np.zeros_like(parts[0])] * width
+        return own[0] if width == 1 else np.stack(own, axis=-1)
+
+    return Radiance(image(0), image(1), image(2))

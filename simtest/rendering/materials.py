@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from simtest.rendering.spectrum import spectrum
 from simtest.spec.reflectance import (
     PhongReflectance,
     PrincipledReflectance,
@@ -69,14 +70,25 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
             }
 
 
-def parameter_updates(reflectance: AnyReflectance) -> dict[str, float] | None:
-    """Give the parameters that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
+def parts_alone(reflectance: AnyReflectance) -> bool:
+    """Tell whether Mitsuba's components 0 and 1 of the BSDF are the lobe and the base."""
+    return isinstance(reflectance, PhongReflectance)
 
-    Returns
-    -------
-    dict or None
-        None where the material has to be rebuilt.
+
+def parameter_updates(mi: Any, reflectance: AnyReflectance) -> dict[str, Any]:
+    """Give all that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
+
+    Of the whole BSDF and of its diffuse base alike, but for Phong's lobe, which has no base of its own.
     """
-    if isinstance(reflectance, PhongReflectance):
-        return {"exponent": reflectance.exponent, "specular": reflectance.specular}
-    return None
+    base = spectrum(mi, [reflectance.diffuse * c for c in reflectance.colour])
+    match reflectance:
+        case PhongReflectance():
+            lobe = {"exponent": reflectance.exponent, "specular": reflectance.specular}
+            return {**lobe, "diffuse_reflectance.value": base}
+        case RoughPlasticReflectance():
+            return {"alpha": reflectance.alpha, "diffuse_reflectance.value": base}
+        case PrincipledReflectance():
+            return {"roughness.value": reflectance.roughness, "base_color.value": base}
+        case RoughConductorReflectance():
+            matt = {"bsdf_1.reflectance.value": spectrum(mi, list(reflectance.colour))}
+            return {"weight.value": reflectance.diffuse, "bsdf_0.alpha.value": reflectance.alpha, **matt}

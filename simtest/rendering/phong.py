@@ -33,8 +33,10 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
     class Phong(mi.BSDF):
         """Specular c cos^n(beta) plus a Lambertian base, beta between mirror direction and view [P75].
 
-        As published, the specular radiance has no cosine of incidence: f cos(theta) = c cos^n(beta). The normalised
-        form is f = c (n + 2)/(2 pi) cos^n(beta), which conserves energy for c <= 1 and is reciprocal.
+        As published, the specular radiance has no cosine of incidence: f cos(theta) = c cos^n(beta). The radiance stays
+        the same when light and camera change places; f itself is not reciprocal and grows without bound at grazing
+        light. The normalised form is f = c (n + 2)/(2 pi) cos^n(beta): reciprocal, of albedo c at normal incidence and
+        less elsewhere, so it conserves energy where c plus the base's albedo are at most 1.
         """
 
         def __init__(self, props: Any) -> None:
@@ -58,50 +60,76 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             # Literal parameters would be baked into the kernel and recompile it at each change.
             dr.make_opaque(self.exponent, self.specular)
 
-        def _lobe(self, wi: Any, wo: Any) -> tuple[Any, Any]:
-            """Give cos(beta), clipped at 0, and its power n."""
-            cosine = dr.maximum(dr.dot(mi.reflect(wi), wo), 0)
-            return cosine, cosine**self.exponent
+        def _enabled(self, ctx: Any) -> tuple[bool, bool]:
+            """Tell whether the lobe and the base are asked for."""
+            return (
+                ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
+                ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
+            )
+
+        def _log_cosine(self, wi: Any, wo: Any) -> tuple[Any, Any]:
+            """Give log cos(beta), and whether beta is below 90 deg.
+
+            With t = tan(beta/2) = |wo - m|/|wo + m|, m the mirror direction, log cos(beta) = -2 artanh(t^2). The
+            cosine itself, by a dot product, has lost the digits that count next to 1: its power's relative error
+            would be n eps, while this form's is sqrt(n) eps within the lobe.
+            """
+            mirror = mi.reflect(wi)
+            squared = dr.squared_norm(wo - mirror) / dr.squared_norm(wo + mirror)
+            ahead = squared < 1
+            return -2 * dr.atanh(dr.select(ahead, squared, 0)), ahead
 
         def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             """Give f cos(theta) and the sampling density of the enabled lobes."""
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
             active &= (cos_i > 0) & (cos_o > 0)
             value, density = mi.Spectrum(0), mi.Float(0)
-            share = self._share(ctx)
-            if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-                _, power = self._lobe(si.wi, wo)
+            share = self._share(ctx, si, active)
+            glossy, diffuse = self._enabled(ctx)
+            if glossy:
+                log_cosine, ahead = self._log_cosine(si.wi, wo)
                 scale = (self.exponent + 2) * dr.inv_two_pi * cos_o if self.normalised else mi.Float(1)
-                value += self.specular * scale * power
-                density += share * (self.exponent + 1) * dr.inv_two_pi * power
-            if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+                value += dr.select(ahead, self.specular * scale * dr.exp(self.exponent * log_cosine), 0)
+                # How samples are drawn is no part of what is differentiated.
+                n = dr.detach(self.exponent)
+                density += dr.select(ahead, share * (n + 1) * dr.inv_two_pi * dr.exp(n * log_cosine), 0)
+            if diffuse:
                 value += self.base.eval(si, active) * dr.inv_pi * cos_o
                 density += (1 - share) * dr.inv_pi * cos_o
             return dr.select(active, value, 0), dr.select(active, density, 0)
 
-        def _share(self, ctx: Any) -> float:
-            """Share of the samples that go to the specular lobe."""
-            glossy = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
-            diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
-            return 0.5 if glossy and diffuse else float(glossy)
+        def _share(self, ctx: Any, si: Any, active: Any) -> Any:
+            """Share of the samples that go to the specular lobe: the lobe's part of the albedo at normal incidence.
+
+            As published, samples above the surface then all weigh the same.
+            """
+            glossy, diffuse = self._enabled(ctx)
+            if not (glossy and diffuse):
+                return mi.Float(float(glossy))
+            lobe = self.specular if self.normalised else self.specular * dr.two_pi / (self.exponent + 1)
+            base = dr.mean(self.base.eval(si, active))
+            whole = lobe + base
+            return dr.detach(dr.select(whole > 0, lobe / dr.select(whole > 0, whole, 1), 0.5))
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            share = self._share(ctx)
-            # cos(beta) = u^(1/(n+1)) about the mirror direction; cosine-weighted about the normal.
-            cosine = sample2.x ** (1 / (self.exponent + 1))
-            sine, angle = dr.safe_sqrt(1 - cosine**2), dr.two_pi * sample2.y
-            s, c = dr.sincos(angle)
+            share = self._share(ctx, si, active)
+            # cos(beta) = u^(1/(n+1)) about the mirror direction, its sine without cancellation; u in (0, 1].
+            slope = -dr.log(1 - sample2.x) / (dr.detach(self.exponent) + 1)
+            cosine, sine = dr.exp(-slope), dr.sqrt(2 * dr.exp(-slope) * dr.sinh(slope))
+            s, c = dr.sincos(dr.two_pi * sample2.y)
             glossy = mi.Frame3f(mi.reflect(si.wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
             chosen = sample1 < share
             bs = mi.BSDFSample3f()
+            # Cosine-weighted about the normal for the base.
             bs.wo = dr.select(chosen, glossy, mi.warp.square_to_cosine_hemisphere(sample2))
-            value, bs.pdf = self._values(ctx, si, bs.wo, active)
+            value, bs.pdf = self._values(ctx, si, bs.wo, mi.Bool(active))
             bs.eta = 1.0
             bs.sampled_type = dr.select(
                 chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
             )
             bs.sampled_component = dr.select(chosen, mi.UInt32(0), mi.UInt32(1))
-            return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
+            drawn = bs.pdf > 0
+            return bs, dr.select(drawn, value / dr.select(drawn, bs.pdf, 1), 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             return self._values(ctx, si, wo, mi.Bool(active))[0]
@@ -116,6 +144,6 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             return self.base.eval(si, active)
 
         def to_string(self) -> str:
-            return f"Phong[exponent={self.exponent}, specular={self.specular}]"
+            return f"Phong[exponent={self.exponent}, specular={self.specular}, normalised={self.normalised}]"
 
     return Phong

@@ -6,15 +6,19 @@ from typing import Any
 import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
-from simtest.rendering import backend, highlights, integrate, phong
-from simtest.rendering.frames import Array, Radiance, TrueHighlight, TruthMaps, scattered
-from simtest.rendering.materials import bsdf_dict, parameter_updates
+from simtest.rendering import backend, emission, exact, highlights, phong
+from simtest.rendering.direct import COLOCATED_MM, DirectLight, Material
+from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
+from simtest.rendering.indirect import Bounces
+from simtest.rendering.integrate import Progress, Tracer, as_radiance
+from simtest.rendering.labels import ShapeLabels, as_hits, as_labels
+from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
+from simtest.rendering.places import check_camera, check_lights
+from simtest.rendering.rays import Sightlines
+from simtest.rendering.refine import Refinement
 from simtest.rendering.shapes import make_shape
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
-
-COLOCATED_MM = 1e-9
-"""A light nearer to the camera than this sees what the camera sees: no shadow rays."""
 
 FINE_STRIDE_PX = 2
 """Seeds' grid for anatomies, whose highlights are small and many."""
@@ -25,12 +29,14 @@ COARSE_STRIDE_PX = 4
 
 @dataclass
 class _Built:
-    """The Mitsuba objects of a scene's structure."""
+    """The Mitsuba objects of a scene's structure, and what their parameters were last set to."""
 
     key: tuple[Any, ...]
     scene: Any
     parameters: Any
-    diffuse_bsdf: Any
+    base: Any
+    base_parameters: Any
+    labels: ShapeLabels | None = None
 
 
 class Session:
@@ -42,6 +48,8 @@ class Session:
         The first scene.
     variant : str, optional
         Mitsuba variant; default by `simtest.rendering.backend.requested_variant`.
+    labelled : bool
+        Whether to prepare for `frame` when a scene is built, rather than at the first call.
 
     Attributes
     ----------
@@ -53,18 +61,19 @@ class Session:
     BackendError
         If the rendering backend cannot be used.
     InputError
-        If the surface's file is malformed or the camera lies on the wrong side.
+        If the surface's file is malformed, the camera lies on the wrong side, or a light inside a body.
     """
 
-    def __init__(self, scene: Scene, variant: str | None = None) -> None:
+    def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
         self.mi = backend.load(variant)
         self.variant = str(self.mi.variant())
         self.plugin = phong.register(self.mi, self.variant)
+        emission.register(self.mi, self.variant)
         self.rebuilds = 0
+        self._labelled = labelled
         self._built: _Built | None = None
-        self._truth: TruthMaps | None = None
-        self._camera_spec, self.camera = scene.camera, scene.camera.model()
         self._load_surface(scene)
+        self._set_camera(scene)
         self.update(scene)
 
     def update(self, scene: Scene) -> None:
@@ -74,67 +83,84 @@ class Session:
         ----------
         scene : Scene
             The next scene.
+
+        Raises
+        ------
+        InputError
+            As for the session itself; it then stays at its scene.
         """
         if scene.surface != self.scene.surface:
             self._load_surface(scene)
-        elif scene.camera != self.scene.camera:
-            self._truth = None  # of another camera
-        if self._camera_spec != scene.camera:
-            self._camera_spec, self.camera = scene.camera, scene.camera.model()
+            self._set_camera(scene)
+        else:
+            if scene.rig != self.scene.rig:
+                check_lights(scene, self.surface)
+            if scene.camera != self._camera_spec:
+                self._set_camera(scene)
         self.scene: Scene = scene
-        updates = parameter_updates(scene.reflectance)
-        fixed = (
-            scene.reflectance
-            if updates is None
-            else (type(updates), scene.reflectance.diffuse, scene.reflectance.colour)
-        )
-        normalised = getattr(scene.reflectance, "normalised", None)
-        key = (self._shape.key, fixed, normalised, len(scene.rig.lights))
+        reflectance = scene.reflectance
+        material = (type(reflectance), getattr(reflectance, "normalised", None))
+        key = (self._shape.key, material, tuple(emission.kind_of(light) for light in scene.rig.lights))
         if self._built is None or self._built.key != key:
             self._built = self._build(key)
+        if self._labelled:
+            self._shape_labels()
         self._apply(self._built)
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here and leaves the session at its scene.
         surface = make_surface(scene.surface)
+        check_camera(scene, surface)
+        check_lights(scene, surface)
         self._shape = surface.shape()
         self.surface: SurfaceModel = surface
         self.scene = scene
-        self._truth = None
+        self._forget()
+
+    def _set_camera(self, scene: Scene) -> None:
+        self._camera_spec, self.camera = scene.camera, scene.camera.model()
+        self.sightlines = Sightlines(self.mi, self.camera, self.surface.model_from_camera)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._truth: TruthMaps | None = None
+        self._centre: list[FloatImage] = []
 
     def _build(self, key: tuple[Any, ...]) -> _Built:
         self.rebuilds += 1
         reflectance = self.scene.reflectance
         shape = make_shape(self.mi, self._shape, bsdf_dict(reflectance, self.plugin, diffuse_only=False))
-        lights = {
-            f"light_{i}": {"type": "point", "intensity": {"type": "uniform", "value": 1.0}}
-            for i in range(len(self.scene.rig.lights))
-        }
+        kinds = (emission.kind_of(light) for light in self.scene.rig.lights)
+        lights = {f"light_{i}": emission.emitter_dict(kind) for i, kind in enumerate(kinds)}
         # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
         # would share a parameter, and an update of one would change both.
         scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
-        diffuse = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True))
-        return _Built(key, scene, self.mi.traverse(scene), diffuse)
+        base = None
+        if not parts_alone(reflectance):
+            base = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True), optimize=False)
+        return _Built(key, scene, self.mi.traverse(scene), base, base and self.mi.traverse(base))
 
     def _apply(self, built: _Built) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
         parameters = built.parameters
         if "to_model" in self._shape.parameters:
             matrix = self._shape.parameters["to_model"]
-            self._set(parameters, "surface.to_world", self.mi.AffineTransform4f(matrix.tolist()))
-        for i, light in enumerate(self.scene.rig.lights):
-            place = self.to_model(np.array([light.place_mm]))[0]
-            self._set(parameters, f"light_{i}.position", self.mi.Point3f(*place.tolist()))
-            self._set(parameters, f"light_{i}.intensity.value", light.power)
-        for name, value in (parameter_updates(self.scene.reflectance) or {}).items():
-            self._set(parameters, f"bsdf.{name}", value)
+            _set(parameters, "surface.to_world", self.mi.AffineTransform4f(matrix.tolist()))
+        lights = self.scene.rig.lights
+        places = self.to_model(self.scene.rig.true_mm())
+        axes = np.array([light.axis for light in lights]) @ self.surface.model_from_camera[:3, :3].T
+        for i, light in enumerate(lights):
+            values = emission.emitter_values(self.mi, emission.kind_of(light), light, places[i], axes[i])
+            for name, value in values.items():
+                _set(parameters, f"light_{i}.{name}", value)
+        for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
+            _set(parameters, f"bsdf.{name}", value)
+            if built.base is not None:
+                built.base_parameters[name] = value
         parameters.update()
-
-    def _set(self, parameters: Any, suffix: str, value: Any) -> None:
-        """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
-        paths = [path for path in parameters.keys() if path.endswith(suffix)]  # noqa: SIM118 - no plain dict
-        assert len(paths) == 1, (suffix, list(parameters.keys()))
-        parameters[paths[0]] = value
+        if built.base is not None:
+            built.base_parameters.update()
+        self._light = DirectLight(self.mi, self.scene.rig, places, axes)
 
     # Frames ------------------------------------------------------------------------------------------------------
 
@@ -143,22 +169,16 @@ class Session:
         pose = self.surface.model_from_camera
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
-    def _rays(self, points_px: Array) -> tuple[Array, Array]:
-        """Give the rays of pixels, shape (N, 2), in the model frame, unit directions; NaN where the lens has none."""
-        pose = self.surface.model_from_camera
-        directions = self.camera.unproject(points_px) @ pose[:3, :3].T
-        return np.broadcast_to(pose[:3, 3], directions.shape), directions
-
-    def _rays_in_view(self, points_px: Array) -> tuple[Array, Array]:
-        """Give the rays of pixels as `_rays` does; NaN outside the camera's view mask too."""
-        origins, directions = self._rays(points_px)
-        mask = self.camera.view_mask
-        return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
-
     # Radiance ----------------------------------------------------------------------------------------------------
 
-    def radiance(self) -> Radiance:
+    def radiance(self, progress: Progress | None = None) -> Radiance:
         """Render the frame.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Told after each part of the work (see `simtest.rendering.integrate.Progress`); what it raises stops the
+            frame and leaves the session as it was.
 
         Returns
         -------
@@ -166,20 +186,53 @@ class Session:
             With one sample a pixel: the value on the ray through each pixel's centre; with more: the mean over the
             pixel's area. The same scene and seed give the same bytes.
         """
+        return self._render(None, progress)[0]
+
+    def frame(self, progress: Progress | None = None) -> Frame:
+        """Render the frame with the labels of the rendered shape; one pass where it has one sample a pixel.
+
+        The exact truth that `truth` gives afterwards starts from the same hits.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            See `radiance`.
+
+        Returns
+        -------
+        Frame
+        """
+        radiance, channels = self._render(self._shape_labels(), progress)
+        self._centre = channels
+        return Frame(radiance, as_labels(channels))
+
+    def _shape_labels(self) -> ShapeLabels:
         assert self._built is not None
-        shadows = [float(np.linalg.norm(light.place_mm)) > COLOCATED_MM for light in self.scene.rig.lights]
-        lights = self.to_model(np.array([light.place_mm for light in self.scene.rig.lights]))
-        powers = [light.power for light in self.scene.rig.lights]
-        tracer = integrate.Tracer(self.mi, self._built.scene, self._built.diffuse_bsdf, lights, powers, shadows)
-        effort = self.scene.render
-        return integrate.render(
-            tracer, self._rays_in_view, self.camera, effort.samples_per_pixel, effort.path_depth, effort.seed
-        )
+        if self._built.labels is None:
+            operators = self.surface.vertex_shape_operators()
+            self._built.labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], operators)
+        return self._built.labels
+
+    def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
+        built, effort = self._built, self.scene.render
+        assert built is not None
+        material = Material(built.scene.shapes()[0].bsdf(), built.base)
+        refinement = Refinement(self.mi, self._shape)
+        tracer = Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
+        bounces = None
+        if effort.path_depth > 2:
+            bounces = Bounces(self.mi, built.scene, effort.path_depth, effort.seed)
+        if effort.samples_per_pixel == 1:
+            parts, channels = tracer.centres(bounces, True, labels, progress)
+        else:
+            parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
+            channels = tracer.centres(None, False, labels)[1] if labels else []
+        return as_radiance(parts), channels
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixels onto the exact surface, outside the image and the view mask too.
+        """Cast rays through pixels onto the exact surface.
 
         Parameters
         ----------
@@ -193,61 +246,17 @@ class Session:
         shading_normal, geometric_normal : ndarray, shape (N, 3)
             Normals of the rendered shape, camera frame; NaN where the ray misses.
         """
-        return self._cast(*self._rays(points_px))
+        return self._cast(*self.sightlines.in_model(points_px))
 
     def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
         """Cast rays of the model frame (see `cast`); a direction of NaN hits nothing."""
         hits, shading, geometric = self._hits(origins, directions)
-        exact = self.surface.points(np.asarray(origins), directions, hits)
         rotation = self.surface.model_from_camera[:3, :3]
-        centre = self.surface.model_from_camera[:3, 3]
-        points = SurfacePoints(
-            distance=exact.distance,
-            position=(exact.position - centre) @ rotation,
-            normal=exact.normal @ rotation,
-            k_min=exact.k_min,
-            k_max=exact.k_max,
-            direction_min=exact.direction_min @ rotation,
-            direction_max=exact.direction_max @ rotation,
-            valid=exact.valid,
-        )
-        return points, shading @ rotation, geometric @ rotation
+        return exact.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
 
     def _hits(self, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
         assert self._built is not None
-        if not len(origins):
-            # Dr.Jit ends the process on a kernel without rays.
-            none = np.empty((0, 3))
-            return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
-        rays = np.asarray(np.isfinite(directions).all(axis=1))
-        if not rays.all():
-            # Rays that do not exist must not reach the tracer.
-            traced, *normals_ = self._hits(origins[rays], directions[rays])
-            hits = RayHits(
-                scattered(traced.distance, rays, np.inf), scattered(traced.face, rays, 0),
-                scattered(traced.barycentric, rays, 0.0),
-            )  # fmt: skip
-            return hits, scattered(normals_[0], rays, np.nan), scattered(normals_[1], rays, np.nan)
-        mi = self.mi
-        ray = mi.Ray3f(_point(mi, origins), mi.Vector3f(_point(mi, directions)))
-        preliminary = self._built.scene.ray_intersect_preliminary(ray)
-        si = preliminary.compute_surface_interaction(ray)
-        import drjit as dr
-
-        valid = si.is_valid()
-        normals = (mi.Vector3f(si.sh_frame.n), mi.Vector3f(si.n))
-        dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
-        missed = ~np.array(valid)
-        distance = np.where(missed, np.inf, np.array(preliminary.t, dtype=np.float64))
-        face = np.where(missed, 0, np.array(preliminary.prim_index, dtype=np.int64))
-        barycentric = np.where(missed[:, None], 0.0, np.array(preliminary.prim_uv, dtype=np.float64).T)
-        shading, geometric = (np.array(n, dtype=np.float64).T for n in normals)
-        facing = np.where(np.einsum("ij,ij->i", geometric, directions) > 0, -1.0, 1.0)[:, None]
-        if self._shape.kind == "mesh":
-            geometric = geometric * facing
-        for normal in (shading, geometric):
-            normal[missed] = np.nan
-        return RayHits(distance, face, barycentric), shading, geometric
+        return exact.trace_hits(self.mi, self._built.scene, self._shape, origins, directions)
 
     def truth(self, stride: int = 1) -> TruthMaps:
         """Give the ground truth at the centre of every pixel, or of every `stride`-th along both axes.
@@ -265,34 +274,28 @@ class Session:
 
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]
-        size = centres.shape[:2]
-        points, shading, geometric = self._cast(*self._rays_in_view(centres.reshape(-1, 2)))
-        return TruthMaps(
-            depth=points.distance.reshape(size),
-            position=points.position.reshape(*size, 3),
-            normal=points.normal.reshape(*size, 3),
-            shading_normal=shading.reshape(*size, 3),
-            geometric_normal=geometric.reshape(*size, 3),
-            k_min=points.k_min.reshape(size),
-            k_max=points.k_max.reshape(size),
-            direction_min=points.direction_min.reshape(*size, 3),
-            direction_max=points.direction_max.reshape(*size, 3),
-            mask=points.valid.reshape(size),
-        )
+        pixels = centres.reshape(-1, 2)
+        if stride == 1 and self._centre:
+            hits, shading, geometric = as_hits(self._centre)
+            points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
+        else:
+            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels))
+        return exact.truth_maps(points, shading, geometric, centres.shape[:2])
 
     def lit(self, positions: Array, light: int) -> Any:
-        """Tell which points, shape (N, 3), camera frame, mm, a light reaches without being blocked."""
-        assert self._built is not None
-        place = np.array([self.scene.rig.lights[light].place_mm])
-        if np.linalg.norm(place) <= COLOCATED_MM:
-            return np.ones(len(positions), dtype=bool)
+        """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
+        place = self.scene.rig.true_mm()[light : light + 1]
         towards = positions - place
         distance = np.linalg.norm(towards, axis=1)
+        directions = towards / distance[:, None]
+        emitted = self.scene.rig.lights[light].factor(directions) > 0
+        if np.linalg.norm(place) <= COLOCATED_MM:
+            return emitted
         pose = self.surface.model_from_camera
         origins = np.broadcast_to(self.to_model(place), positions.shape)
-        hits, _, _ = self._hits(origins, (towards / distance[:, None]) @ pose[:3, :3].T)
+        hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)
         # A blocker stands clearly before the point; the point's own triangle does not count.
-        return hits.distance > distance * (1 - 1e-3)
+        return emitted & (hits.distance > distance * (1 - 1e-3))
 
     def highlights(self, radiance: Radiance) -> list[TrueHighlight]:
         """Find the true highlights of every light in view.
@@ -311,5 +314,8 @@ class Session:
         return highlights.find(self, radiance, stride=FINE_STRIDE_PX if is_anatomy else COARSE_STRIDE_PX)
 
 
-def _point(mi: Any, values: Array) -> Any:
-    return mi.Point3f(np.ascontiguousarray(values.T, dtype=np.float32))
+def _set(parameters: Any, suffix: str, value: Any) -> None:
+    """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
+    paths = [path for path in parameters.keys() if path.endswith(suffix)]  # noqa: SIM118 - no plain dict
+    assert len(paths) == 1, (suffix, list(parameters.keys()))
+    parameters[paths[0]] = value

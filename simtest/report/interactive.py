@@ -23,7 +23,8 @@ def to_json(figure: go.Figure) -> str:
     return str(figure.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _layout(height: int, **more: Any) -> dict[str, Any]:
+def layout(height: int, **more: Any) -> dict[str, Any]:
+    """Give the layout that all figures share, of a height in px, with more of its keys."""
     return {
         "height": height, "autosize": True, "margin": {"l": 62, "r": 12, "t": 10, "b": 56},
         "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "template": "none",
@@ -59,7 +60,7 @@ def lines(data: LineFigure, colours: Mapping[str, str]) -> go.Figure:
     y = {"title": {"text": escape(data.y.title)}, "range": data.y.limits, "automargin": True}
     if data.y.scale == "log":
         y = _log_axis(data.y.title, [v for c in data.curves for v in (c.y, c.low, c.high)])
-    figure.update_layout(_layout(500, xaxis=x, yaxis=y))
+    figure.update_layout(layout(500, xaxis=x, yaxis=y))
     return figure
 
 
@@ -114,7 +115,7 @@ def heat_map(item: HeatMap, maps: Sequence[HeatMap]) -> go.Figure:
     )  # fmt: skip
     axes = {"showgrid": False, "zeroline": False, "automargin": True}
     figure.update_layout(
-        _layout(
+        layout(
             360,
             xaxis=axes | {"title": {"text": "k d"}, "tickvals": list(range(len(item.kd))),
                           "ticktext": item.column_names},
@@ -156,7 +157,7 @@ def surfaces(data: SurfaceFigure, colours: Mapping[str, str]) -> go.Figure:
         "range": [-0.6, len(data.surfaces) - 0.4], "zeroline": False, "showgrid": False, "automargin": True,
     }  # fmt: skip
     y = _log_axis("angular error (deg)", [box.points for box in data.boxes])
-    figure.update_layout(_layout(460, xaxis=x, yaxis=y, boxmode="overlay"))
+    figure.update_layout(layout(460, xaxis=x, yaxis=y, boxmode="overlay"))
     return figure
 
 
@@ -182,9 +183,9 @@ def surface_3d(data: Surface3D, colours: Mapping[str, str]) -> go.Figure:
     scene = {
         "aspectmode": "data",
         "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}},
-        **{f"{a}axis": {"title": {"text": f"{a} (mm)"}, "nticks": 5} for a in "xyz"},
+        **{f"{a}axis": {"title": {"text": f"{a} ({data.unit})"}, "nticks": 5} for a in "xyz"},
     }  # fmt: skip
-    figure.update_layout(_layout(560, scene=scene, dragmode="orbit"))
+    figure.update_layout(layout(560, scene=scene, dragmode="orbit"))
     figure.update_layout(margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"y": 0})
     return figure
 

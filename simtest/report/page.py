@@ -9,6 +9,7 @@ from typing import Any
 from simtest.files import write_atomically
 from simtest.report import static, style, words
 from simtest.report.gallery import isophote_colour
+from simtest.report.paper.section import paper_section
 from simtest.report.run import Run, read_run
 from simtest.report.series import LineFigure, line_figures
 from simtest.report.surface3d import surface_3d
@@ -61,6 +62,11 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
         static.save(static.draw_lines(figure, colours), folder / f"{figure.key}.png")
         charts[figure.key] = interactive.to_json(interactive.lines(figure, colours))
     sections: dict[str, Any] = {"headline": words.headline(run, lines), "lines": [_line_section(f) for f in lines]}
+    published = paper_section(run, colours, folder, picture)
+    if published:
+        sections["paper"] = published[0]
+        sections["headline"].append(published[0]["headline"])
+        charts |= published[1]
     maps = heat_maps(run)[:_MAX_HEAT_MAPS]
     if maps:
         static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
@@ -70,7 +76,7 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
             {"key": f"heatmap_{i}", "title": f"{m.estimator}, {m.label}", "line": words.heat_line(m)}
             for i, m in enumerate(maps)
         ]
-    surfaces = surface_figure(run, has_lines=bool(lines or maps))
+    surfaces = surface_figure(run, has_figures=bool(lines or maps or published))
     if surfaces:
         sections["surfaces"] = surfaces
         if surfaces.boxes:
@@ -82,7 +88,7 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
     if view:
         path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
         charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
-        sections["view"] = {"title": view.title, "picture": picture(path, 120_000)}
+        sections["view"] = {"title": view.title, "unit": view.unit, "picture": picture(path, 120_000)}
     return sections, charts
 
 
@@ -153,6 +159,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         description=content.get("description") or "",
         headline=sections["headline"],
         lines=sections["lines"],
+        paper=sections.get("paper"),
         heat=sections.get("heat", []),
         surfaces=sections.get("surfaces"),
         gallery=sections["gallery"],
@@ -161,6 +168,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         view=sections.get("view"),
         summary=summary_rows(run),
         columns=[heading for _, heading in SUMMARY_COLUMNS],
+        length_units=" or ".join(dict.fromkeys(item.length_unit for item in run.gallery)) or "mm",
         provenance=words.provenance_rows(run),
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,

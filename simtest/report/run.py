@@ -3,7 +3,7 @@
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class GalleryItem:
         Calibration of the frame.
     meta : mapping
         The rest, as written by the run.
+    pictures : mapping
+        Further pictures by name: of the published protocol its stages.
     """
 
     name: str
@@ -50,6 +52,12 @@ class GalleryItem:
     normal: npt.NDArray[np.float32]
     camera: Camera
     meta: Mapping[str, Any]
+    pictures: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+
+    @property
+    def length_unit(self) -> str:
+        """Unit of the positions."""
+        return str(self.meta.get("length_unit") or "mm")
 
     @property
     def truth(self) -> list[dict[str, Any]]:
@@ -201,8 +209,9 @@ def _read_item(path: Path) -> GalleryItem:
     try:
         with np.load(path, allow_pickle=False) as data:
             meta = json.loads(str(data["meta"][()]))
-            frame, position, normal = (np.asarray(data[k], np.float32) for k in ("frame", "position", "normal"))
+            pictures = {name: np.asarray(data[name], np.float32) for name in data.files if name != "meta"}
+        frame, position, normal = (pictures.pop(name) for name in ("frame", "position", "normal"))
         camera = CameraSpec(**meta["camera"]).model()
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
-    return GalleryItem(path.stem, frame, position, normal, camera, meta)
+    return GalleryItem(path.stem, frame, position, normal, camera, meta, pictures)

@@ -89,7 +89,8 @@ def line_figures(run: Run) -> list[LineFigure]:
 def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 6) -> list[LineFigure]:
     """Error against every other swept parameter whose values do not already show as curvature or offset."""
     figures: list[LineFigure] = []
-    for name in run.swept:
+    # Sweeps of the published protocol have figures of their own.
+    for name in (name for name in run.swept if not name.startswith("paper.")):
         if len(figures) == most:
             break
         kept = []

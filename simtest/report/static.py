@@ -200,7 +200,7 @@ def draw_surface_3d(data: Surface3D, colours: Mapping[str, str]) -> "Figure":
             width = 0.9 if part.name in ("true normals", "sightline from the camera") else 2.2
             ax.plot(*ends, color=colour, lw=width, label=part.name if i == 0 else None, zorder=2)
     ax.set_aspect("equal")
-    ax.set(xlabel="x (mm)", ylabel="z, depth (mm)", zlabel="−y, up (mm)")
+    ax.set(xlabel=f"x ({data.unit})", ylabel=f"z, depth ({data.unit})", zlabel=f"−y, up ({data.unit})")
     ax.view_init(elev=28, azim=-65)
     ax.set_title(data.title)
     handles, names = ax.get_legend_handles_labels()

@@ -26,13 +26,14 @@ class Segments:
 
 @dataclass(frozen=True)
 class Surface3D:
-    """A triangle mesh in the camera frame (mm) with a grey value per vertex, and normals as segments."""
+    """A triangle mesh in the camera frame with a grey value per vertex, and normals as segments."""
 
     title: str
     vertices: Array
     triangles: npt.NDArray[np.int64]
     intensity: Array
     segments: tuple[Segments, ...]
+    unit: str
 
 
 def surface_3d(run: Run) -> Surface3D | None:
@@ -75,7 +76,7 @@ def _build(item: GalleryItem) -> Surface3D | None:
     return Surface3D(
         f"{item.meta.get('label') or item.meta.get('surface') or item.name}: {item.meta.get('setting', '')}",
         vertices, triangles, _intensity(item, position.shape[:2], step)[valid],
-        (_sparse(position, normal, valid, reach), *_highlights(item, 2.5 * reach)),
+        (_sparse(position, normal, valid, reach), *_highlights(item, 2.5 * reach)), item.length_unit,
     )  # fmt: skip
 
 

@@ -116,15 +116,15 @@ class SurfaceFigure:
     table: tuple[dict[str, Any], ...]
 
 
-def surface_figure(run: Run, has_lines: bool) -> SurfaceFigure | None:
+def surface_figure(run: Run, has_figures: bool) -> SurfaceFigure | None:
     """Compute the errors per surface for anatomy, and for runs that have no figure of curves.
 
     Parameters
     ----------
     run : Run
         A run directory.
-    has_lines : bool
-        Whether the run has figures of curves.
+    has_figures : bool
+        Whether the run has other figures of its errors.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def surface_figure(run: Run, has_lines: bool) -> SurfaceFigure | None:
         None where there is nothing to show.
     """
     rows = run.results.with_columns(ok=(pl.col("status") == "ok").fill_null(False))
-    if rows.is_empty() or (has_lines and run.experiment != "anatomy"):
+    if rows.is_empty() or (has_figures and run.experiment != "anatomy"):
         return None
     surfaces = [str(s) for s in rows["surface"].unique(maintain_order=True)]
     names = estimator_order(rows["estimator"].to_list())

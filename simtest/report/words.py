@@ -123,6 +123,9 @@ def gallery_caption(item: GalleryItem) -> dict[str, Any]:
             result = "false detection" if status == "ok" else f"{status} (false detection)"
         else:
             result = value if status == "ok" else status
+            if status == "ok" and len(estimate.get("candidates") or ()) > 1:
+                better = degrees(estimate.get("error_oracle_deg"))
+                result += f" (better candidate {better})" if better not in ("–", value) else ""
         name = str(estimate.get("estimator"))
         errors.append({"spot": estimate.get("specularity"), "estimator": name, "text": result})
     found = {e.get("true_id") for e in item.estimates}

@@ -1,5 +1,7 @@
-"""From radiance to a frame: exposure and noise."""
+"""From radiance to a frame: lens, exposure, noise, saturation, response, quantisation."""
 
-from simtest.sensor.exposure import expose, from_srgb, to_uint8
+from simtest.sensor.capture import capture, encode
+from simtest.sensor.exposure import expose, to_uint8
+from simtest.sensor.optics import collect
 
-__all__ = ["expose", "from_srgb", "to_uint8"]
+__all__ = ["capture", "collect", "encode", "expose", "to_uint8"]

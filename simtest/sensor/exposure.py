@@ -3,6 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import srgb_encode
+
 Image = npt.NDArray[np.float32]
 
 
@@ -23,7 +25,7 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
     Returns
     -------
     ndarray of float32, same shape
-        Not clipped: saturation and quantisation are not part of this sensor.
+        Not clipped.
 
     Raises
     ------
@@ -41,11 +43,4 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
 def to_uint8(frame: Image) -> npt.NDArray[np.uint8]:
     """Give the sRGB-encoded 8-bit picture of a linear frame, clipped to [0, 1]."""
     linear = np.clip(np.nan_to_num(frame, nan=0.0), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.asarray(np.round(255 * encoded), dtype=np.uint8)
-
-
-def from_srgb(encoded: Image) -> Image:
-    """Give the linear values of an sRGB-encoded picture in [0, 1] (IEC 61966-2-1)."""
-    values = np.asarray(encoded, dtype=np.float32)
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.asarray(np.round(255 * srgb_encode(linear)), dtype=np.uint8)

@@ -1,9 +1,10 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema."""
 
+from simtest.spec.calibration import CalibrationSpec, load_calibration
 from simtest.spec.camera import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
-from simtest.spec.rig import LightSpec
+from simtest.spec.rig import Emission, LightSpec, Rig
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
 from simtest.spec.surface import (
     AnatomySurface,
@@ -16,13 +17,16 @@ from simtest.spec.surface import (
 
 __all__ = [
     "AnatomySurface",
+    "CalibrationSpec",
     "CameraSpec",
     "CylinderSurface",
+    "Emission",
     "Experiment",
     "Group",
     "LightSpec",
     "PlaneSurface",
     "QuadricSurface",
+    "Rig",
     "Scene",
     "SphereSurface",
     "Surface",
@@ -31,6 +35,7 @@ __all__ = [
     "camera_table",
     "camera_toml",
     "describe_camera",
+    "load_calibration",
     "load_camera",
     "load_experiment",
     "load_scene",

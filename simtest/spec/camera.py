@@ -12,12 +12,13 @@ from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.resources import shown
 from simtest.spec.reading import Spec, read_toml, validate
+from simtest.spec.writing import toml_tables, toml_value
 
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response"})
-"""Tables that a calibration file may hold beside the camera; they are read elsewhere."""
+NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor"})
+"""Tables that a calibration file may hold beside the camera; `simtest.spec.calibration` reads them."""
 
 
 class BrownConradySpec(Spec):
@@ -237,16 +238,9 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
 def camera_toml(camera: Camera) -> str:
     """Give a camera as the text of simtest's own TOML file."""
     table = camera_table(camera)
-    inner = {key: table.pop(key) for key in ("distortion", "view_mask") if key in table}
+    inner: dict[str, dict[str, Any]] = {key: table.pop(key) for key in ("distortion", "view_mask") if key in table}
     lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt"}
     kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]
-    lines += [f"{key} = {_toml(value)}" for key, value in table.items()]
-    for name, values in inner.items():
-        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: float | str) -> str:
-    # A NumPy number's own form is no TOML.
-    return f'"{value}"' if isinstance(value, str) else repr(value.item() if hasattr(value, "item") else value)
+    lines += [f"{key} = {toml_value(value)}" for key, value in table.items()]
+    return "\n".join([*lines, "", toml_tables(inner)] if inner else [*lines, ""])

@@ -293,8 +293,11 @@ def _demand(error: Any) -> str:
 def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
     """Drop the tags that pydantic puts into the location for each tagged union."""
     path: list[Any] = []
+    tagged: Any = None
     for part in location:
-        if isinstance(data, Mapping) and part not in data and part == data.get("type"):
+        # The tag comes first; after it the same word is a key (type = "gamma" has a key gamma).
+        if isinstance(data, Mapping) and data is not tagged and part == data.get("type"):
+            tagged = data
             continue
         path.append(part)
         try:

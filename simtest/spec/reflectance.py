@@ -2,10 +2,13 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from simtest.spec.quantities import Share
 from simtest.spec.reading import Spec
+
+ROUNDING = 1e-9
+"""What a sum of shares written in decimals may exceed 1 by."""
 
 
 class _Reflectance(Spec):
@@ -19,7 +22,21 @@ class PhongReflectance(_Reflectance):
     type: Literal["phong"] = "phong"
     exponent: float = Field(50.0, gt=0, le=1e5, description="roughness exponent n")
     specular: float = Field(1.0, ge=0, le=1e6, description="scale c of the specular lobe")
-    normalised: bool = Field(False, description="energy-conserving form: (n + 2)/(2 pi) cos^n(beta) cos(theta)")
+    normalised: bool = Field(
+        False,
+        description="energy-conserving form: (n + 2)/(2 pi) cos^n(beta) cos(theta); specular + diffuse at most 1",
+    )
+
+    @model_validator(mode="after")
+    def _conserves_energy(self) -> "PhongReflectance":
+        # At normal incidence the albedo is the sum, in the colour's strongest channel.
+        base = self.diffuse * max(self.colour)
+        if self.normalised and self.specular + base > 1 + ROUNDING:
+            raise ValueError(
+                f"specular = {self.specular:g} and a diffuse base of {base:g} reflect more light than arrives; "
+                "their sum must be at most 1 when normalised is true"
+            )
+        return self
 
 
 class RoughPlasticReflectance(_Reflectance):

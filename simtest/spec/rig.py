@@ -1,15 +1,104 @@
-"""The lights that travel with the camera."""
+"""The lights that travel with the camera: given one by one, or by a preset."""
 
 import math
+from typing import Annotated, Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from simtest.seeds import from_integer
+from simtest.spec.profile import CosineProfile, Profile, TableProfile
 from simtest.spec.quantities import Coordinate
 from simtest.spec.reading import Spec
 
+Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
+Gain = Annotated[float, Field(ge=0, le=1e6)]
+Power = Annotated[float, Field(gt=0, le=1e12)]
+Vector = tuple[float, float, float]
 
-class LightSpec(Spec):
-    """An isotropic point light, placed in the camera frame.
+
+class Emission(Spec):
+    """How a light emits: power colour profile(angle) edge(angle), the angle taken from `direction`."""
+
+    colour: tuple[Gain, Gain, Gain] = Field(
+        (1.0, 1.0, 1.0), description="linear RGB factor of the power; mono variants take its luminance"
+    )
+    profile: Profile = Field(
+        CosineProfile(), description="factor over the angle from direction; default the same in all directions"
+    )
+    direction: tuple[Direction, Direction, Direction] = Field(
+        (0.0, 0.0, 1.0), description="axis of profile and spot, camera frame, any length"
+    )
+    spot_deg: float | None = Field(
+        None, gt=0, description="full angle of a spot, at most 180 deg; nothing is emitted beyond half of it"
+    )
+    soft_edge_deg: float = Field(
+        0.0, ge=0, description="the spot's emission falls to 0 over this angle inside its rim, linearly in the angle"
+    )
+    position_error_mm: float = Field(
+        0.0,
+        ge=0,
+        le=1e3,
+        description="standard deviation of the true place about the given one, along each axis, mm; drawn by rig.seed",
+    )
+
+    @model_validator(mode="after")
+    def _usable(self) -> "Emission":
+        if not any(self.colour):
+            raise ValueError(f"colour = {list(self.colour)}: one of the channels must be positive")
+        if not any(self.direction):
+            raise ValueError(f"direction = {list(self.direction)}: must have a length")
+        if self.spot_deg is None:
+            if self.soft_edge_deg:
+                raise ValueError(f"soft_edge_deg = {self.soft_edge_deg:g}: needs spot_deg")
+        elif self.spot_deg > 180:
+            raise ValueError(
+                f"spot_deg = {self.spot_deg:g}: must be at most 180, the full angle of a half-space; "
+                "leave it out for a light that emits everywhere"
+            )
+        elif self.soft_edge_deg > self.spot_deg / 2:
+            raise ValueError(
+                f"soft_edge_deg = {self.soft_edge_deg:g}: must be at most half of spot_deg = {self.spot_deg:g}"
+            )
+        return self
+
+    @property
+    def axis(self) -> npt.NDArray[np.float64]:
+        """Unit axis of profile and spot, shape (3,), camera frame."""
+        axis = np.array(self.direction)
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether the light emits alike in all directions."""
+        return self.spot_deg is None and self.profile.model().is_uniform
+
+    def factor(self, directions: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Give the emission relative to that of an isotropic light of the same power.
+
+        Parameters
+        ----------
+        directions : array_like, shape (N, 3)
+            Unit directions away from the light, camera frame.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+        """
+        away = np.asarray(directions, dtype=float)
+        cosine = away @ self.axis
+        value = self.profile.model().at(cosine)
+        if self.spot_deg is None:
+            return value
+        angle = np.arctan2(np.linalg.norm(np.cross(away, self.axis), axis=1), cosine)
+        inside = math.radians(self.spot_deg / 2) - angle
+        edge = math.radians(self.soft_edge_deg)
+        return value * (np.clip(inside / edge, 0.0, 1.0) if edge > 0 else (inside >= 0))
+
+
+class LightSpec(Emission):
+    """A light, small enough to be a point, placed in the camera frame.
 
     Its place is `position_mm`, or `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0.
     """
@@ -19,24 +108,112 @@ class LightSpec(Spec):
     )
     offset_mm: float = Field(0.0, ge=0, le=1e6, description="distance from the camera centre, mm")
     azimuth_deg: float = Field(0.0, ge=-360, le=360, description="direction of the offset, deg from x to y")
-    power: float = Field(1.0, gt=0, le=1e12, description="radiant intensity, relative")
+    power: Power = Field(1.0, description="radiant intensity along direction, mW/sr or any relative unit, one for all")
 
     @model_validator(mode="after")
     def _one_way(self) -> "LightSpec":
-        if self.position_mm is not None and self.model_fields_set & {"offset_mm", "azimuth_deg"}:
+        if self.position_mm is not None and (self.offset_mm or self.azimuth_deg):
             raise ValueError("position_mm and offset_mm exclude each other; give one of them")
         return self
 
     @property
-    def place_mm(self) -> tuple[float, float, float]:
-        """Position in the camera frame, mm."""
+    def place_mm(self) -> Vector:
+        """Nominal position in the camera frame, mm: what estimators are told."""
         if self.position_mm is not None:
             return self.position_mm
         angle = math.radians(self.azimuth_deg)
         return (self.offset_mm * math.cos(angle), self.offset_mm * math.sin(angle), 0.0)
 
 
+Preset = Literal["colocated", "laparoscope", "colonoscope_2", "colonoscope_3"]
+
+PRESETS: dict[Preset, dict[str, float]] = {
+    "colocated": {"count": 1, "radius_mm": 0.0},
+    "laparoscope": {"count": 8, "radius_mm": 4.0},
+    "colonoscope_2": {"count": 2, "radius_mm": 4.0},
+    "colonoscope_3": {"count": 3, "radius_mm": 4.0},
+}
+"""Number of lights and radius of the ring that they stand on, evenly spaced around the camera.
+
+Sizes of the class, not of one instrument: in a 10 mm laparoscope the ends of the fibres lie 3 to 5 mm from the axis,
+in the 12 to 13 mm tip of a colonoscope the light guides about 4 mm from the lens.
+"""
+
+
 class Rig(Spec):
-    """The lights that travel with the camera."""
+    """The lights that travel with the camera: a list, or a preset whose numbers can be overridden."""
 
     lights: tuple[LightSpec, ...] = Field((LightSpec(),), min_length=1, max_length=32)
+    preset: Preset | None = Field(None, description="lights on a ring about the optical axis, in place of lights")
+    count: int | None = Field(None, ge=1, le=32, description="of a preset: number of lights")
+    radius_mm: float | None = Field(None, ge=0, le=1e6, description="of a preset: radius of the ring, mm")
+    azimuth_deg: float | None = Field(
+        None, ge=-360, le=360, description="of a preset: direction of the first light, deg from x to y"
+    )
+    axial_mm: Coordinate | None = Field(None, description="of a preset: z of the lights, mm")
+    power: Power | None = Field(None, description="of a preset: power of all lights together, shared evenly; default 1")
+    each: Emission | None = Field(None, description="of a preset: how each light emits")
+    seed: int = Field(0, ge=0, lt=2**63, description="of the position errors; experiments draw one a realisation")
+
+    emission_known: bool = Field(
+        True, description="whether reconstruction is told the profile of a single light at the camera"
+    )
+
+    @model_validator(mode="after")
+    def _expand(self) -> "Rig":
+        if self.preset is None:
+            for name in ("count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name}: belongs to a preset; give preset, or the place of each of lights")
+            return self
+        ring = self._ring()
+        # Equal lights are those of a dumped model that is read back.
+        if "lights" in self.model_fields_set and self.lights != ring:
+            raise ValueError("preset and lights exclude each other; give one of them")
+        object.__setattr__(self, "lights", ring)
+        return self
+
+    def _ring(self) -> tuple[LightSpec, ...]:
+        """Give the preset's lights."""
+        assert self.preset is not None
+        sizes = PRESETS[self.preset]
+        count = int(sizes["count"]) if self.count is None else self.count
+        radius = sizes["radius_mm"] if self.radius_mm is None else self.radius_mm
+        if count > 1 and radius == 0:
+            raise ValueError(f"count = {count}: with radius_mm = 0 all lights would be in one place")
+        emission: dict[str, Any] = {} if self.each is None else dict(self.each)
+        power = (1.0 if self.power is None else self.power) / count
+        first, lights = math.radians(self.azimuth_deg or 0.0), []
+        for i in range(count):
+            angle = first + 2 * math.pi * i / count
+            place = (radius * math.cos(angle), radius * math.sin(angle), self.axial_mm or 0.0)
+            lights.append(LightSpec(position_mm=place, power=power, **emission))
+        return tuple(lights)
+
+    def known_emission(self) -> CosineProfile | TableProfile | None:
+        """Give the profile that reconstruction may divide by: of a single light at the camera, along the optical axis.
+
+        None where it is uniform or not known, and for other rigs, whose falloff hangs on the distance too.
+        """
+        light = self.lights[0]
+        at_camera = len(self.lights) == 1 and not any(light.place_mm) and light.spot_deg is None
+        along = not any(light.direction[:2]) and light.direction[2] > 0
+        told = self.emission_known and at_camera and along and not light.profile.model().is_uniform
+        return light.profile if told else None
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether the true places hang on the seed."""
+        return any(light.position_error_mm > 0 for light in self.lights)
+
+    def nominal_mm(self) -> npt.NDArray[np.float64]:
+        """Give the places that estimators are told, shape (L, 3), camera frame, mm."""
+        return np.array([light.place_mm for light in self.lights])
+
+    def true_mm(self) -> npt.NDArray[np.float64]:
+        """Give the places that are rendered, shape (L, 3), camera frame, mm: the nominal ones plus their errors."""
+        places = self.nominal_mm()
+        if not self.is_drawn:
+            return places
+        deviations = np.array([[light.position_error_mm] for light in self.lights])
+        return places + deviations * from_integer(self.seed).standard_normal(places.shape)

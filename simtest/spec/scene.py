@@ -6,6 +6,8 @@ from typing import Any
 
 from pydantic import Field
 
+from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.geometry.profile import AngularProfile
 from simtest.resources import find
 from simtest.spec.camera import CameraSpec
 from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
@@ -33,6 +35,22 @@ class Scene(Spec):
     camera: CameraSpec = CameraSpec()
     sensor: Sensor = Sensor()
     render: Effort = Effort()
+
+    def calibration(self) -> Calibration:
+        """Give what reconstruction is told of the scene's camera, sensor and light.
+
+        See the keys ``sensor.*_known`` and ``rig.emission_known``. White noise is not told: each frame shows it.
+        """
+        sensor, emission = self.sensor, self.rig.known_emission()
+        response = sensor.response.model() if sensor.response_known else Response()
+        return Calibration(
+            self.camera.model(),
+            response=response,
+            vignetting=sensor.vignetting.model() if sensor.vignetting_known else AngularProfile(),
+            emission=emission.model() if emission else AngularProfile(),
+            noise=NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response),
+            saturation_level=1.0 if sensor.clips else None,
+        )
 
 
 def scene_from_dict(data: Mapping[str, Any], where: str = "scene") -> Scene:

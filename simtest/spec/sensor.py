@@ -1,12 +1,141 @@
 """The sensor of a scene: what turns radiance into a frame."""
 
-from pydantic import Field
+from typing import Annotated, Literal
 
+from pydantic import Field, model_validator
+
+from simtest.calibration import NoiseModel, Response
+from simtest.calibration.response import check_table
+from simtest.errors import InputError
+from simtest.spec.profile import CosineProfile, Profile
+from simtest.spec.quantities import Share
 from simtest.spec.reading import Spec
+
+FullWell = Annotated[float, Field(ge=1, le=1e9)]
+ReadNoise = Annotated[float, Field(ge=0, le=1e6)]
+Bits = Annotated[int, Field(ge=8, le=16)]
+
+
+def check_electrons(full_well: float | None, read_noise: float) -> None:
+    """Raise `ValueError` where a read noise in electrons has no full well that gives it its share of full scale."""
+    if read_noise > 0 and full_well is None:
+        raise ValueError(f"read_noise = {read_noise:g} electrons: needs full_well as well")
+
+
+class LinearResponse(Spec):
+    """Values are proportional to light."""
+
+    type: Literal["linear"] = "linear"
+
+    def model(self) -> Response:
+        """Give the response as reconstruction uses it."""
+        return Response()
+
+
+class GammaResponse(Spec):
+    """value = light^(1/gamma)."""
+
+    type: Literal["gamma"] = "gamma"
+    gamma: float = Field(2.2, ge=0.1, le=10, description="2.2: dark values are spread, as in most pictures")
+
+    def model(self) -> Response:
+        """Give the response as reconstruction uses it."""
+        return Response("gamma", self.gamma)
+
+
+class SrgbResponse(Spec):
+    """The curve of sRGB pictures (IEC 61966-2-1)."""
+
+    type: Literal["srgb"] = "srgb"
+
+    def model(self) -> Response:
+        """Give the response as reconstruction uses it."""
+        return Response("srgb")
+
+
+class TableResponse(Spec):
+    """A measured curve, linear between its points; both lists rise from 0 to 1."""
+
+    type: Literal["table"] = "table"
+    light: tuple[Share, ...] = Field(min_length=2, max_length=4096, description="light, share of full scale")
+    value: tuple[Share, ...] = Field(min_length=2, max_length=4096, description="value, share of the largest")
+
+    @model_validator(mode="after")
+    def _rising(self) -> "TableResponse":
+        try:
+            check_table(self.light, self.value)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def model(self) -> Response:
+        """Give the response as reconstruction uses it."""
+        return Response("table", light=self.light, value=self.value)
+
+
+ResponseSpec = Annotated[LinearResponse | GammaResponse | SrgbResponse | TableResponse, Field(discriminator="type")]
+
+
+class Exposure(Spec):
+    """Which radiance becomes full scale: that of the brightest isolated highlight, unless one of the keys says else."""
+
+    full_scale: float | None = Field(None, gt=0, le=1e12, description="radiance at full scale, fixed")
+    percentile: float | None = Field(
+        None, gt=0, le=100, description="automatic: this percentile of the frame's radiance becomes full scale"
+    )
+    gain: float = Field(1.0, gt=0, le=1e6, description="exposure over that of the rule; 2 halves full scale")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "Exposure":
+        if self.full_scale is not None and self.percentile is not None:
+            raise ValueError("full_scale and percentile exclude each other; give one of them")
+        return self
 
 
 class Sensor(Spec):
-    """Noise of the frame."""
+    """From radiance to a frame, in this order.
 
-    noise_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of the noise, share of full scale")
+    Point spread, vignetting, exposure, noise, saturation, response, quantisation.
+    """
+
+    point_spread_px: float = Field(0.0, ge=0, le=50, description="standard deviation of the Gaussian point spread, px")
+    vignetting: Profile = Field(
+        CosineProfile(), description="share of the light that is left, over the angle from the optical axis"
+    )
+    exposure: Exposure = Exposure()
+    full_well: FullWell | None = Field(
+        None, description="electrons at full scale, Poisson distributed; default no shot noise"
+    )
+    read_noise: ReadNoise = Field(0.0, description="standard deviation, electrons; needs full_well")
+    noise_sigma: float = Field(
+        0.0, ge=0, le=1, description="standard deviation of the white noise, share of full scale"
+    )
+    saturation: bool = Field(
+        False, description="clip to [0, full scale]; a response that is not linear and bits clip as well"
+    )
+    response: ResponseSpec = LinearResponse()
+    bits: Bits | None = Field(None, description="of the values; default not quantised")
+    response_known: bool = Field(True, description="whether reconstruction knows the response; else it assumes linear")
+    vignetting_known: bool = Field(
+        True, description="whether reconstruction knows the vignetting; else it assumes none"
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the noise; experiments draw one for each realisation")
+
+    @model_validator(mode="after")
+    def _electrons(self) -> "Sensor":
+        check_electrons(self.full_well, self.read_noise)
+        return self
+
+    @property
+    def encodes(self) -> bool:
+        """Whether the frame's values are encoded: by a response, or to a number of bits."""
+        return self.bits is not None or self.response.type != "linear"
+
+    @property
+    def clips(self) -> bool:
+        """Whether values end at full scale."""
+        return self.saturation or self.encodes
+
+    def noise_model(self) -> NoiseModel:
+        """Give the noise of one channel of the linear frame by its level."""
+        return NoiseModel(self.noise_sigma, self.full_well, self.read_noise, self.bits, self.response.model())

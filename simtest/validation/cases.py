@@ -1,7 +1,6 @@
 """From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
 
 import itertools
-import json
 import math
 import shlex
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ from simtest.resources import find, shown
 from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
+from simtest.spec.writing import toml_value
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,10 @@ class Case:
         """Give the setting of the published protocol; raises `InputError` where a value does not fit."""
         return paper_from_dict(self.data, self.where)
 
+    def paper_columns(self) -> dict[str, Any]:
+        """Give every parameter of the published protocol by key path, swept or not, for the rows' columns."""
+        return {f"paper.{name}": value for name, value in self.paper_setting().model_dump().items()}
+
     @property
     def name(self) -> str:
         """The case's place in the seed tree."""
@@ -91,6 +95,9 @@ class Case:
         if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
             seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
             scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
+        if scene.rig.is_drawn:
+            seed = integer(experiment.seed, experiment.name, self.name, realisation, Stage.RIG)
+            scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"seed": seed})})
         return scene, drawn
 
     def noise_seed(self, experiment: Experiment, realisation: int) -> int:
@@ -103,6 +110,8 @@ class Case:
         values = {**self.settings, **drawn, "sensor.seed": self.noise_seed(experiment, realisation)}
         if scene.render.seed != self.data.get("render", {}).get("seed", 0):
             values["render.seed"] = scene.render.seed
+        if scene.rig.is_drawn:
+            values["rig.seed"] = scene.rig.seed
         return f"simtest render {shlex.quote(self.source)} {set_options(values)}"
 
 
@@ -202,17 +211,8 @@ def _plain(value: Any) -> Any:
 
 
 def _toml(value: Any) -> str:
-    """Write a value so that ``--set key=value`` reads it back."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_quoted(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_quoted(item) for item in value) + "]"
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _quoted(value: Any) -> str:
-    # A JSON string is a TOML basic string.
-    return json.dumps(value) if isinstance(value, str) else _toml(value)
+    """Write a value so that ``--set key=value`` reads it back: text stays bare."""
+    return value if isinstance(value, str) else toml_value(value)
 
 
 def swept_example(cases: list[Case]) -> dict[str, Any]:
@@ -222,5 +222,6 @@ def swept_example(cases: list[Case]) -> dict[str, Any]:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)
         if case.is_paper:
+            example |= {key: value for key, value in case.paper_columns().items() if key not in example}
             example["bound_deg"] = 0.0
     return example

@@ -11,7 +11,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.base import drawable
 from simtest.files import write_atomically
-from simtest.geometry import Camera
+from simtest.geometry import Camera, Patch
 from simtest.rendering import Session
 from simtest.spec import camera_table
 from simtest.validation.cases import Case
@@ -56,16 +56,33 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made, camera)],
     }
 
-    def write(part: Path) -> None:
-        np.savez_compressed(
-            part,
-            frame=made.frame.astype(np.float16).astype(np.float32),
-            position=truth.position.astype(np.float32),
-            normal=truth.normal.astype(np.float32),
-            meta=np.array(json.dumps(meta, allow_nan=False)),
-        )
+    # Pictures are encoded once more where they are drawn.
+    linear = seen.scene.sensor.response.model().decode(made.frame)
+    write_item(path, meta, linear, truth.position, truth.normal)
 
-    write_atomically(path, write)
+
+def write_item(path: Path, meta: dict[str, Any], frame: Any, position: Any, normal: Any, **more: Any) -> None:
+    """Write the file of one gallery item.
+
+    Parameters
+    ----------
+    path : Path
+        The .npz file.
+    meta : dict
+        All that is no picture.
+    frame : ndarray, shape (H, W) or (H, W, 3)
+        Share of full scale.
+    position, normal : ndarray, shape (h, w, 3)
+        Thinned truth, camera frame; NaN where there is no surface.
+    **more : ndarray
+        Further pictures.
+    """
+    # Half precision is enough to look at; stored wider, since it is read back as it is.
+    content = {"frame": np.asarray(frame).astype(np.float16).astype(np.float32)}
+    content |= {"position": np.asarray(position, np.float32), "normal": np.asarray(normal, np.float32)}
+    content |= {name: np.asarray(picture).astype(np.float16) for name, picture in more.items()}
+    text = np.array(json.dumps(meta, allow_nan=False))
+    write_atomically(path, lambda part: np.savez_compressed(part, **content, meta=text))  # type: ignore[arg-type]
 
 
 def _truth(j: int, judged: Any) -> dict[str, Any]:
@@ -87,26 +104,46 @@ def _estimates(i: int, made: Realisation, camera: Camera) -> list[dict[str, Any]
     peak = [v + PIXEL_CENTRE for v in specularity.region.peak]
     if not isinstance(specularity.patch, Failure):
         peak = specularity.patch.peak_px.tolist()
-    entries = []
-    for name, result in specularity.estimates.items():
-        entry: dict[str, Any] = {
-            "specularity": i, "true_id": true_id, "estimator": name, "bp_px": peak, "error_deg": None, "normal": None,
-            "candidates": [], "look_px": None, "isophotes": [], "curves": [],
-        }  # fmt: skip
-        if isinstance(result, Failure):
-            entries.append(entry | {"status": str(result.reason)})
-            continue
-        entries.append(entry | {"status": "ok"} | _drawn(result, camera))
-        if true_id is not None:
-            entries[-1]["error_deg"] = float(angle_deg(result.normal, made.truths[true_id].highlight.normal))
-    return entries
+    normal = None if true_id is None else made.truths[true_id].highlight.normal
+    place = {"specularity": i, "true_id": true_id, "bp_px": peak}
+    return [
+        place | {"estimator": name} | drawn(result, specularity.patch, camera, normal)
+        for name, result in specularity.estimates.items()
+    ]
 
 
-def _drawn(estimate: Estimate, camera: Camera) -> dict[str, Any]:
+def drawn(result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: Any) -> dict[str, Any]:
+    """Give what a gallery item keeps of an estimator's answer.
+
+    Parameters
+    ----------
+    result : Estimate or Failure
+        The answer.
+    patch : Patch or Failure
+        What it looked at.
+    camera : Camera
+        Of the frame.
+    truth : ndarray, shape (3,), or None
+        The true normal, where there is one.
+    """
+    entry: dict[str, Any] = {
+        "error_deg": None, "error_oracle_deg": None, "normal": None, "candidates": [], "look_px": None,
+        "isophotes": [], "curves": [],
+    }  # fmt: skip
+    if isinstance(result, Failure):
+        return entry | {"status": str(result.reason)}
+    entry |= {"status": "ok"} | _drawn(result, patch, camera)
+    if truth is not None:
+        entry["error_deg"] = float(angle_deg(result.normal, truth))
+        entry["error_oracle_deg"] = float(angle_deg(result.candidates, truth).min())
+    return entry
+
+
+def _drawn(estimate: Estimate, patch: Patch | Failure, camera: Camera) -> dict[str, Any]:
     isophotes = []
-    for isophote in estimate.isophotes:
-        step = max(1, len(isophote.points) // CONTOUR_POINTS)
-        isophotes.append({"t": isophote.isovalue, "points": np.round(isophote.points[::step], 2).tolist()})
+    for t, points in estimate.contours(patch):
+        step = max(1, len(points) // CONTOUR_POINTS)
+        isophotes.append({"t": t, "points": np.round(points[::step], 2).tolist()})
     return {
         "normal": estimate.normal.tolist(),
         "candidates": estimate.candidates.tolist(),

@@ -130,3 +130,42 @@ def bisector_angle(position: npt.ArrayLike, light: npt.ArrayLike) -> Array:
     to_light = np.asarray(light, float) - P
     sine = np.linalg.norm(np.cross(-P, to_light), axis=-1)
     return np.asarray(np.arctan2(sine, np.sum(-P * to_light, axis=-1)) / 2)
+
+
+def vignetting_shift(
+    off_axis: npt.ArrayLike,
+    power: npt.ArrayLike,
+    lobe_curvature: npt.ArrayLike,
+    kd: npt.ArrayLike = 0.0,
+    isovalue: npt.ArrayLike = 1.0,
+) -> Array:
+    """Give the error that falloff cos^k about the optical axis leaves where it is not known (section 4).
+
+    With w the image angle away from the axis and m = 1 + d k, equal in all directions,
+    -log I = (c m^2 + 2 m) w^2 / 2 - k log(cos(phi + w)), so the peak moves towards the axis by
+    k tan(phi) / (c m^2 + 2 m + k + k tan(phi)^2); for small k and phi that is k tan(phi) / (4 n + 2) on a plane.
+    The axis of the cone of an isophote of half-width r about that peak moves by 1 / (1 + r^2) of it.
+
+    Parameters
+    ----------
+    off_axis : array_like
+        phi, angle of the highlight from the optical axis, rad.
+    power : array_like
+        k; vignetting's and emission's add up.
+    lobe_curvature : array_like
+        c = -(log f)''(0) of the reflectance; 4 n for Phong.
+    kd : array_like
+        d times the principal curvatures, equal.
+    isovalue : array_like
+        t in (0, 1]; 1 is the peak.
+
+    Returns
+    -------
+    ndarray
+        Angle, rad, >= 0; NaN where there is no peak.
+    """
+    k, m = np.asarray(power, float), 1 + np.asarray(kd, float)
+    tangent, across = np.tan(np.asarray(off_axis, float)), np.asarray(lobe_curvature, float) * m**2 + 2 * m + k
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = np.where(across > 0, k * tangent / (across + k * tangent**2), np.nan)
+        return np.asarray(shift / (1 - 2 * np.log(np.asarray(isovalue, float)) / across))

@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session
 from simtest.rendering.frames import Array
+from simtest.spec.profile import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.scene import Scene
 from simtest.validation import laws
@@ -30,9 +32,14 @@ SCHEMA: dict[str, pl.DataType] = {
     "mahalanobis2": pl.Float64(), "distance_mm": pl.Float64(), "kd_min": pl.Float64(), "kd_max": pl.Float64(),
     "eps_over_d": pl.Float64(), "noise_sigma": pl.Float64(), "peak_snr": pl.Float64(), "isovalue": pl.Float64(),
     "isovalues": pl.String(), "axis_ratio": pl.Float64(), "axis_ratio_law": pl.Float64(), "path_depth": pl.Int64(),
-    "n_lights": pl.Int64(),
+    "n_lights": pl.Int64(), "saturated_share": pl.Float64(),
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
+
+MISSED = "missed"
+
+EQUAL_KD = 1e-3
+"""Principal curvatures times distance that differ by less are those of a plane or a sphere."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,7 @@ def angle_deg(first: Array, second: Array) -> Array:
 
 def rows(
     context: RowContext, specularities: list[Specularity], truths: list[JudgedHighlight], matched: dict[int, int],
-    estimators: list[str],
+    estimators: list[str], unfound: str = MISSED,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Give the rows of one realisation: of each detection, and of each truth that no detection found.
 
@@ -80,6 +87,8 @@ def rows(
         Index of the truth by index of the detection.
     estimators : list of str
         Names, for the missed.
+    unfound : str
+        Status of the rows of truths that no detection found.
 
     Returns
     -------
@@ -94,7 +103,7 @@ def rows(
             made.append(row)
     for j, truth in enumerate(truths):
         if j not in matched.values():
-            missed = {"specularity": None, "true_id": j, "status": "missed"}
+            missed = {"specularity": None, "true_id": j, "status": unfound}
             made += [{**_base(context, truth), **missed, "estimator": name} for name in estimators]
     return made
 
@@ -112,7 +121,8 @@ def _base(context: RowContext, truth: JudgedHighlight | None) -> dict[str, Any]:
     if truth is None:
         return row
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    # Of the light that made the highlight, at its true place.
+    light = scene.rig.true_mm()[highlight.light]
     row |= {
         "distance_mm": highlight.distance,
         "kd_min": highlight.kd_min,
@@ -132,6 +142,7 @@ def _result(
     row: dict[str, Any] = {}
     if not isinstance(specularity.patch, Failure):
         row["bp_x_px"], row["bp_y_px"] = (float(v) for v in specularity.patch.peak_px)
+        row["saturated_share"] = specularity.patch.saturated_share(HIGHLIGHT_ISOVALUE)
     if isinstance(result, Failure):
         return row | {"status": str(result.reason), "flags": result.detail}
     isovalues = [isophote.isovalue for isophote in result.isophotes]
@@ -177,14 +188,17 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
 def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
     """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
 
-    With a light at the camera: circle pose (two candidates) on a curved surface. With an offset light: half the
-    angle between light and camera for estimators of one candidate.
+    With a light at the camera: circle pose (two candidates) on a curved surface; the shift by unknown vignetting for
+    estimators of one candidate. With an offset light: half the angle between light and camera for those.
     """
     highlight = truth.highlight
-    light = np.array(scene.rig.lights[highlight.light].place_mm)
+    light = scene.rig.true_mm()[highlight.light]
     offset = float(np.linalg.norm(light)) > 0
     if len(estimate.candidates) == 1:
-        return float(np.degrees(laws.bisector_angle(highlight.position, light))) if offset else None
+        unknown = not (scene.sensor.vignetting_known or scene.sensor.vignetting.model().is_uniform)
+        if offset and not unknown:
+            return float(np.degrees(laws.bisector_angle(highlight.position, light)))
+        return _vignetting_law_deg(scene, estimate, truth) if unknown and not offset else None
     if offset or len(estimate.isophotes) != 1:
         return None
     a, b = laws.isophote_half_axes(
@@ -192,6 +206,17 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     )
     error = float(np.degrees(laws.circle_pose_error(a, b)))
     return error if np.isfinite(error) else None
+
+
+def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
+    """Give the shift by unknown vignetting, deg; None for a table, and where the curvatures differ."""
+    highlight, vignetting = truth.highlight, scene.sensor.vignetting
+    if not isinstance(vignetting, CosineProfile) or abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
+        return None
+    off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
+    isovalues = [isophote.isovalue for isophote in estimate.isophotes] or [1.0]
+    shifts = laws.vignetting_shift(off_axis, vignetting.power, lobe_curvature(scene), highlight.kd_min, isovalues)
+    return float(np.degrees(shifts.mean())) if np.isfinite(shifts).all() else None
 
 
 def lobe_curvature(scene: Scene) -> float:
@@ -207,9 +232,21 @@ def lobe_curvature(scene: Scene) -> float:
 
 def table(made: list[dict[str, Any]], swept: dict[str, Any]) -> pl.DataFrame:
     """Make the table of results from rows; `swept` gives an example value for each swept parameter's column."""
-    extra = {name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}
-    schema = {**SCHEMA, **extra}
+    schema = _schema(swept)
     return pl.DataFrame([{name: row.get(name) for name in schema} for row in made], schema=schema)
+
+
+def completed(made: pl.DataFrame, swept: dict[str, Any]) -> pl.DataFrame:
+    """Give a table of results all columns of `table`, in its order; those that are missing are null."""
+    columns = [
+        (pl.col(name) if name in made.columns else pl.lit(None)).cast(dtype).alias(name)
+        for name, dtype in _schema(swept).items()
+    ]
+    return made.select(columns)
+
+
+def _schema(swept: dict[str, Any]) -> dict[str, pl.DataType]:
+    return {**SCHEMA, **{name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}}
 
 
 def _dtype(value: Any) -> pl.DataType:

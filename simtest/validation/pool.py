@@ -44,17 +44,22 @@ class Pool:
             return
         if self._executor is None:
             context = multiprocessing.get_context("spawn")
-            self._executor = ProcessPoolExecutor(self._workers, context, initializer=_leave_interrupts)
+            self._executor = ProcessPoolExecutor(self._workers, context, initializer=_start)
         for future in [self._executor.submit(function, *task) for task in tasks]:
             yield future.result()
 
 
-def _leave_interrupts() -> None:
-    """Let Ctrl-C, which reaches all processes of a terminal, be answered by the parent alone."""
+def _start() -> None:
+    """Prepare a worker: Ctrl-C, which reaches all processes of a terminal, is the parent's to answer.
+
+    One thread a worker: more would only get in each other's way.
+    """
+    import os
     import signal
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Read when NumPy loads, which OpenCV's import does.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     import cv2
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # One thread a worker: more would only get in each other's way.
     cv2.setNumThreads(1)

@@ -1,21 +1,27 @@
 """One realisation: render, expose, reconstruct, match, measure."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import Calibration, NoiseModel
+from simtest.errors import Reason
 from simtest.estimators import Estimator
 from simtest.reconstruction import Specularity, reconstruct
-from simtest.rendering import Radiance, Session
+from simtest.rendering import Radiance, Session, TrueHighlight
 from simtest.seeds import from_integer
-from simtest.sensor import expose
+from simtest.sensor import capture, collect
 from simtest.spec import Experiment, Scene
 from simtest.validation.cases import Case
 from simtest.validation.matching import match
-from simtest.validation.metrics import RowContext, rows
+from simtest.validation.metrics import MISSED, RowContext, rows
 from simtest.validation.truth import JudgedHighlight, judge
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -27,17 +33,27 @@ class View:
     scene : Scene
         What was rendered.
     radiance : Radiance
-        Noise-free.
+        Noise-free, before the lens.
+    light : ndarray of float32, shape (H, W) or (H, W, 3)
+        Noise-free radiance behind the lens: what reaches the sensor.
     truths : list of JudgedHighlight
         All true highlights, those included that do not count.
     full_scale : float
-        Radiance that becomes 1: the brightest isolated highlight's, else the frame's maximum.
+        Radiance behind the lens that becomes 1 (`Exposure`); 0 where no light reaches the sensor.
+    calibration : Calibration
+        What reconstruction is told.
     """
 
     scene: Scene
     radiance: Radiance
+    light: Image
     truths: list[JudgedHighlight]
     full_scale: float
+    calibration: Calibration
+
+    def frame(self, seed: int) -> Image:
+        """Give the sensor's frame with the noise of a seed."""
+        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed))
 
 
 @dataclass(frozen=True)
@@ -49,7 +65,7 @@ class Realisation:
     rows : list of dict
         Of the results' table.
     frame : ndarray of float32, shape (H, W) or (H, W, 3)
-        What the sensor gave.
+        What the sensor gave, as encoded.
     specularities : list of Specularity
         Detections with estimates.
     truths : list of JudgedHighlight
@@ -59,13 +75,13 @@ class Realisation:
     """
 
     rows: list[dict[str, Any]]
-    frame: npt.NDArray[np.float32]
+    frame: Image
     specularities: list[Specularity]
     truths: list[JudgedHighlight]
     matched: dict[int, int]
 
 
-def view(session: Session, scene: Scene) -> View:
+def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> View:
     """Render a scene and judge its true highlights.
 
     Parameters
@@ -74,22 +90,53 @@ def view(session: Session, scene: Scene) -> View:
         Is moved to the scene.
     scene : Scene
         The scene.
+    radiance : Radiance, optional
+        Of the scene, where it is rendered already.
 
     Returns
     -------
     View
     """
     session.update(scene)
-    radiance = session.radiance()
-    total = radiance.intensity
-    peak, seen = float(total.max()), session.camera.seen
-    highlights = session.highlights(radiance)
-    # Exposure is set on the brightest isolated highlight, which is judged without noise first.
-    isolated = [judged.highlight.radiance for judged in judge(highlights, total, 0.0, peak, seen) if judged.isolated]
-    full_scale = max(isolated, default=peak)
+    if radiance is None:
+        radiance = session.radiance()
+    light = collect(radiance.total, scene.sensor, session.camera)
+    mean = light if light.ndim == 2 else light.mean(axis=2, dtype=np.float32)
+    highlights, seen = session.highlights(radiance), session.camera.seen
+    full_scale = _full_scale(scene, mean, highlights, seen)
     # Noise is independent in each channel; estimators see the channels' mean.
-    sigma = scene.sensor.noise_sigma / np.sqrt(radiance.channels)
-    return View(scene, radiance, judge(highlights, total, float(sigma), full_scale, seen), full_scale)
+    truths = judge(highlights, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
+    return View(scene, radiance, light, truths, full_scale, scene.calibration())
+
+
+def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], seen: Mask | None) -> float:
+    """Give the radiance that becomes 1; 0, with a warning, where there is no light at all."""
+    exposure, peak = scene.sensor.exposure, float(light.max())
+    if peak <= 0:
+        warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=3)
+        return 0.0
+    if exposure.full_scale is not None:
+        radiance = exposure.full_scale
+    elif exposure.percentile is not None:
+        radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))
+        if radiance <= 0:
+            warnings.warn(
+                f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is 0; "
+                "the frame's maximum becomes full scale",
+                stacklevel=3,
+            )
+            radiance = peak
+    else:
+        # Which highlights are isolated is judged without noise first.
+        isolated = [j.highlight.bp_px for j in judge(highlights, light, NoiseModel(), peak, 1, seen) if j.isolated]
+        radiance = max((_nearest(light, place) for place in isolated), default=peak)
+    return radiance / exposure.gain
+
+
+def _nearest(light: Image, place: npt.NDArray[np.float64]) -> float:
+    """Give the light at the pixel that a place, px, lies in."""
+    column, row = (min(int(v), size - 1) for v, size in zip(place, light.shape[::-1], strict=True))
+    return float(light[row, column])
 
 
 def realise(
@@ -119,11 +166,12 @@ def realise(
     -------
     Realisation
     """
-    scene = seen.scene
     seed = case.noise_seed(experiment, number)
-    frame = expose(seen.radiance.total, seen.full_scale, scene.sensor.noise_sigma, from_integer(seed))
-    specularities = reconstruct(frame, session.camera, estimators, isolated=case.isolated)
-    truths = [truth for truth in seen.truths if truth.isolated or not case.isolated]
+    frame = seen.frame(seed)
+    dark = seen.full_scale <= 0
+    # Without light whatever is found is noise; no highlight counts as isolated, and all count as failures.
+    specularities = [] if dark else reconstruct(frame, seen.calibration, estimators, isolated=case.isolated)
+    truths = [truth for truth in seen.truths if truth.isolated or not case.isolated or dark]
     matched = match(specularities, truths)
     common = {
         "experiment": experiment.name,
@@ -134,5 +182,6 @@ def realise(
         **case.swept,
         **drawn,
     }
-    made = rows(RowContext(session, common), specularities, truths, matched, list(estimators))
+    unfound = str(Reason.NO_LIGHT) if dark else MISSED
+    made = rows(RowContext(session, common), specularities, truths, matched, list(estimators), unfound)
     return Realisation(made, frame, specularities, truths, matched)

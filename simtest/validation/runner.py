@@ -1,6 +1,7 @@
 """Runs an experiment: case by case, each kept as soon as it is done, so that a stopped run goes on."""
 
 import hashlib
+import itertools
 import json
 import re
 import time
@@ -22,11 +23,13 @@ from simtest.files import write_atomically, write_json
 from simtest.rendering import Session, backend
 from simtest.resources import shown
 from simtest.spec import Experiment, Scene
+from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
 from simtest.validation import gallery
 from simtest.validation.cases import Case, expand, swept_example
-from simtest.validation.metrics import table
+from simtest.validation.metrics import completed, table
 from simtest.validation.paper.bound import cramer_rao_bound
+from simtest.validation.paper.item import save_realisation
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.pool import Pool
 from simtest.validation.realise import View, realise, view
@@ -156,8 +159,7 @@ class _Work:
     def run(self, parts: Path, progress: Progress | None) -> int:
         """Run the cases that are not done yet; gives how many were."""
         total, done, resumed = sum(case.realisations for case in self.cases), 0, 0
-        count = min(GALLERY_ITEMS, len(self.cases))
-        shown = set(np.linspace(0, len(self.cases) - 1, count).round().astype(int).tolist())
+        in_gallery = _in_gallery(self.cases)
         swept = swept_example(self.cases)
         with Pool(self.workers) as pool:
             for index, case in enumerate(self.cases):
@@ -169,9 +171,12 @@ class _Work:
                         if progress:
                             progress(before + more, total, name)
 
-                    item = self.folder / "gallery" / f"{index:04d}.npz" if index in shown else None
-                    rows = self._published(case, pool, step) if case.is_paper else self._rendered(case, item, step)
-                    write_atomically(_part_file(parts, index), table(rows, swept).write_parquet)
+                    item = self.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
+                    if case.is_paper:
+                        made = completed(self._published(case, item, pool, step), swept)
+                    else:
+                        made = table(self._rendered(case, item, step), swept)
+                    write_atomically(_part_file(parts, index), made.write_parquet)
                 done += case.realisations
         if progress:
             progress(total, total, "done")
@@ -194,10 +199,14 @@ class _Work:
                 gallery.save(item, self.session, case, seen, made, again)
         return rows
 
-    def _published(self, case: Case, pool: Pool, step: Callable[[int], None]) -> list[dict[str, Any]]:
-        """Make the rows of a case of the published protocol, in chunks over the workers."""
+    def _published(self, case: Case, item: Path | None, pool: Pool, step: Callable[[int], None]) -> pl.DataFrame:
+        """Make the rows of a case of the published protocol, in chunks over the workers; see `_rendered` for `item`."""
         experiment, numbers, setting = self.experiment, case.numbers(), case.paper_setting()
-        common = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **case.swept}
+        names = {"label": case.label, "setting": case.setting}
+        common: dict[str, Any] = {"experiment": experiment.name, **names, **case.paper_columns(), **case.swept}
+        if item:
+            seed = case.noise_seed(experiment, numbers[0])
+            save_realisation(item, setting, experiment.estimators, seed, names)
         # The bound is that of the light at V.
         common["bound_deg"] = float(np.degrees(cramer_rao_bound(setting))) if setting.eps == 0 else None
         tasks = []
@@ -205,16 +214,24 @@ class _Work:
             chunk = numbers[first : first + PAPER_CHUNK]
             seeds = [case.noise_seed(experiment, number) for number in chunk]
             tasks.append((setting, common, chunk, seeds, experiment.estimators))
-        rows: list[dict[str, Any]] = []
-        for done, made in enumerate(pool.map(paper_rows, tasks)):
+        made = []
+        for done, rows in enumerate(pool.map(paper_rows, tasks)):
             step(min(done * PAPER_CHUNK, len(numbers)))
-            rows += made
-        return rows
+            made.append(rows)
+        return pl.concat(made)
 
     def _view(self, scene: Scene) -> View:
         if self.session is None:
             self.session = Session(scene, self.variant)
         return view(self.session, scene)
+
+
+def _in_gallery(cases: list[Case]) -> set[int]:
+    """Choose the cases whose first realisation is kept: evenly spaced ones, and the published protocol's defaults."""
+    count = min(GALLERY_ITEMS, len(cases))
+    chosen = set(np.linspace(0, len(cases) - 1, count).round().astype(int).tolist())
+    at_defaults = (i for i, case in enumerate(cases) if case.is_paper and case.paper_setting() == PaperSetting())
+    return chosen | set(itertools.islice(at_defaults, 1))
 
 
 def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:

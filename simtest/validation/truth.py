@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import NoiseModel
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
 from simtest.detection import contrast, half_height_component
 from simtest.geometry import smooth
 from simtest.rendering import TrueHighlight
 
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 MAX_CLIMB_PX = 12
 """Smoothing moves a lopsided highlight's maximum away from its true BP, by no more than this."""
@@ -25,7 +27,8 @@ class JudgedHighlight:
     highlight : TrueHighlight
         Where it is.
     peak_snr : float
-        Peak above its surroundings over the noise; inf without noise, 0 where it has no closed isophote.
+        Peak above its surroundings over the standard deviation of the noise at the peak's level; inf without noise, 0
+        where it has no closed isophote.
     why_not : str
         Empty for a true isolated highlight, else the first condition that it fails.
     """
@@ -42,10 +45,11 @@ class JudgedHighlight:
 
 def judge(
     highlights: list[TrueHighlight],
-    radiance: Image,
-    noise_sigma: float,
+    light: Image,
+    noise: NoiseModel,
     full_scale: float,
-    seen: npt.NDArray[np.bool_] | None = None,
+    channels: int = 1,
+    seen: Mask | None = None,
 ) -> list[JudgedHighlight]:
     """Judge each true highlight by the noise-free frame.
 
@@ -53,12 +57,14 @@ def judge(
     ----------
     highlights : list of TrueHighlight
         All points where the normal bisects light and camera.
-    radiance : ndarray of float32, shape (H, W)
-        Noise-free radiance.
-    noise_sigma : float
-        Share of full scale.
+    light : ndarray of float32, shape (H, W)
+        Noise-free radiance behind the lens, mean of the channels.
+    noise : NoiseModel
+        Of one channel.
     full_scale : float
-        Radiance at full scale.
+        Radiance at full scale; 0 where there is no light at all.
+    channels : int
+        How many channels were averaged.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
 
@@ -67,13 +73,18 @@ def judge(
     list of JudgedHighlight
         In the same order.
     """
-    smoothed = smooth(radiance, DEFAULT_SMOOTHING_PX, seen)
+    smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
     peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
     owners = _owners(highlights, peaks)
-    noise = noise_sigma * full_scale
+
+    def sigma(peak: tuple[int, int]) -> float:
+        if full_scale <= 0:
+            return 0.0
+        return float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale
+
     return [
-        _judge(highlight, (smoothed, seen), peak, owners.get(peak) is highlight, noise)
-        for highlight, peak in zip(highlights, peaks, strict=True)
+        _judge(h, (smoothed, seen), peak, owners.get(peak) is h, sigma(peak))
+        for h, peak in zip(highlights, peaks, strict=True)
     ]
 
 
@@ -92,7 +103,7 @@ def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> di
 
 def _judge(
     highlight: TrueHighlight,
-    frame: tuple[Image, npt.NDArray[np.bool_] | None],
+    frame: tuple[Image, Mask | None],
     peak: tuple[int, int],
     owns_peak: bool,
     noise: float,

@@ -27,8 +27,9 @@ def parameters(fitted):
     assert isinstance(fitted, FittedConic), fitted
     ellipse = ellipse_of_conic(fitted.normalised)
     T = fitted.normalised_from_image
-    centre = (ellipse.centre - T[:2, 2]) / T[0, 0]
-    return centre, ellipse.semi_major / T[0, 0], ellipse.semi_minor / T[0, 0], ellipse.angle
+    scale, turn = np.sqrt(np.linalg.det(T[:2, :2])), np.arctan2(T[0, 1], T[0, 0])
+    centre = np.linalg.solve(T[:2, :2], ellipse.centre - T[:2, 2])
+    return centre, ellipse.semi_major / scale, ellipse.semi_minor / scale, ellipse.angle + turn
 
 
 def check(points, centre, a, b, angle, digits):

@@ -123,7 +123,7 @@ def test_pipeline_agrees_with_the_plain_one():
     for number in range(200):
         setting = random_setting(number)
         expected = plain(setting, generator(number))
-        result = Pipeline(setting).realise(generator(number))["circle_pose"]
+        result = Pipeline(setting).realise([generator(number)])["circle_pose"][0]
         if expected is None:
             assert isinstance(result, Failure), number
             continue
@@ -136,7 +136,7 @@ def test_pipeline_agrees_with_the_plain_one():
 def mean_error(count, **values):
     setting = PaperSetting(**values)
     pipeline = Pipeline(setting)
-    results = [pipeline.realise(generator(number))["circle_pose"] for number in range(count)]
+    results = pipeline.realise(generator(number) for number in range(count))["circle_pose"]
     return np.mean([error_deg(setting, r.candidates) for r in results if not isinstance(r, Failure)])
 
 
@@ -154,4 +154,4 @@ def test_error_is_least_at_a_middle_isovalue():
 
 def test_an_ill_posed_setting_gives_failures():
     pipeline = Pipeline(PaperSetting(theta_deg=89.0))
-    assert isinstance(pipeline.realise(generator(0))["circle_pose"], Failure)
+    assert isinstance(pipeline.realise([generator(0)])["circle_pose"][0], Failure)

@@ -65,7 +65,7 @@ def nothing_else(monkeypatch):
     """Leave nothing in reach but the variable's library."""
     monkeypatch.setattr(backend, "_packaged_library", lambda: None)
     monkeypatch.setattr(backend, "_system_libraries", lambda: [])
-    monkeypatch.setattr(backend, "_llvm_active", lambda: False)
+    monkeypatch.setattr(backend, "_drjit_loaded", lambda: False)
 
 
 @pytest.fixture
@@ -291,6 +291,31 @@ def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
         assert "llvm_ad_mono" in text
         assert "cuda_ad_mono" in text
         assert "\n" not in text
+
+
+@pytest.mark.parametrize("first", ["nope", "cuda_ad_mono"])
+def test_a_variant_that_fails_leaves_the_next_one_usable(first):
+    """Dr.Jit loads its libLLVM when it is imported, and that must not be one that ends the process."""
+    code = (
+        "from simtest.errors import BackendError; from simtest.rendering import backend\n"
+        f"try: backend.load({first!r})\n"
+        "except BackendError: pass\n"
+        "mi = backend.load('llvm_ad_mono'); import drjit as dr\n"
+        "assert dr.sum(dr.maximum(dr.arange(mi.Float, 5), 2))[0] == 13"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env={**os.environ})
+
+
+def test_a_bad_library_in_memory_is_refused(monkeypatch, tmp_path):
+    library = tmp_path / "libLLVM.so.15"
+    library.write_bytes(b"no library")
+    monkeypatch.setattr(backend, "_drjit_loaded", lambda: True)
+    monkeypatch.setattr(backend, "_mapped_libraries", lambda: [str(library)])
+    with pytest.raises(BackendError, match=f"libLLVM {library}, loaded before simtest could choose: .* before drjit"):
+        backend.load("llvm_ad_mono")
+    monkeypatch.setattr(backend, "_run_probe", lambda path: "ok")
+    monkeypatch.setattr(backend, "_read_cache", lambda: {})
+    backend.load("llvm_ad_mono")
 
 
 # Importing -------------------------------------------------------------------------------------------------------

@@ -54,6 +54,7 @@ SCENES = {
     "true for a number": (PLANE + "distance_mm = true", "surface.distance_mm = True: must be a number"),
     "date for a number": (PLANE + "distance_mm = 2024-01-01", "surface.distance_mm = datetime.date(2024"),
     "number for true": (PHONG + "normalised = 1", "reflectance.normalised = 1: must be true or false"),
+    "more light than arrives": (PHONG + "normalised = true\ndiffuse = 0.3", "a diffuse base of 0.3 reflect more light"),
     "number for text": ("name = 5\n" + PLANE, "name = 5: must be a valid string"),
     "empty name": ('name = ""\n' + PLANE, "name = '': must have at least 1 character"),
     "NaN": (PLANE + "distance_mm = nan", "surface.distance_mm = nan: must be a finite number"),

@@ -274,6 +274,22 @@ def test_an_out_that_cannot_be_written(here, tmp_path):
 
 
 @pytest.mark.render
+def test_export_writes_what_mitsuba_loads(here, tmp_path):
+    code, output, errors = here("export", "saddle", *SET_SMALL, "--out", tmp_path / "out")
+    assert (code, errors) == (0, [])
+    assert output.splitlines() == [str(tmp_path / "out" / name) for name in ("scene.xml", "surface.ply")]
+    assert all((tmp_path / "out" / name).stat().st_size > 1000 for name in ("scene.xml", "surface.ply"))
+    code, output, errors = here("export", "plane", *SET_SMALL, "--set", "camera.skew=1", "--out", tmp_path / "no")
+    assert (code, output, len(errors)) == (2, "", 1)
+    assert "camera.skew = 1.0: cannot be exported" in errors[0]
+    assert not (tmp_path / "no").exists()
+    plain = tmp_path / "plain"
+    plain.write_text("mine")
+    code, output, errors = here("export", "plane", *SET_SMALL, "--out", plain)
+    assert (code, output, errors) == (2, "", [f"simtest: --out {plain}: is a file; must be a folder"])
+
+
+@pytest.mark.render
 def test_a_scene_out_of_sight(here):
     code, output, errors = here("render", "sphere", *SET_SMALL, "--set", "camera.cx=1e6", "--out", "x")
     assert (code, output) == (2, "")
@@ -297,6 +313,22 @@ def test_an_unknown_variant_exits_1(here, monkeypatch, variable):
     code, output, errors = here("render", "plane", *SET_SMALL, "--out", "x", *given)
     assert (code, output, len(errors)) == (1, "", 1)
     assert "variant 'scalar_mono': cannot be used; allowed: " in errors[0]
+
+
+def test_a_stopped_render_writes_nothing(here, monkeypatch, tmp_path):
+    """Ctrl-C waits for the end of a step."""
+
+    def render(scene, settings, variant, progress):
+        progress(1, 10, "rendering")
+        os.kill(os.getpid(), signal.SIGINT)
+        progress(2, 10, "rendering")
+        raise AssertionError("not stopped")
+
+    monkeypatch.setattr(api, "render", render)
+    code, output, errors = here("render", "plane", "--out", tmp_path / "frame")
+    assert (code, output) == (130, "")
+    assert errors[-1] == "simtest: stopped; nothing is written"
+    assert not (tmp_path / "frame").exists()
 
 
 # Validation ------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 
 import simtest
+from simtest.calibration import NoiseModel
 from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
@@ -83,9 +84,11 @@ def test_what_a_killed_run_left_is_swept_away(tmp_path):
     assert not any(file.exists() for file in leftovers)
 
 
-def test_a_set_value_below_a_swept_table_is_refused():
+def test_a_set_value_below_a_swept_table_is_refused(tmp_path):
+    file = tmp_path / "tables.toml"
+    file.write_text('[[groups]]\nscene = "plane"\nsweep = [{ reflectance = [{ type = "phong" }] }]\n')
     with pytest.raises(InputError, match=r"--set reflectance.diffuse: the experiment varies reflectance as a whole"):
-        load_experiment("reflectance", {"reflectance.diffuse": 0.2})
+        load_experiment(file, {"reflectance.diffuse": 0.2})
 
 
 def test_a_set_table_takes_the_place_of_sweeps_below_it():
@@ -108,7 +111,7 @@ def spot(x, lit):
 def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     y, x = np.mgrid[:60, :80] + 0.5
     radiance = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 50).astype(np.float32)
-    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, 0.0, 1.0)
+    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, NoiseModel(), 1.0)
     assert [j.why_not for j in judged] == ["in shadow", ""]
 
 

@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import binary_dilation, label
+from skimage.measure import find_contours
 
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import Patch, ellipse_of_conic, fit_ellipse, smooth
-from simtest.geometry.isophotes import encloses, polygon_area
+from simtest.geometry.isophotes import encloses
 
 WIDTH, HEIGHT = 90, 70
 CENTRE = np.array([41.3, 33.8])
@@ -79,18 +83,86 @@ def test_a_given_peak_and_the_brightest_pixel():
     np.testing.assert_allclose(points.mean(axis=0), [25, 35], atol=0.2)
 
 
-def test_the_enclosing_contour_is_chosen_the_largest_of_several():
-    """A bump beside the peak and a dent at its side make contours that do not enclose it."""
+def test_the_isophote_is_the_outer_border_of_the_region_that_holds_the_peak():
+    """A bump beside the peak has a border of its own."""
     image = spot((45, 35), 10) + 0.55 * spot((12, 12), 3)
     points = patch_of(image).isophote(0.5)
     assert encloses(points, np.array([45, 35.0]))
     np.testing.assert_allclose(points.mean(axis=0), [45, 35], atol=0.3)
-    # A ring around the peak: the level is crossed three times, the outermost crossing is the isophote.
+    # Of a ring around the peak with a dark trench between them, the peak's own border is taken ...
     x, y = centres()
     radius = np.hypot(x - 45, y - 35)
     ring = (np.exp(-(radius**2) / 18) + 0.8 * np.exp(-((radius - 15) ** 2) / 8)).astype(np.float32)
-    outermost = patch_of(ring, None, (44, 34)).isophote(0.5)
-    assert np.hypot(*(outermost - [45, 35]).T).min() > 15
+    assert np.hypot(*(patch_of(ring, None, (44, 34)).isophote(0.5) - [45, 35]).T).max() < 6
+    # ... and of a region with a dark hole the outer one.
+    holed = spot((45, 35), 10)
+    holed[36:39, 41:43] = 0
+    np.testing.assert_array_equal(patch_of(holed).isophote(0.5), patch_of(spot((45, 35), 10)).isophote(0.5))
+
+
+@given(number=st.integers(0, 2**32 - 1), t=st.floats(0.05, 0.95), width=st.floats(0.6, 3.0))
+def test_crossings_are_the_points_of_marching_squares(number, t, width):
+    """On noise alone, where regions have holes, corners that touch and neighbours of all kinds."""
+    rng = np.random.default_rng(number)
+    image = smooth(rng.standard_normal((40, 50)), width) + 0.2 * smooth(spot()[:40, :50], width)
+    patch = patch_of(image, (0, 0, 50, 40))
+    if isinstance(patch, Failure):
+        return
+    polygon, points = patch.isophote(t), patch.crossings(t)
+    contours = [c[:, ::-1] + 0.5 for c in find_contours(patch.values.astype(float), t * patch.peak_value)]
+    around = [c for c in contours if (c[0] == c[-1]).all() and encloses(c, np.array(patch.peak_pixel) + 0.5)]
+    if isinstance(points, Failure):
+        # The region reaches the border: no closed contour is its outer border.
+        reached = level_reaches_border(patch.values > t * patch.peak_value, patch.peak_pixel)
+        assert isinstance(polygon, Failure)
+        assert reached
+        return
+    assert any(same_points(c[:-1], points) for c in around)
+    assert same_points(polygon[:-1], points)
+    assert (polygon[0] == polygon[-1]).all()
+
+
+@given(
+    number=st.integers(0, 2**32 - 1), t=st.floats(0.2, 0.9), x=st.floats(5, 45), y=st.floats(5, 35),
+    radius=st.floats(4, 40),
+)  # fmt: skip
+def test_a_region_that_meets_what_is_not_seen_is_not_closed(number, t, x, y, radius):
+    """Those of marching squares over the cells whose four corners are seen."""
+    rng = np.random.default_rng(number)
+    image = smooth(rng.standard_normal((40, 50)), 1.5) + 0.4 * smooth(spot()[:40, :50], 1.5)
+    columns, rows = np.meshgrid(np.arange(50) + 0.5, np.arange(40) + 0.5)
+    seen = np.hypot(columns - x, rows - y) <= radius
+    image[~seen] = 0 if number % 2 else 5  # whatever lies there
+    row, column = np.unravel_index(np.where(seen, image, -np.inf).argmax(), image.shape)
+    patch = Patch.cut(image, (0, 0, 50, 40), (column, row), seen=seen)
+    if isinstance(patch, Failure):
+        return
+    contours = find_contours(patch.values.astype(float), t * patch.peak_value, mask=seen)
+    centre = np.array(patch.peak_pixel, dtype=float)
+    around = [c[:, ::-1] for c in contours if (c[0] == c[-1]).all() and encloses(c[:, ::-1], centre)]
+    points = patch.crossings(t)
+    if isinstance(points, Failure):
+        above = (patch.values > t * patch.peak_value) & seen
+        labels, _ = label(above)
+        own = binary_dilation(labels == labels[row, column], np.ones((3, 3)))
+        assert (own & ~seen).any() or level_reaches_border(above, patch.peak_pixel)
+        assert np.array_equal(patch.inside(t), seen)
+        return
+    assert any(same_points(c[:-1] + 0.5, points) for c in around)
+    assert seen[patch.inside(t)].all()
+
+
+def same_points(first, second):
+    if len(first) != len(second):
+        return False
+    order = [np.lexsort(np.round(p, 6).T) for p in (first, second)]
+    return bool(np.allclose(first[order[0]], second[order[1]], atol=1e-9))
+
+
+def level_reaches_border(above, pixel):
+    labels, _ = label(above)
+    own = labels == labels[pixel[1], pixel[0]]
+    return bool(own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any())
 
 
 def test_open_contours_fail():
@@ -149,10 +221,8 @@ def test_smoothing_keeps_the_place_and_adds_the_variances():
     assert float(smoothed.sum()) == pytest.approx(float(spot().sum()), rel=1e-4)
 
 
-def test_area_and_even_odd_rule():
+def test_even_odd_rule():
     square = np.array([[0.0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]) + 5000
-    assert polygon_area(square) == pytest.approx(12)
-    assert polygon_area(square[::-1]) == pytest.approx(-12)
     assert encloses(square, np.array([5001.0, 5001]))
     assert not encloses(square, np.array([5005.0, 5001]))
     assert not encloses(square, np.array([4999.0, 5001]))

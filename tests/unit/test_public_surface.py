@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PUBLIC = {
     "BackendError": "simtest.errors",
     "BrownConrady": "simtest.geometry.distortion",
+    "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.base",
     "Experiment": "simtest.spec.experiment",
@@ -28,6 +29,8 @@ PUBLIC = {
     "SimtestError": "simtest.errors",
     "Specularity": "simtest.reconstruction",
     "ViewMask": "simtest.geometry.camera",
+    "export": "simtest.api",
+    "load_calibration": "simtest.spec.calibration",
     "load_camera": "simtest.spec.camera",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",

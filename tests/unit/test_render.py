@@ -141,30 +141,23 @@ def test_normals_are_those_of_the_formula_at_every_pixel(session, name):
 @pytest.mark.parametrize("normalised", [False, True])
 def test_radiance_is_that_of_the_formula(session, name, lights, normalised):
     surface, formula = SHAPES[name]
-    reflectance = {"exponent": 30.0, "specular": 0.7, "diffuse": 0.4, "normalised": normalised}
+    reflectance = {"exponent": 30.0, "specular": 0.6, "diffuse": 0.4, "normalised": normalised}
     session.update(scene(surface, lights, reflectance))
     radiance = session.radiance()
     P, N = formula()
     expected = [0.0, 0.0]
     for light in lights:
         place = light.get("position_mm", (0.0, 0.0, 0.0))
-        parts = phong(P, N, place, light.get("power", 1.0), 30.0, 0.7, 0.4, normalised)
+        parts = phong(P, N, place, light.get("power", 1.0), 30.0, 0.6, 0.4, normalised)
         expected = [total + part for total, part in zip(expected, parts, strict=True)]
     compared = 0
     for part, formula_part in zip((radiance.specular, radiance.diffuse), expected, strict=True):
         assert part.dtype == np.float32
         assert part.shape == (120, 160)
         bright = np.nan_to_num(formula_part) > 1e-3 * np.nanmax(formula_part)
-        grazing = np.zeros(bright.shape, dtype=bool)
-        for place in ((0.0, 0.0, 0.0), *(light.get("position_mm", (0.0, 0.0, 0.0)) for light in lights)):
-            cosine = np.sum(N * (place - P), axis=-1) / np.linalg.norm(place - P, axis=-1)
-            bright &= cosine > 0.02
-            grazing |= cosine < 0.1
         compared += np.count_nonzero(bright)
-        # At grazing light or view the normal's absolute error, 1e-5 in single precision there, weighs more.
-        share = np.where(grazing, 1e-3, 1e-4)[bright]
         # The specular part is a difference: its rounding is that of the whole.
-        allowed = share * formula_part[bright] + 1e-7 * np.nanmax(sum(expected))
+        allowed = 1e-4 * formula_part[bright] + 1e-7 * np.nanmax(sum(expected))
         assert (np.abs(part[bright] - formula_part[bright]) < allowed).all()
     assert compared > 1000
     np.testing.assert_array_equal(radiance.indirect, 0)
@@ -354,7 +347,8 @@ def test_phong_samples_have_the_density_they_claim(session):
     import drjit as dr
 
     mi = session.mi
-    reflectance = scene({}, reflectance={"exponent": 12.0, "diffuse": 0.6, "normalised": True}).reflectance
+    settings = {"exponent": 12.0, "specular": 0.4, "diffuse": 0.6, "normalised": True}
+    reflectance = scene({}, reflectance=settings).reflectance
     bsdf = mi.load_dict(bsdf_dict(reflectance, session.plugin, diffuse_only=False))
     count = 200_000
     si = dr.zeros(mi.SurfaceInteraction3f, count)
@@ -373,7 +367,7 @@ def test_phong_samples_have_the_density_they_claim(session):
     sine = np.sqrt(1 - z**2)
     wo = np.stack([sine * np.cos(a), sine * np.sin(a), z], axis=-1).reshape(-1, 3)
     beta = np.maximum(wo @ [-np.sin(0.6), 0, np.cos(0.6)], 0)
-    lobe = 14 / (2 * np.pi) * beta**12 * wo[:, 2] + 0.6 / np.pi * wo[:, 2]
+    lobe = 0.4 * 14 / (2 * np.pi) * beta**12 * wo[:, 2] + 0.6 / np.pi * wo[:, 2]
     directions = np.array(sample.wo).T
     for g in (lambda w: np.ones(len(w)), lambda w: w[:, 0], lambda w: w[:, 2]):
         integral = 2 * np.pi * np.mean(lobe * g(wo))

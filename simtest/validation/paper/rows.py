@@ -1,21 +1,28 @@
 """Rows of results for realisations of the published protocol."""
 
+import itertools
+from functools import lru_cache, partial
 from typing import Any
+
+import numpy as np
+import polars as pl
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.checked import one_by_one
+from simtest.estimators.circle_pose import circle_poses
 from simtest.seeds import from_integer
 from simtest.spec.paper import PaperSetting
-from simtest.validation.metrics import angle_deg
+from simtest.validation.metrics import SCHEMA, angle_deg
 from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.smoothing import smoothing_bias
 
 SURFACE = "published plane"
 
 
 def paper_rows(
     setting: PaperSetting, common: dict[str, Any], numbers: range, seeds: list[int], estimators: tuple[str, ...]
-) -> list[dict[str, Any]]:
+) -> pl.DataFrame:
     """Make the rows of some realisations of one setting; runs in any process.
 
     Parameters
@@ -33,42 +40,64 @@ def paper_rows(
 
     Returns
     -------
-    list of dict
-        In the order of the realisations.
+    polars.DataFrame
+        Columns of `metrics.SCHEMA` and of `common`, in the order of the realisations.
     """
-    loaded = load_estimators(estimators)
-    if "circle_pose" in loaded:
-        loaded["circle_pose"] = lambda patch, camera: circle_pose(patch, camera, setting.isovalue)
-    pipeline = Pipeline(setting, loaded)
+    pipeline = pipeline_with(setting, estimators)
+    made = pipeline.realise(from_integer(seed) for seed in seeds)
     shared = {**common, "surface": SURFACE, "reflectance": "phong", "noise_sigma": setting.sigma, "n_lights": 1}
     shared |= dict(zip(("truth_x", "truth_y", "truth_z"), setting.normal.tolist(), strict=True))
-    rows = []
-    for number, seed in zip(numbers, seeds, strict=True):
-        for name, result in pipeline.realise(from_integer(seed)).items():
-            row = {**shared, "realisation": number, "specularity": 0, "true_id": 0, "seed": seed, "estimator": name}
-            rows.append(row | _result(setting, result))
-    return rows
+    shared |= {"specularity": 0, "true_id": 0}
+    bias = smoothing_bias(setting)
+    law_deg = {"circle_pose": None if bias is None else float(np.degrees(bias))}
+    tables = []
+    for name, results in made.items():
+        own = {**shared, "estimator": name, "error_law_deg": law_deg.get(name)}
+        columns = {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}
+        table = pl.DataFrame(columns, schema_overrides=SCHEMA)
+        tables.append(table.with_columns(**{column: pl.lit(value) for column, value in own.items()}))
+    return pl.concat(tables, how="vertical_relaxed").sort("realisation", maintain_order=True)
 
 
-def _result(setting: PaperSetting, result: Estimate | Failure) -> dict[str, Any]:
-    if isinstance(result, Failure):
-        return {"status": str(result.reason), "flags": result.detail}
-    to_truth = angle_deg(result.candidates, setting.normal)
-    isovalues = [isophote.isovalue for isophote in result.isophotes]
-    proposed = float(angle_deg(result.normal, setting.normal))
-    return {
-        "status": "ok",
-        "flags": ",".join(result.flags),
+@lru_cache(maxsize=2)
+def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
+    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue; the last two are kept."""
+    batched = {name: one_by_one(estimator) for name, estimator in load_estimators(estimators).items()}
+    if "circle_pose" in batched:
+        batched["circle_pose"] = partial(circle_poses, isovalue=setting.isovalue)
+    return Pipeline(setting, batched)
+
+
+def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[str, Any]:
+    """Give the columns that differ between the rows of one estimator; null where it failed."""
+    ok = [result for result in results if isinstance(result, Estimate)]
+    # All candidates of all estimates in one go; an estimator may give more of them here and fewer there.
+    ends = np.cumsum([0, *(len(estimate.candidates) for estimate in ok)]).tolist()
+    every = angle_deg(np.concatenate([e.candidates for e in ok] or [np.empty((0, 3))]), setting.normal).tolist()
+    errors = [every[first:end] for first, end in itertools.pairwise(ends)]
+    proposed = angle_deg(np.array([e.normal for e in ok]).reshape(-1, 3), setting.normal).tolist()
+    isovalues = [[isophote.isovalue for isophote in estimate.isophotes] for estimate in ok]
+    columns: dict[str, list[Any]] = {
         "error_deg": proposed,
-        "error_oracle_deg": float(to_truth.min()),
+        "error_oracle_deg": [min(own) for own in errors],
         # The plane's normal is the same wherever the estimate looks.
         "error_look_deg": proposed,
-        "rank_correct": int(to_truth.argmin()),
-        "n_candidates": len(result.candidates),
-        "look_x_px": float(result.look_px[0]),
-        "look_y_px": float(result.look_px[1]),
-        "isovalue": isovalues[0] if len(isovalues) == 1 else None,
-        "isovalues": ",".join(f"{t:g}" for t in isovalues) or None,
-        "axis_ratio": result.axis_ratio,
-        **dict(zip(("normal_x", "normal_y", "normal_z"), result.normal.tolist(), strict=True)),
+        "rank_correct": [own.index(min(own)) for own in errors],
+        "n_candidates": [len(own) for own in errors],
+        "look_x_px": [float(e.look_px[0]) for e in ok],
+        "look_y_px": [float(e.look_px[1]) for e in ok],
+        "isovalue": [t[0] if len(t) == 1 else None for t in isovalues],
+        "isovalues": [",".join(f"{value:g}" for value in t) or None for t in isovalues],
+        "axis_ratio": [e.axis_ratio for e in ok],
     }
+    columns |= {f"normal_{axis}": [float(e.normal[i]) for e in ok] for i, axis in enumerate("xyz")}
+    status = ["ok" if isinstance(r, Estimate) else str(r.reason) for r in results]
+    flags = [",".join(r.flags) if isinstance(r, Estimate) else r.detail for r in results]
+    answered = [isinstance(result, Estimate) for result in results]
+    return {"status": status, "flags": flags} | {name: _spread(answered, v) for name, v in columns.items()}
+
+
+def _spread(answered: list[bool], values: list[Any]) -> list[Any]:
+    """Put the values of the answered rows into all rows."""
+    given = iter(values)
+    return [next(given) if present else None for present in answered]

@@ -1,0 +1,168 @@
+"""The renderer: labelled frames against Mitsuba's own integrators, updates, first frames and memory.
+
+The scene is the generated colon, 200,000 triangles, seen at 640 x 480 with 16 samples a pixel or one. The reference is
+Mitsuba's `direct` nested in `aov`, on the same scene, with the labels that it knows: depth, position, both normals,
+shape and triangle; and with the box filter, which is its fastest.
+"""
+
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measuring import Figure, in_turns
+from simtest.rendering import Session
+from simtest.spec import Scene, scene_from_dict
+
+ROUNDS = 7
+OFFSET_MM = 3.0
+FRAMES = 1000
+AOVS = "d:depth,p:position,s:sh_normal,g:geo_normal,i:shape_index,f:prim_index"
+
+
+def _scene(samples: int = 16, light: dict[str, Any] | None = None, exponent: float = 50.0, fx: float = 400.0) -> Scene:
+    return scene_from_dict(
+        {
+            "surface": {"type": "anatomy", "path": "colon"},
+            "reflectance": {"type": "phong", "exponent": exponent, "diffuse": 0.3},
+            "rig": {"lights": [light or {}]},
+            "camera": {"width": 640, "height": 480, "fx": fx, "fy": 400.0},
+            "render": {"samples_per_pixel": samples},
+        }
+    )
+
+
+def _reference(session: Session, samples: int) -> Callable[[], object]:
+    """Give the function that renders the session's scene by Mitsuba."""
+    mi, camera = session.mi, session.camera
+    pose = session.surface.model_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    film = {
+        "type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"},
+        "pixel_format": "luminance",
+    }  # fmt: skip
+    sensor = mi.load_dict(
+        {
+            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
+            "fov_axis": "x", "near_clip": 1e-2, "far_clip": 1e4, "film": film,
+            "to_world": mi.ScalarTransform4f(pose.tolist()),
+        }
+    )  # fmt: skip
+    integrator = mi.load_dict({"type": "aov", "aovs": AOVS, "image": {"type": "direct"}})
+    assert session._built is not None
+    scene = session._built.scene
+    return lambda: np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=1))
+
+
+def figures() -> list[Figure]:
+    """Give the figures."""
+    session = Session(_scene(), labelled=True)
+    return [*_frames(session), _updates(session), _compiled(session), _first_frame(), _memory(session)]
+
+
+def _frames(session: Session) -> Iterator[Figure]:
+    """Compare frames in turns: labelled and, for 16 samples at the camera, without labels."""
+    limits = {(16, 0.0): 3.0, (16, OFFSET_MM): 1.8, (1, 0.0): 3.0, (1, OFFSET_MM): 1.8}
+    for (samples, offset), limit in limits.items():
+        session.update(_scene(samples, {"offset_mm": offset}))
+        functions: dict[str, Callable[[], object]] = {
+            "mitsuba": _reference(session, samples),
+            "labelled": session.frame,
+        }
+        functions["radiance"] = session.radiance
+        times = in_turns(functions, ROUNDS)
+        name = f"{samples} sample{'s' if samples > 1 else ''}, light {'aside' if offset else 'at the camera'}"
+        about = ", ".join(f"{key} {1e3 * value:.0f} ms" for key, value in times.items())
+        yield Figure(f"labelled frame: {name}", times["mitsuba"] / times["labelled"], limit, True, "x", about)
+        if (samples, offset) == (16, 0.0):
+            yield Figure(f"radiance alone: {name}", times["mitsuba"] / times["radiance"], 3.5, True, "x", about)
+
+
+def _updates(session: Session) -> Figure:
+    """Time an update of light, camera and reflectance together against a frame."""
+    scenes = [_scene(16, {"offset_mm": 1 + 0.1 * i}, 40.0 + i, 390.0 + i) for i in range(20)]
+
+    def update() -> None:
+        for scene in scenes:
+            session.update(scene)
+
+    times = in_turns({"updates": update, "frame": session.frame}, ROUNDS)
+    one = times["updates"] / len(scenes)
+    about = f"update {1e3 * one:.2f} ms, frame {1e3 * times['frame']:.0f} ms"
+    return Figure("update of light, camera and reflectance", 100 * one / times["frame"], 1.0, False, "%", about)
+
+
+def _compiled(session: Session) -> Figure:
+    """Count the kernels that a sweep compiles after its first frame."""
+    import drjit as dr
+
+    def sweep(i: int) -> None:
+        profile = {"type": "cosine", "power": 1.0 + 0.3 * i}
+        light = {"offset_mm": 1 + 0.1 * i, "power": 1.0 + i, "profile": profile, "direction": [0.01 * i, 0, 1]}
+        session.update(_scene(4, light, 40.0 + i, 390.0 + i))
+        session.frame()
+
+    sweep(0)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for i in range(1, 11):
+            sweep(i)
+        launched = dr.kernel_history((dr.KernelType.JIT,))
+    missed = sum(not kernel["cache_hit"] for kernel in launched)
+    return Figure("kernels compiled after a sweep's first frame", missed, 0, False, "", f"{len(launched)} launched")
+
+
+def _first_frame() -> Figure:
+    """Compare the first frame of a fresh process, whose kernels are on disk, with its later ones."""
+    script = "from benchmarks.rendering import first_frame; first_frame()"
+    ratios: list[tuple[float, float]] = []
+    for _ in range(4):
+        child = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1]
+        )
+        ratios.append(tuple(json.loads(child.stdout)))
+    # The first child fills the cache.
+    first, steady = (statistics.median(values) for values in zip(*ratios[1:], strict=True))
+    about = f"first {1e3 * first:.0f} ms, later {1e3 * steady:.0f} ms"
+    return Figure("first frame of a process, kernels on disk", first / steady, 2.0, False, "x", about)
+
+
+def first_frame() -> None:
+    """Print the time of the first labelled frame of this process, and the median of the next, s."""
+    session = Session(_scene(), labelled=True)
+    times = []
+    for _ in range(6):
+        start = time.perf_counter()
+        session.frame()
+        times.append(time.perf_counter() - start)
+    print(json.dumps([times[0], statistics.median(times[1:])]))
+
+
+def _memory(session: Session) -> Figure:
+    """Compare the resident memory before and after many labelled frames of a moving light."""
+
+    def render(count: int) -> None:
+        for i in range(count):
+            session.update(_scene(1, {"offset_mm": 1 + 1e-3 * i}, 50.0 + 0.01 * i))
+            session.frame()
+
+    render(50)
+    before = resident_bytes()
+    render(FRAMES)
+    after = resident_bytes()
+    about = f"{before / 2**20:.0f} MiB before, {after / 2**20:.0f} MiB after"
+    return Figure(f"memory gained over {FRAMES} frames", 100 * (after / before - 1), 2.0, False, "%", about)
+
+
+def resident_bytes() -> int:
+    """Give the resident memory of this process; where the system does not tell, its peak."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,67 @@
+"""The noise of a linear frame as a function of its level."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.calibration.response import Response
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """White, shot, read and quantisation noise of one channel; level and noise are shares of full scale.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of white noise.
+    full_well : float, optional
+        Electrons at full scale; their number is Poisson distributed. Default: no shot noise.
+    read_noise : float
+        Standard deviation, electrons; needs `full_well`.
+    bits : int, optional
+        Of the values; default: not quantised.
+    response : Response
+        The curve before quantisation: it sets the light between two values.
+    """
+
+    sigma: float = 0.0
+    full_well: float | None = None
+    read_noise: float = 0.0
+    bits: int | None = None
+    response: Response = field(default_factory=Response)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether there is no noise at any level."""
+        return self.sigma == 0 and self.full_well is None and self.bits is None
+
+    def at(self, level: npt.ArrayLike, channels: int = 1) -> npt.NDArray[np.float64]:
+        """Give the standard deviation at a level.
+
+        Parameters
+        ----------
+        level : array_like, shape (...)
+            Linear light without noise, share of full scale.
+        channels : int
+            How many channels of that mean level are averaged; their noise is independent.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            sqrt((sigma^2 + level/full_well + (read_noise/full_well)^2 + step^2/12) / channels), with step the light
+            between two neighbouring values.
+        """
+        x = np.asarray(level, dtype=float)
+        if self.full_well is None and self.bits is None:
+            return np.full(x.shape, self.sigma / np.sqrt(channels))
+        variance = np.full(x.shape, self.sigma**2)
+        if self.full_well is not None:
+            variance = variance + np.maximum(x, 0) / self.full_well + (self.read_noise / self.full_well) ** 2
+        if self.bits is not None:
+            half = 0.5 / (2**self.bits - 1)
+            value = self.response.encode(np.clip(x, 0, 1))
+            above, below = (self.response.decode(np.clip(value + d, 0, 1)) for d in (half, -half))
+            variance = variance + (above - below) ** 2 / 12
+        return np.asarray(np.sqrt(variance / channels))

@@ -1,0 +1,84 @@
+"""The response of a camera: how light, a share of full scale, becomes a value, a share of the largest one."""
+
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+
+Array = TypeVar("Array", npt.NDArray[np.float32], npt.NDArray[np.float64])
+
+
+def srgb_encode(linear: Array) -> Array:
+    """Give the sRGB-encoded values of linear ones in [0, 1] (IEC 61966-2-1); the type of the array is kept."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def srgb_decode(encoded: Array) -> Array:
+    """Give the linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1); the type of the array is kept."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+@dataclass(frozen=True)
+class Response:
+    """A rising curve from light 0, value 0 to light 1, value 1.
+
+    Parameters
+    ----------
+    kind : {"linear", "gamma", "srgb", "table"}
+        Which curve.
+    gamma : float
+        For "gamma": value = light^(1/gamma).
+    light, value : tuple of float
+        For "table": points of the curve, linear between them; both rise from 0 to 1.
+
+    Raises
+    ------
+    InputError
+        If gamma is not positive or the table is malformed.
+    """
+
+    kind: Literal["linear", "gamma", "srgb", "table"] = "linear"
+    gamma: float = 1.0
+    light: tuple[float, ...] = ()
+    value: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("linear", "gamma", "srgb", "table"):
+            raise InputError(f"response kind = {self.kind!r}: must be linear, gamma, srgb or table")
+        if not (np.isfinite(self.gamma) and self.gamma > 0):
+            raise InputError(f"response gamma = {self.gamma!r}: must be a finite number > 0")
+        if self.kind == "table":
+            check_table(self.light, self.value)
+
+    def encode(self, light: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Give the values of light, any shape; light outside [0, 1] is clipped, unless the curve is linear."""
+        x = np.asarray(light, dtype=float)
+        if self.kind == "linear":
+            return x
+        x = np.clip(x, 0.0, 1.0)
+        if self.kind == "gamma":
+            return np.asarray(x ** (1 / self.gamma))
+        return srgb_encode(x) if self.kind == "srgb" else np.asarray(np.interp(x, self.light, self.value))
+
+    def decode(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Give the light of values, any shape: the inverse of `encode`."""
+        y = np.asarray(values, dtype=float)
+        if self.kind == "linear":
+            return y
+        y = np.clip(y, 0.0, 1.0)
+        if self.kind == "gamma":
+            return np.asarray(y**self.gamma)
+        return srgb_decode(y) if self.kind == "srgb" else np.asarray(np.interp(y, self.value, self.light))
+
+
+def check_table(light: tuple[float, ...], value: tuple[float, ...]) -> None:
+    """Raise `InputError` where the points of a curve do not both rise from 0 to 1."""
+    if len(light) != len(value):
+        raise InputError(f"value has {len(value)} entries, light {len(light)}; must be as many")
+    for name, points in (("light", light), ("value", value)):
+        steps = np.diff(points)
+        if len(points) < 2 or points[0] != 0 or points[-1] != 1 or not (steps > 0).all():
+            raise InputError(f"{name} = {list(points)}: must rise from 0 to 1, each more than the one before")

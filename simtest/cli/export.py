@@ -1,0 +1,20 @@
+"""`simtest export`."""
+
+from simtest.cli.options import Out, Settings, Variant
+
+
+def export(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
+    """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh.
+
+    Parameters
+    ----------
+    scene : str
+        A scene file, or the name of a shipped scene.
+    """
+    from simtest import api
+    from simtest.files import refuse_file
+    from simtest.spec import parse_settings
+
+    refuse_file(out)
+    for file in api.export(scene, out, parse_settings(settings or []), variant):
+        print(file)

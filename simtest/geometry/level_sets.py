@@ -1,0 +1,106 @@
+"""The region above a level around a pixel, and where its outer border crosses the lines between pixel centres.
+
+These are the points of marching squares, whose contours are the region's border; a fit needs no order among them,
+and without it they are found several times faster than by tracing.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from skimage.measure import find_contours
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+_ABOVE, _REGION, _OUTSIDE = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """A 4-connected region of pixels above a level, its holes filled, with one pixel of margin on all sides.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, w)
+        Intensities.
+    inside : ndarray of bool, shape (h, w)
+        The region; the outermost rows and columns are outside of it.
+    level : float
+        The level.
+    corner : tuple of int
+        Column and row of the first pixel in the array that the region was found in.
+    """
+
+    values: Image | Array
+    inside: Mask
+    level: float
+    corner: tuple[int, int]
+
+    def crossings(self) -> Array:
+        """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
+
+        Those between horizontal neighbours first, row by row, then those between vertical ones.
+        """
+        width = self.inside.shape[1]
+        rows, columns = np.divmod(np.flatnonzero(self.inside[:, 1:] != self.inside[:, :-1]), width - 1)
+        first = rows * width + columns
+        below = np.flatnonzero(self.inside[1:] != self.inside[:-1])
+        rows_down, columns_down = np.divmod(below, width)
+        # Where the level lies between two neighbours, 0 at the first and 1 at the next.
+        values = np.ravel(self.values)
+        start = values[np.concatenate([first, below])].astype(float)
+        end = values[np.concatenate([first + 1, below + width])]
+        share = (self.level - start) / (end - start)
+        across = len(first)
+        points = np.empty((len(share), 2))
+        points[:across, 0], points[:across, 1] = columns + share[:across], rows
+        points[across:, 0], points[across:, 1] = columns_down, rows_down + share[across:]
+        points += self.corner
+        return points
+
+    def polygon(self) -> Array:
+        """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred."""
+        above = np.nextafter(self.level, np.inf)
+        values = self.values.astype(float)
+        clean = np.where(self.inside, np.maximum(values, above), np.minimum(values, self.level))
+        return np.asarray(find_contours(clean, self.level)[0][:, ::-1] + self.corner)
+
+
+def level_set_around(
+    values: Image | Array, pixel: tuple[int, int], level: float, seen: Mask | None = None
+) -> LevelSet | None:
+    """Find the region above a level that holds a pixel.
+
+    Parameters
+    ----------
+    values : ndarray, shape (H, W)
+        Finite intensities.
+    pixel : tuple of int
+        Column and row; its value lies above the level.
+    level : float
+        The level.
+    seen : ndarray of bool, shape (H, W), optional
+        Where the values are known; default everywhere.
+
+    Returns
+    -------
+    LevelSet or None
+        None where the region reaches the array's border or a pixel that is not seen, across a corner too: its own
+        border is not closed then.
+    """
+    marks = (values > level if seen is None else (values > level) & seen).view(np.uint8)
+    # Low values are connected across corners, high ones are not, as in marching squares for an ambiguous cell.
+    _, _, _, (x, y, width, height) = cv2.floodFill(marks, None, pixel, _REGION, flags=4)
+    rows, columns = marks.shape
+    if x == 0 or y == 0 or x + width == columns or y + height == rows:
+        return None
+    box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
+    around = np.where(marks[box] == _REGION, np.uint8(_REGION), np.uint8(0))
+    if seen is not None and (cv2.dilate(around, _NEIGHBOURS) > 0)[~seen[box]].any():
+        return None
+    cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
+    return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))

@@ -1,0 +1,206 @@
+"""How lights emit, as Dr.Jit expressions, and as a Mitsuba emitter for the integrators that follow bounces.
+
+Both use one function, so that direct light and inter-reflections come from the same lights.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from simtest.rendering.spectrum import spectrum
+from simtest.spec.profile import CosineProfile, TableProfile
+from simtest.spec.rig import LightSpec
+
+PLUGIN = "simtest_light"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What of a light is compiled into the kernel; all else is a parameter.
+
+    Parameters
+    ----------
+    profile : {"uniform", "cosine", "table"}
+        Form of the angular profile.
+    entries : int
+        Of the table; 0 without one.
+    spot : bool
+        Whether the emission is cut off.
+    plain : bool
+        Whether Mitsuba's own point light is the same light.
+    """
+
+    profile: str
+    entries: int
+    spot: bool
+    plain: bool
+
+
+def kind_of(light: LightSpec) -> Kind:
+    """Give the kind of a light."""
+    plain = light.is_isotropic and len(set(light.colour)) == 1
+    match light.profile:
+        case TableProfile():
+            return Kind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain)
+        case CosineProfile():
+            uniform = light.profile.power == 0
+            return Kind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain)
+
+
+def parameters(mi: Any, light: LightSpec, place: Any, axis: Any) -> dict[str, Any]:
+    """Give the values of the emitter's parameters by name.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    light : LightSpec
+        The light.
+    place, axis : ndarray, shape (3,)
+        In the model frame; mm and unit.
+
+    Returns
+    -------
+    dict
+    """
+    values = {
+        "position": mi.Point3f(*place.tolist()),
+        "axis": mi.Vector3f(*axis.tolist()),
+        "intensity": mi.Spectrum(spectrum(mi, [light.power * c for c in light.colour])),
+        "exponent": mi.Float(light.profile.power if isinstance(light.profile, CosineProfile) else 0.0),
+        "rim": mi.Float(math.radians((light.spot_deg or 360.0) / 2)),
+        "edge": mi.Float(math.radians(light.soft_edge_deg)),
+    }
+    if isinstance(light.profile, TableProfile):
+        values["angles"] = mi.Float(np.radians(light.profile.angle_deg).astype(np.float32))
+        values["values"] = mi.Float(np.array(light.profile.value, dtype=np.float32))
+    return values
+
+
+def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
+    """Give the emission into unit directions away from a light, relative to the axis.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    kind : Kind
+        The light's.
+    values : dict
+        See `parameters`.
+    away : mitsuba.Vector3f
+        Unit directions.
+
+    Returns
+    -------
+    mitsuba.Float
+    """
+    import drjit as dr
+
+    if kind.profile == "uniform" and not kind.spot:
+        return mi.Float(1)
+    axis = values["axis"]
+    cosine, value = dr.dot(axis, away), mi.Float(1)
+    if kind.profile == "cosine":
+        value = dr.select(cosine > 0, dr.maximum(cosine, 0) ** values["exponent"], 0)
+    if kind.profile == "table" or kind.spot:
+        # Not the arc cosine, which loses half of the digits next to the axis.
+        angle = dr.atan2(dr.norm(dr.cross(axis, away)), cosine)
+        if kind.profile == "table":
+            value = _interpolate(mi, values["angles"], values["values"], angle, kind.entries)
+        if kind.spot:
+            inside, edge = values["rim"] - angle, values["edge"]
+            soft = dr.clip(inside / dr.maximum(edge, 1e-12), 0, 1)
+            value *= dr.select(edge > 0, soft, dr.select(inside >= 0, mi.Float(1), mi.Float(0)))
+    return value
+
+
+def _interpolate(mi: Any, knots: Any, values: Any, x: Any, entries: int) -> Any:
+    """Interpolate a table linearly; the last value holds beyond it."""
+    import drjit as dr
+
+    upper = dr.binary_search(1, entries - 1, lambda i: dr.gather(mi.Float, knots, i) < x)
+    low, high = dr.gather(mi.Float, knots, upper - 1), dr.gather(mi.Float, knots, upper)
+    share = dr.clip((x - low) / (high - low), 0, 1)
+    return dr.lerp(dr.gather(mi.Float, values, upper - 1), dr.gather(mi.Float, values, upper), share)
+
+
+def emitter_dict(kind: Kind) -> dict[str, Any]:
+    """Describe a light of a kind to `mi.load_dict`; its parameters are set afterwards."""
+    if kind.plain:
+        return {"type": "point", "intensity": {"type": "uniform", "value": 1.0}}
+    return {"type": PLUGIN, "profile": kind.profile, "entries": kind.entries, "spot": kind.spot}
+
+
+def emitter_values(mi: Any, kind: Kind, light: LightSpec, place: Any, axis: Any) -> dict[str, Any]:
+    """Give what to write into the emitter that `emitter_dict` describes, by parameter (see `parameters`)."""
+    if not kind.plain:
+        values = parameters(mi, light, place, axis)
+        return {name: value for name, value in values.items() if name not in ("angles", "values") or kind.entries}
+    return {"position": mi.Point3f(*place.tolist()), "intensity.value": light.power * light.colour[0]}
+
+
+@cache
+def register(mi: Any, variant: str) -> str:
+    """Register the emitter plugin for a variant, once (see `simtest.rendering.phong.register`)."""
+    mi.register_emitter(PLUGIN, lambda props: _make_class(mi, variant)(props))
+    return PLUGIN
+
+
+@cache
+def _make_class(mi: Any, variant: str) -> Any:
+    import drjit as dr
+
+    class Light(mi.Emitter):
+        """A point light with an angular profile, a cut-off and a colour."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.kind = Kind(props["profile"], props["entries"], props["spot"], False)
+            self.parts: dict[str, Any] = {
+                "position": mi.Point3f(0), "axis": mi.Vector3f(0, 0, 1), "intensity": mi.Spectrum(1),
+                "exponent": mi.Float(0), "rim": mi.Float(dr.pi), "edge": mi.Float(0),
+            }  # fmt: skip
+            if self.kind.entries:
+                self.parts |= {name: dr.zeros(mi.Float, self.kind.entries) for name in ("angles", "values")}
+            self.m_flags = mi.EmitterFlags.DeltaPosition
+            self.parameters_changed()
+
+        def traverse(self, callback: Any) -> None:
+            for name, value in self.parts.items():
+                callback.put(name, value, mi.ParamFlags.NonDifferentiable)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            dr.make_opaque(self.parts)
+
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+            ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
+            towards = self.parts["position"] - it.p
+            squared = dr.squared_norm(towards)
+            ds.p, ds.dist = self.parts["position"], dr.sqrt(squared)
+            ds.d = towards / ds.dist
+            ds.time, ds.pdf, ds.delta = it.time, mi.Float(1), mi.Bool(True)
+            ds.emitter = mi.EmitterPtr(self)
+            emitted = self.parts["intensity"] * factor(mi, self.kind, self.parts, -ds.d)
+            return ds, dr.select(active & (squared > 0), emitted / squared, 0)
+
+        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            emitted = self.parts["intensity"] * factor(mi, self.kind, self.parts, -ds.d)
+            return dr.select(active, emitted / dr.square(ds.dist), 0)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def bbox(self) -> Any:
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return f"Light[{self.kind}]"
+
+    return Light

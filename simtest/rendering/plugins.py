@@ -1,0 +1,26 @@
+"""Mitsuba plugins of simtest, for scenes that Mitsuba loads by itself (see docs/export.md).
+
+One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
+
+    from simtest.rendering.plugins import register; register()
+"""
+
+from simtest.errors import BackendError
+from simtest.rendering import emission, phong
+
+
+def register() -> None:
+    """Register the plugins for Mitsuba's active variant; again for another variant, twice does no harm.
+
+    Raises
+    ------
+    BackendError
+        If no variant is set.
+    """
+    import mitsuba
+
+    variant = mitsuba.variant()
+    if variant is None:
+        raise BackendError("no Mitsuba variant is set; call mitsuba.set_variant before register")
+    phong.register(mitsuba, variant)
+    emission.register(mitsuba, variant)

@@ -1,0 +1,226 @@
+"""Rays through pixels: where each sample lies, in which order pixels are traced, and their sightlines.
+
+The sightlines of a pinhole are made inside the kernel; those of any other camera come from its `unproject`.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.geometry.camera import Camera
+from simtest.rendering.frames import Array
+
+TILE = 4
+"""Pixels along a side of the tiles in which several samples a pixel are traced: neighbours meet the same triangles."""
+
+# The additive recurrence of the plane's generalised golden ratio, as shares of 2^32: any number of first points
+# covers the pixel evenly.
+_STEP_X, _STEP_Y = 0xC13FA9A9, 0x91E10DA5
+
+
+def is_pinhole(camera: Camera) -> bool:
+    """Tell whether a camera's sightlines are those of its matrix K, over the whole frame."""
+    x, y = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
+    points = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = points @ np.linalg.inv(camera.K).T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return np.allclose(camera.unproject(points[..., :2]), rays, rtol=0, atol=1e-12)
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The pixels that one launch of a kernel works on.
+
+    Parameters
+    ----------
+    column, row : mitsuba.UInt32
+        The pixels; beyond the frame where it is no multiple of the tile.
+    shift_x, shift_y : mitsuba.UInt32
+        Random shifts of the pixels' sample points, shares of 2^32.
+    """
+
+    column: Any
+    row: Any
+    shift_x: Any
+    shift_y: Any
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays of one launch.
+
+    Parameters
+    ----------
+    traced : mitsuba.Ray3f
+        Model frame, mm; unit directions.
+    origin, direction : mitsuba.Vector3d
+        The same in double precision.
+    sightline : mitsuba.Vector3f
+        The directions in the camera frame.
+    active : mitsuba.Bool
+        False where the camera has no sightline or the pixel lies outside its round field of view.
+    """
+
+    traced: Any
+    origin: Any
+    direction: Any
+    sightline: Any
+    active: Any
+
+
+class Sightlines:
+    """The rays of a camera at its pose.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    camera : Camera
+        The camera.
+    model_from_camera : ndarray, shape (4, 4)
+        Its pose, mm.
+
+    Attributes
+    ----------
+    camera_from_model : mitsuba.Matrix3f
+        The rotation alone.
+    """
+
+    def __init__(self, mi: Any, camera: Camera, model_from_camera: Array) -> None:
+        import drjit as dr
+
+        self.mi, self.camera = mi, camera
+        self.in_kernel = is_pinhole(camera)
+        self._pose = model_from_camera
+        # Opaque, so that another camera or pose compiles no new kernel.
+        self._origin = mi.Vector3d(*model_from_camera[:3, 3].tolist())
+        self._rotation = mi.Matrix3d(model_from_camera[:3, :3].tolist())
+        self.camera_from_model = mi.Matrix3f(model_from_camera[:3, :3].T.tolist())
+        numbers = {"fx": 1 / camera.fx, "fy": 1 / camera.fy, "cx": camera.cx, "cy": camera.cy, "skew": camera.skew}
+        self._numbers = {name: mi.Float64(value) for name, value in numbers.items()}
+        mask = camera.view_mask
+        # In double precision, to tell as `Camera.seen` does.
+        self._mask = None if mask is None else [mi.Float64(v) for v in (mask.cx, mask.cy, mask.radius**2)]
+        self._width, self._tiles = mi.UInt32(camera.width), mi.UInt32(-(-camera.width // TILE))
+        dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
+        dr.make_opaque(self._mask, self._width, self._tiles)
+
+    @property
+    def tiled_size(self) -> tuple[int, int]:
+        """Height and width of the frame in whole tiles, px."""
+        return -(-self.camera.height // TILE) * TILE, -(-self.camera.width // TILE) * TILE
+
+    def lanes(self, first: int, count: int, tiled: bool, seed: int) -> Lanes:
+        """Give a run of pixels, row by row or tile by tile.
+
+        Parameters
+        ----------
+        first, count : int
+            The run.
+        tiled : bool
+            In tiles, which trace faster, or in rows, which need no sorting afterwards.
+        seed : int
+            Of the sample points; they hang on seed and pixel alone.
+
+        Returns
+        -------
+        Lanes
+        """
+        import drjit as dr
+
+        mi = self.mi
+        start, salt = mi.UInt32(first), mi.UInt32(seed)
+        dr.make_opaque(start, salt)
+        index = dr.arange(mi.UInt32, count) + start
+        if tiled:
+            cell, tile = index & (TILE * TILE - 1), index // (TILE * TILE)
+            tile_row = tile // self._tiles
+            column = (tile - tile_row * self._tiles) * TILE + (cell & (TILE - 1))
+            row = tile_row * TILE + cell // TILE
+        else:
+            row = index // self._width
+            column = index - row * self._width
+        return Lanes(column, row, *mi.sample_tea_32(row * self._width + column, salt))
+
+    def sample(self, lanes: Lanes, number: Any) -> tuple[Any, Any]:
+        """Give the position of the sample of a number within each pixel, px: evenly spread, uniform for each alone."""
+        mi = self.mi
+        x, y = lanes.shift_x + number * mi.UInt32(_STEP_X), lanes.shift_y + number * mi.UInt32(_STEP_Y)
+        # 24 bits are what single precision holds.
+        share = 2.0**-24
+        return mi.Float(lanes.column) + mi.Float(x >> 8) * share, mi.Float(lanes.row) + mi.Float(y >> 8) * share
+
+    def centre(self, lanes: Lanes) -> tuple[Any, Any]:
+        """Give the centres of the pixels, px."""
+        return self.mi.Float(lanes.column) + PIXEL_CENTRE, self.mi.Float(lanes.row) + PIXEL_CENTRE
+
+    def rays(self, x: Any, y: Any) -> Rays:
+        """Give the rays of pixel positions.
+
+        Parameters
+        ----------
+        x, y : mitsuba.Float
+            px.
+
+        Returns
+        -------
+        Rays
+        """
+        import drjit as dr
+
+        mi = self.mi
+        active = mi.Bool(True)
+        if self.in_kernel:
+            n = self._numbers
+            b = (mi.Float64(y) - n["cy"]) * n["fy"]
+            a = (mi.Float64(x) - n["cx"] - n["skew"] * b) * n["fx"]
+            sightline = mi.Vector3d(a, b, 1) / dr.sqrt(a * a + b * b + 1)
+        else:
+            directions = self.camera.unproject(np.stack([np.array(x), np.array(y)], axis=-1).astype(np.float64))
+            seen = np.asarray(np.isfinite(directions).all(axis=-1))
+            # No NaN may enter the renderer.
+            directions = np.where(seen[:, None], directions, [0.0, 0.0, 1.0])
+            sightline, active = mi.Vector3d(np.ascontiguousarray(directions.T)), mi.Bool(seen)
+        if self._mask is not None:
+            cx, cy, squared = self._mask
+            column, row = (mi.Float64(dr.floor(v)) + PIXEL_CENTRE for v in (x, y))
+            active &= dr.square(column - cx) + dr.square(row - cy) <= squared
+        direction = self._rotation @ sightline
+        traced = mi.Ray3f(mi.Point3f(self._origin), mi.Vector3f(direction))
+        return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
+
+    def in_model(self, points_px: Array) -> tuple[Array, Array]:
+        """Give origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
+
+        Outside the round field of view too; NaN where the camera has no sightline.
+        """
+        directions = self.camera.unproject(points_px) @ self._pose[:3, :3].T
+        return np.broadcast_to(self._pose[:3, 3], directions.shape), directions
+
+    def in_view(self, points_px: Array) -> tuple[Array, Array]:
+        """Give origins and directions as `in_model` does; NaN outside the round field of view."""
+        origins, directions = self.in_model(points_px)
+        mask = self.camera.view_mask
+        return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
+
+
+def untile(values: Any, size: tuple[int, int]) -> Any:
+    """Sort channels from tiles into rows.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., N)
+        Tile by tile.
+    size : tuple of int
+        Height and width, px, whole tiles.
+
+    Returns
+    -------
+    ndarray, shape (..., height, width)
+    """
+    height, width = size
+    lead = values.shape[:-1]
+    cells = values.reshape(*lead, height // TILE, width // TILE, TILE, TILE)
+    return np.swapaxes(cells, -3, -2).reshape(*lead, height, width)

@@ -1,0 +1,285 @@
+"""What the article states about its sweeps, what a run measured, and whether the two agree."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from simtest.report.paper import explanations, fits
+from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
+from simtest.report.paper.sweeps import Sweep, SweepFigure
+from simtest.report.style import Array, degrees, number
+
+AGREES, DIFFERS, ABSENT = "agrees", "differs", "not in this run"
+
+ESTIMATOR = "circle_pose"
+"""The article's method; only its sweeps are compared."""
+
+ARTICLE, EXPECTED = "published", "expected here"
+
+MEAN_BELOW_DEG = 1.25
+SLANT_BELOW_DEG = 7.0
+EXPONENT_BELOW_DEG = 1.75
+EXPONENT_SLOPE_DEG = 1e-2
+LEAST_AT = (0.5, 0.6)
+STABLE_TO = 200.0
+"""Figures of [MB, section 3.1]; docs/theory.md, section 2."""
+
+BRANCH_SLOPE = 0.5
+SLOPE_TOLERANCE = 0.05
+STABLE_TOLERANCE = 0.1
+LAW_TOLERANCE = 0.2
+LAW_FROM_PX = 1.0
+FREE = ("smoothing_px",)
+"""Parameters that the article does not state: any fixed value is compared."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A row of the table.
+
+    Parameters
+    ----------
+    sweep, claim, source, rule : str
+        Which sweep; what is stated, by whom, and when it counts as met.
+    measured : str
+        What the run gave; empty where it holds no such sweep.
+    verdict : str
+        `AGREES`, `DIFFERS` or `ABSENT`.
+    because : str
+        Why it differs; empty otherwise.
+    """
+
+    sweep: str
+    claim: str
+    source: str
+    rule: str
+    measured: str
+    verdict: str
+    because: str = ""
+
+
+@dataclass(frozen=True)
+class _Check:
+    """A statement with the sweep it is about and the test of it, which gives the measured text and whether it holds."""
+
+    parameter: str
+    fixed: dict[str, Any]
+    claim: str
+    rule: str
+    test: Callable[[Sweep], tuple[str, bool]]
+    because: Callable[[Sweep], str]
+    source: str = ARTICLE
+    where: str = ""
+
+
+def statements(figures: Sequence[SweepFigure]) -> list[Statement]:
+    """Judge every statement on the sweeps of a run.
+
+    Parameters
+    ----------
+    figures : sequence of SweepFigure
+        The run's sweeps.
+
+    Returns
+    -------
+    list of Statement
+        The article's first, in its order, then those of this project's own analysis that the run has a sweep for.
+    """
+    rows = []
+    for check in _CHECKS:
+        sweep = _find(figures, check)
+        about = PARAMETERS[check.parameter]
+        name = f"{about.words} {about.symbol}" + (f", {check.where}" if check.where else "")
+        if sweep is None:
+            if check.source == ARTICLE:
+                rows.append(Statement(name, check.claim, check.source, check.rule, "", ABSENT))
+            continue
+        measured, met = check.test(sweep)
+        because = "" if met else check.because(sweep)
+        verdict = AGREES if met else DIFFERS
+        rows.append(Statement(name, check.claim, check.source, check.rule, measured, verdict, because))
+    return rows
+
+
+def _find(figures: Sequence[SweepFigure], check: _Check) -> Sweep | None:
+    """Give the first sweep of the article's method at the check's settings with two answered ones."""
+    wanted = {name: value for name, value in {**DEFAULTS, **check.fixed}.items() if name != check.parameter}
+    for figure in figures:
+        for sweep in figure.sweeps if figure.parameter.name == check.parameter else ():
+            named = all(sweep.fixed.get(k) == v for k, v in wanted.items() if k not in FREE or k in check.fixed)
+            if sweep.estimator == ESTIMATOR and named and np.isfinite(sweep.mean).sum() > 1:
+                return sweep
+    return None
+
+
+def _at(sweep: Sweep, index: int) -> str:
+    return f"{degrees(float(sweep.mean[index]))} at {sweep.parameter.text(float(sweep.x[index]))}"
+
+
+def _largest(sweep: Sweep, values: Array) -> str:
+    index = int(np.nanargmax(values))
+    return f"{degrees(float(values[index]))} at {sweep.parameter.text(float(sweep.x[index]))}"
+
+
+def _grows(sweep: Sweep) -> tuple[str, bool]:
+    known = np.flatnonzero(np.isfinite(sweep.mean))
+    mean, error = sweep.mean[known], np.nan_to_num(sweep.standard_error[known])
+    noise = 2 * np.hypot(error[1:], error[:-1])
+    met = bool(np.all(np.diff(mean) >= -noise) and mean[-1] - mean[0] > 2 * np.hypot(error[0], error[-1]))
+    text = f"mean {_at(sweep, known[0])}, {_at(sweep, known[-1])}"
+    least = known[int(mean.argmin())]
+    return (text if least == known[0] else f"{text}; least {_at(sweep, least)}"), met
+
+
+def _mean_below(sweep: Sweep) -> tuple[str, bool]:
+    return f"largest mean {_largest(sweep, sweep.mean)}", bool(np.nanmax(sweep.mean) < MEAN_BELOW_DEG)
+
+
+def _single_below(limit: float) -> Callable[[Sweep], tuple[str, bool]]:
+    def test(sweep: Sweep) -> tuple[str, bool]:
+        text = f"largest single error {_largest(sweep, sweep.largest)}, largest mean {_largest(sweep, sweep.mean)}"
+        return text, bool(np.nanmax(sweep.largest) < limit)
+
+    return test
+
+
+def _slope(sweep: Sweep) -> tuple[str, bool]:
+    line = fits.line(sweep.x, sweep.mean, sweep.standard_error)
+    low, high = EXPONENT_SLOPE_DEG / 2, EXPONENT_SLOPE_DEG * 2
+    met = line.slope + 2 * line.error >= low and line.slope - 2 * line.error <= high
+    text = f"slope ({1e3 * line.slope:.2f} ± {1e3 * line.error:.2f})·10⁻³\u00a0° per unit"
+    return f"{text}, straight to within {degrees(line.worst)}", met
+
+
+def _why_slope(sweep: Sweep) -> str:
+    known = np.isfinite(sweep.law)
+    slope = fits.line(sweep.x[known], sweep.law[known]).slope if known.sum() > 1 else float("nan")
+    return explanations.exponent_slope(sweep, slope, EXPONENT_SLOPE_DEG)
+
+
+def _u_shape(sweep: Sweep) -> tuple[str, bool]:
+    # Where most realisations failed, the others are a selection, and few.
+    known = np.flatnonzero(np.isfinite(sweep.mean) & (sweep.answered >= sweep.failed))
+    if known.size < 3:
+        return "fewer than three settings where at least half of the realisations answered", False
+    least = known[int(sweep.mean[known].argmin())]
+    error = np.nan_to_num(sweep.standard_error)
+    inside = [i for i in known if LEAST_AT[0] - 1e-9 <= sweep.x[i] <= LEAST_AT[1] + 1e-9]
+    ends = (known[0], known[-1])
+    is_u = all(sweep.mean[i] - sweep.mean[least] > 2 * np.hypot(error[i], error[least]) for i in ends)
+    near = any(sweep.mean[i] - sweep.mean[least] <= 2 * np.hypot(error[i], error[least]) for i in inside)
+    text = f"{'U-shaped' if is_u else 'not U-shaped'}: mean {_at(sweep, ends[0])}, {_at(sweep, ends[1])}; "
+    return text + f"least {_at(sweep, least)}", is_u and near
+
+
+def _stable(sweep: Sweep) -> tuple[str, bool]:
+    known = np.isfinite(sweep.mean)
+    at_end = np.flatnonzero(known & (np.abs(sweep.x - STABLE_TO) < 1e-9))
+    at_zero = np.flatnonzero(known & (sweep.x == 0))
+    if not (at_end.size and at_zero.size):
+        return f"no value at ε = 0 or ε = {STABLE_TO:g}", False
+    first, last = int(at_zero[0]), int(at_end[0])
+    ratio = float(sweep.mean[last] / sweep.mean[first])
+    shares = np.nan_to_num(sweep.standard_error)[[first, last]] / sweep.mean[[first, last]]
+    error = ratio * float(np.hypot(*shares))
+    met = abs(ratio - 1) <= STABLE_TOLERANCE + 2 * error
+    largest = _largest(sweep, sweep.mean)
+    return f"mean at ε = {STABLE_TO:g} over that at 0: {ratio:.3f} ± {error:.3f}; largest mean {largest}", met
+
+
+def _half(sweep: Sweep) -> tuple[str, bool]:
+    kept = (sweep.x > 0) & (sweep.mean > 0)
+    if kept.sum() < 2:
+        return "fewer than two settings with noise", False
+    line = fits.line(np.log(sweep.x[kept]), np.log(sweep.mean[kept]), (sweep.standard_error / sweep.mean)[kept])
+    met = abs(line.slope - BRANCH_SLOPE) <= SLOPE_TOLERANCE + 2 * line.error
+    return f"slope {line.slope:.3f} ± {line.error:.3f}", met
+
+
+def _bias(sweep: Sweep) -> tuple[str, bool]:
+    kept = np.isfinite(sweep.mean) & np.isfinite(sweep.law) & (sweep.law > 0)
+    pairs = [f"{number(m)}/{number(p)}" for m, p in zip(sweep.mean[kept], sweep.law[kept], strict=True)]
+    wide = kept & (sweep.x >= LAW_FROM_PX)
+    gaps = np.abs(sweep.law[wide] / sweep.mean[wide] - 1)
+    met = bool(wide.any() and np.all(gaps <= LAW_TOLERANCE))
+    widths = ", ".join(f"{x:g}" for x in sweep.x[kept])
+    worst = f"; largest departure {number(100 * float(gaps.max()), 2)}\u00a0%" if gaps.size else ""
+    return f"measured/predicted {', '.join(pairs)}° at s = {widths} px{worst}", met
+
+
+def _truncation(sweep: Sweep) -> tuple[str, bool]:
+    limit = fits.offset_inside_window(sweep.fixed)
+    inside = sweep.x <= limit
+    total = int(sweep.failed[inside].sum())
+    beyond = ", ".join(
+        f"{int(f)} of {int(f + n)} at {x:g}"
+        for x, f, n in zip(sweep.x, sweep.failed, sweep.answered, strict=True)
+        if f and x > limit
+    )
+    met = total == 0 and bool(beyond)
+    text = f"failures up to ε = {limit:.0f}: {total}; beyond: {beyond or 'none'}"
+    return f"{text}; largest mean {_largest(sweep, sweep.mean)}", met
+
+
+def _says(text: str) -> Callable[[Sweep], str]:
+    return lambda _sweep: text
+
+
+_CHECKS = (
+    _Check(
+        "sigma", {}, "the mean error grows with the noise",
+        "no mean falls below the one before by more than 2 standard errors, and the last is above the first",
+        _grows, _says(explanations.NOISE),
+    ),
+    _Check(
+        "sigma", {}, f"the mean stays below {MEAN_BELOW_DEG}° throughout to 10\u00a0%", "largest mean",
+        _mean_below, _says(explanations.NOISE_LEVEL),
+    ),
+    _Check(
+        "theta_deg", {}, "strong growth of the error with the slant",
+        "no mean falls below the one before by more than 2 standard errors, and the last is above the first",
+        _grows, _says(explanations.NEAR_ZERO_SLANT),
+    ),
+    _Check(
+        "theta_deg", {}, f"the maximum stays below {SLANT_BELOW_DEG:g}°", "largest single error",
+        _single_below(SLANT_BELOW_DEG), _says(explanations.NEAR_ZERO_SLANT),
+    ),
+    _Check(
+        "exponent", {}, "about linear, slope about 10⁻² degrees per unit",
+        "least-squares slope of the means within a factor of 2, give or take 2 standard errors", _slope, _why_slope,
+    ),
+    _Check(
+        "exponent", {}, f"never above {EXPONENT_BELOW_DEG}°", "largest single error",
+        _single_below(EXPONENT_BELOW_DEG), _says(explanations.NOISE_LEVEL),
+    ),
+    _Check(
+        "isovalue", {}, f"U-shaped, minimum at {LEAST_AT[0]:g} to {LEAST_AT[1]:g}",
+        "of the settings where at least half answered, both ends above the least mean and a mean in that range "
+        "equal to it, by 2 standard errors",
+        _u_shape, _says(explanations.ISOVALUE_MINIMUM),
+    ),
+    _Check(
+        "eps", {"exponent": 100.0}, f"stable up to ε = {STABLE_TO:g}",
+        f"ratio 1 within {STABLE_TOLERANCE:g}, give or take 2 standard errors", _stable, _says(explanations.OFFSET),
+    ),
+    _Check(
+        "sigma", {"theta_deg": 0.0}, "at slant 0 the error grows with the root of the noise: log-log slope 1/2",
+        f"within {SLOPE_TOLERANCE:g}, give or take 2 standard errors", _half, _says(explanations.BRANCH_POINT),
+        EXPECTED, "slant 0",
+    ),
+    _Check(
+        "eps", {"exponent": 100.0, "recentre": False},
+        "with the window at the foot, failures begin where the window cuts the isophote, and not before",
+        "no failure before, some beyond", _truncation, _says(explanations.TRUNCATION), EXPECTED, "window at the foot",
+    ),
+    *(
+        _Check(
+            "smoothing_px", {"sigma": 0.0, "isovalue": t}, "without noise the error is the smoothing's predicted bias",
+            f"within {LAW_TOLERANCE:.0%} from s = {LAW_FROM_PX:g} px on", _bias, _says(explanations.SMOOTHING),
+            EXPECTED, f"no noise, t = {t:g}",
+        )
+        for t in (0.1, 0.5)
+    ),
+)  # fmt: skip

@@ -1,0 +1,218 @@
+"""The sweeps of the published protocol, gathered from a run's rows: what the article's error plots show."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
+from simtest.report.run import Run
+from simtest.report.style import Array, Axis, estimator_order
+
+_WIDE = 20.0
+"""Means that span more than this factor are drawn on a logarithmic axis."""
+
+_FEWEST = 2
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One estimator's errors over one parameter, all else fixed; the better candidate's error, deg.
+
+    Parameters
+    ----------
+    parameter : Parameter
+        What is swept.
+    estimator, label : str
+        Name of the estimator and of the group of settings.
+    fixed : mapping
+        The other parameters' values by name.
+    x : ndarray, shape (n,)
+        Values of the parameter, ascending, as in the rows.
+    mean, std, least, largest : ndarray, shape (n,)
+        Over the answered realisations; NaN where there is none (std: none or one).
+    answered, failed : ndarray of int, shape (n,)
+        Realisations.
+    reasons : tuple of str, length n
+        Reasons of the failures with their counts.
+    bound, law : ndarray, shape (n,)
+        Cramer-Rao bound (RMS angle) and predicted error without noise, deg; NaN where there is none.
+    """
+
+    parameter: Parameter
+    estimator: str
+    label: str
+    fixed: Mapping[str, Any]
+    x: Array
+    mean: Array
+    std: Array
+    least: Array
+    largest: Array
+    answered: Array
+    failed: Array
+    reasons: tuple[str, ...]
+    bound: Array
+    law: Array
+
+    @property
+    def shown_x(self) -> Array:
+        """Values of the parameter in the unit of the axis."""
+        return self.x * self.parameter.factor
+
+    @property
+    def standard_error(self) -> Array:
+        """Standard error of each mean; NaN where a setting has fewer than two answers."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self.std / np.sqrt(self.answered))
+
+
+@dataclass(frozen=True)
+class SweepFigure:
+    """An error plot: all sweeps over one parameter."""
+
+    parameter: Parameter
+    sweeps: tuple[Sweep, ...]
+
+    @property
+    def key(self) -> str:
+        """Name of the figure's files."""
+        return f"error_vs_paper_{self.parameter.name}"
+
+    @property
+    def title(self) -> str:
+        """Title of the figure."""
+        return f"Error against {self.parameter.words} {self.parameter.symbol}"
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels in order of appearance."""
+        return list(dict.fromkeys(sweep.label for sweep in self.sweeps))
+
+    @property
+    def estimators(self) -> list[str]:
+        """Estimators in the report's order."""
+        return estimator_order(sweep.estimator for sweep in self.sweeps)
+
+    @property
+    def x(self) -> Axis:
+        """The parameter's axis: logarithmic where the values are evenly spaced in the logarithm."""
+        values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
+        is_log = values.size > 2 and values[0] > 0 and _unevenness(np.log(values)) < 0.5 * _unevenness(values)
+        return Axis(self.parameter.axis_title, "log" if is_log else "linear")
+
+    @property
+    def y(self) -> Axis:
+        """The errors' axis: from 0 as in the article; logarithmic beside such an x, or where the means differ much."""
+        title = "error of the better candidate (deg)"
+        means = np.concatenate([sweep.mean for sweep in self.sweeps])
+        means = means[np.isfinite(means)]
+        if means.size and means.min() > 0 and (self.x.scale == "log" or means.max() > _WIDE * means.min()):
+            return Axis(title, "log")
+        tops = np.concatenate([np.concatenate([sweep.largest, sweep.bound]) for sweep in self.sweeps])
+        tops = tops[np.isfinite(tops)]
+        return Axis(title, "linear", (0.0, 1.06 * float(tops.max())) if tops.size and tops.max() > 0 else None)
+
+    def places(self, index: int) -> Array:
+        """Give where a sweep is drawn: beside the others, so that the bars of several do not hide each other."""
+        x = self.sweeps[index].shown_x
+        values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
+        is_log = self.x.scale == "log"
+        gap = float(np.diff(np.log(values) if is_log else values).min()) if values.size > 1 else 1.0
+        shift = (index - (len(self.sweeps) - 1) / 2) * self.spread * gap
+        return x * np.exp(shift) if is_log else x + shift
+
+    @property
+    def spread(self) -> float:
+        """Share of the least gap between settings that one sweep takes."""
+        return min(0.14, 0.6 / max(len(self.sweeps), 1))
+
+
+def _unevenness(values: Array) -> float:
+    """Spread of the steps between ascending values, over their mean."""
+    steps = np.diff(values)
+    return float(steps.std() / steps.mean())
+
+
+def is_published(run: Run) -> bool:
+    """Tell whether a run has rows of the published protocol."""
+    return any(name.startswith(PREFIX) for name in run.results.columns)
+
+
+def sweep_figures(run: Run) -> list[SweepFigure]:
+    """Give the error plots of a run, one a swept parameter, in the article's order.
+
+    Parameters
+    ----------
+    run : Run
+        A run directory.
+
+    Returns
+    -------
+    list of SweepFigure
+        Empty where the run has no row of the published protocol.
+    """
+    found = list(_sweeps(run)) if is_published(run) else []
+    figures = []
+    for parameter in PARAMETERS.values():
+        own = tuple(sweep for sweep in found if sweep.parameter == parameter)
+        if own:
+            figures.append(SweepFigure(parameter, own))
+    return figures
+
+
+def _sweeps(run: Run) -> Iterator[Sweep]:
+    columns = [name for name in run.results.columns if name.startswith(PREFIX) and name[len(PREFIX) :] in PARAMETERS]
+    rows = run.results.filter(pl.any_horizontal(pl.col(columns).is_not_null()))
+    for (label,), part in rows.group_by("label", maintain_order=True):
+        swept = [name for name in columns if part[name].drop_nulls().n_unique() >= _FEWEST]
+        for name in swept:
+            others = [other for other in swept if other != name]
+            pieces = part.partition_by(others, maintain_order=True) if others else [part]
+            kept = [piece for piece in pieces if piece[name].n_unique() >= _FEWEST]
+            for piece in kept:
+                fixed = {c[len(PREFIX) :]: piece[c].drop_nulls().first() for c in columns if c != name}
+                more = [PARAMETERS[other[len(PREFIX) :]].text(fixed[other[len(PREFIX) :]]) for other in others]
+                for estimator in estimator_order(piece["estimator"].unique().to_list()):
+                    own = piece.filter(pl.col("estimator") == estimator)
+                    yield _sweep(own, name, estimator, ", ".join([str(label), *more]), fixed)
+
+
+def _sweep(rows: pl.DataFrame, column: str, estimator: str, label: str, fixed: Mapping[str, Any]) -> Sweep:
+    ok = (pl.col("status") == "ok") & pl.col("error_oracle_deg").is_not_null()
+    error = pl.col("error_oracle_deg").filter(ok)
+    bound = pl.col("bound_deg") if "bound_deg" in rows.columns else pl.lit(None, pl.Float64)
+    table = (
+        rows.filter(pl.col(column).is_not_null())
+        .with_columns(bound=bound)
+        .group_by(pl.col(column).cast(pl.Float64).alias("x"))
+        .agg(
+            mean=error.mean(), std=error.std(), least=error.min(), largest=error.max(), answered=error.len(),
+            total=pl.len(), bound=pl.col("bound").first(), law=pl.col("error_law_deg").drop_nulls().first(),
+            reasons=pl.col("status").filter(~ok.fill_null(False)).fill_null("unknown"),
+        )
+        .sort("x")
+    )  # fmt: skip
+    values = {
+        name: table[name].cast(pl.Float64).to_numpy().astype(float)
+        for name in ("x", "mean", "std", "least", "largest", "bound", "law")
+    }
+    answered = table["answered"].to_numpy().astype(float)
+    reasons = tuple(_counted(list(entry)) for entry in table["reasons"].to_list())
+    failed = table["total"].to_numpy().astype(float) - answered
+    parameter = PARAMETERS[column[len(PREFIX) :]]
+    return Sweep(parameter, estimator, label, fixed, answered=answered, failed=failed, reasons=reasons, **values)
+
+
+def _counted(reasons: list[str]) -> str:
+    return ", ".join(f"{name} {reasons.count(name)}" for name in sorted(set(reasons)))
+
+
+def departures(fixed: Mapping[str, Any]) -> str:
+    """Write the fixed parameters that are not the article's defaults; empty where all are."""
+    return ", ".join(
+        PARAMETERS[name].text(value)
+        for name, value in fixed.items()
+        if value is not None and value != DEFAULTS[name]
+    )  # fmt: skip

@@ -1,0 +1,75 @@
+"""Calibration files: a camera with its response, vignetting, emission and noise."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.spec.camera import NOT_OF_THE_CAMERA, CameraSpec, load_camera
+from simtest.spec.profile import CosineProfile, Profile
+from simtest.spec.reading import Spec, read_toml, validate
+from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
+
+
+class SensorCalibration(Spec):
+    """What is known of the sensor's noise and range."""
+
+    full_well: FullWell | None = Field(None, description="electrons at full scale")
+    read_noise: ReadNoise = Field(0.0, description="standard deviation, electrons")
+    bits: Bits | None = Field(None, description="of the values")
+    saturation_level: float | None = Field(
+        None, gt=0, le=1e6, description="value, share of the largest, at and above which a pixel counts as clipped"
+    )
+
+    @model_validator(mode="after")
+    def _electrons(self) -> "SensorCalibration":
+        check_electrons(self.full_well, self.read_noise)
+        return self
+
+
+class CalibrationSpec(Spec):
+    """A calibration file; all tables but the camera may be left out."""
+
+    camera: CameraSpec
+    response: ResponseSpec | None = Field(None, description="how light became values; default: not stated")
+    vignetting: Profile = Field(
+        CosineProfile(), description="share of the light that the lens passes, over the angle from the optical axis"
+    )
+    emission: Profile = Field(
+        CosineProfile(), description="of a light at the camera, shining along the optical axis, over the same angle"
+    )
+    sensor: SensorCalibration = SensorCalibration()
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration file, or a camera file.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``*.toml`` with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level; or
+        anything that `load_camera` reads.
+
+    Returns
+    -------
+    Calibration
+        What the file does not state is unknown: no response, no falloff, no noise model.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed.
+    """
+    path = Path(path)
+    camera = load_camera(path)
+    data = read_toml(path) if path.suffix.lower() == ".toml" else {}
+    if not isinstance(data.get("camera"), Mapping):
+        # The camera's keys stand at top level, before the other tables.
+        data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
+    # The camera's own table has been read, by its own rules.
+    spec = validate(CalibrationSpec, {**data, "camera": {}}, str(path))
+    response = spec.response.model() if spec.response is not None else None
+    sensor = spec.sensor
+    noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
+    return Calibration(camera, response, spec.vignetting.model(), spec.emission.model(), noise, sensor.saturation_level)

@@ -1,0 +1,303 @@
+"""Calibrations: files, what they undo, and what they leave flagged."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import simtest
+from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.calibration.calibration import MIN_FALLOFF
+from simtest.detection import detect, estimate_noise
+from simtest.errors import Failure, InputError
+from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
+from simtest.geometry.profile import AngularProfile
+from simtest.reconstruction import reconstruct
+from simtest.sensor import capture, collect
+from simtest.spec import load_calibration, load_camera
+from simtest.spec.sensor import Sensor
+
+CAMERA = Camera(160, 120, 90.0, 90.0, 80.0, 60.0)
+CAMERA_TABLE = "[camera]\nwidth = 160\nheight = 120\nfx = 90.0\nfy = 90.0\n"
+WHOLE = """
+[response]
+type = "gamma"
+gamma = 2.0
+
+[vignetting]
+type = "cosine"
+power = 4.0
+
+[emission]
+type = "table"
+angle_deg = [0.0, 60.0]
+value = [1.0, 0.5]
+
+[sensor]
+full_well = 5000.0
+read_noise = 4.0
+bits = 10
+saturation_level = 0.98
+"""
+
+
+def spot(x=80.3, y=60.6, width=9.0, height=1.0):
+    centres = CAMERA.pixel_centres()
+    squared = (centres[..., 0] - x) ** 2 + (centres[..., 1] - y) ** 2
+    return (height * np.exp(-squared / (2 * width**2))).astype(np.float32)
+
+
+def write(tmp_path, text, name="calibration.toml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", [CAMERA_TABLE, CAMERA_TABLE.removeprefix("[camera]\n")])
+def test_a_whole_file_is_read(tmp_path, text):
+    read = load_calibration(write(tmp_path, text + WHOLE))
+    response = Response("gamma", 2.0)
+    assert read == Calibration(
+        CAMERA,
+        response,
+        AngularProfile(4.0),
+        AngularProfile(angles=(0.0, np.radians(60.0)), values=(1.0, 0.5)),
+        NoiseModel(0.0, 5000.0, 4.0, 10, response),
+        0.98,
+    )
+
+
+@pytest.mark.parametrize("text", [CAMERA_TABLE, CAMERA_TABLE.removeprefix("[camera]\n")])
+def test_a_camera_file_is_a_calibration_of_nothing_else(tmp_path, text):
+    read = load_calibration(write(tmp_path, text))
+    assert read == Calibration(CAMERA)
+    assert read.response is None
+    assert read.falloff is None
+    assert read.saturation_level is None
+
+
+def test_lens_and_view_mask_are_read_beside_the_other_tables(tmp_path):
+    table = CAMERA_TABLE + 'distortion = { type = "kannala_brandt", k1 = 0.01 }\nview_mask = { radius = 50.0 }\n'
+    camera = dataclasses.replace(CAMERA, distortion=KannalaBrandt(0.01), view_mask=ViewMask(80.0, 60.0, 50.0))
+    nested, flat = (load_calibration(write(tmp_path, text + WHOLE)) for text in (table, table.partition("\n")[2]))
+    assert nested.camera == camera
+    assert nested == flat
+    assert load_camera(write(tmp_path, table + WHOLE)) == camera
+    # The profile counts over the sightline's own angle: 0.6 rad from the axis lie about 90 tan or 90 theta px off.
+    share = nested.falloff / AngularProfile(angles=(0.0, np.radians(60.0)), values=(1.0, 0.5)).at(
+        camera.unproject(camera.pixel_centres())[..., 2]
+    )
+    theta = np.arccos(share**0.25)
+    radius = np.hypot(*(camera.pixel_centres() - [80.0, 60.0]).transpose(2, 0, 1))
+    inner = radius < 50
+    np.testing.assert_allclose(radius[inner], (90 * (theta + 0.01 * theta**3))[inner], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (WHOLE, "width: missing"),
+        (CAMERA_TABLE.removeprefix("[camera]\n") + "[lens]\nk1 = 0.1", "lens = .*unknown key"),
+        (CAMERA_TABLE.removeprefix("[camera]\n") + "[sensor]\nbits = 20", "sensor.bits = 20"),
+        (CAMERA_TABLE + "[lens]\nk1 = 0.1", "lens = .*unknown key"),
+        (CAMERA_TABLE + '[response]\ntype = "film"', "response.type = 'film'"),
+        (CAMERA_TABLE + '[response]\ntype = "table"\nlight = [0.0, 1.0]\nvalue = [1.0, 0.0]', "response.*rise from 0"),
+        (CAMERA_TABLE + '[vignetting]\ntype = "cosine"\npower = -1', "vignetting.power = -1"),
+        (CAMERA_TABLE + "[sensor]\nsaturation_level = 0", "sensor.saturation_level = 0"),
+        (CAMERA_TABLE + "[sensor]\nread_noise = 5", "sensor: read_noise = 5 electrons: needs full_well"),
+        (CAMERA_TABLE + "[sensor]\nbits = 20", "sensor.bits = 20"),
+        (CAMERA_TABLE.replace("90.0", "0.0"), "fx = 0.0"),
+    ],
+)
+def test_malformed_files_name_the_key(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        load_calibration(write(tmp_path, text))
+
+
+def test_malformed_calibrations_are_refused():
+    with pytest.raises(InputError, match=r"must be a simtest\.Camera"):
+        Calibration("camera")
+    with pytest.raises(InputError, match="saturation_level"):
+        Calibration(CAMERA, saturation_level=0.0)
+    with pytest.raises(InputError, match=r"must be a simtest\.Camera or simtest\.Calibration"):
+        reconstruct(spot(), "camera.toml")
+
+
+# What is undone ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["grey", "colour"])
+def test_correction_is_the_inverse_of_the_sensor(shape):
+    vignetting = {"type": "cosine", "power": 4.0}
+    response = {"type": "gamma", "gamma": 2.2}
+    sensor = Sensor.model_validate({"vignetting": vignetting, "response": response, "bits": 16})
+    scene = spot(20, 30, height=0.9)
+    radiance = scene if shape == "grey" else scene[..., None] * np.array([0.9, 0.6, 0.3], np.float32)
+    frame = capture(collect(radiance, sensor, CAMERA), 1.0, sensor, None)
+    known = Calibration(CAMERA, Response("gamma", 2.2), AngularProfile(4.0))
+    expected = scene if shape == "grey" else scene * 0.6
+    np.testing.assert_allclose(known.correct(frame).intensity, expected, atol=1e-4)
+    # Each part that is missing shows.
+    for unknown in (Calibration(CAMERA, Response("gamma", 2.2)), Calibration(CAMERA, vignetting=AngularProfile(4.0))):
+        assert np.abs(unknown.correct(frame).intensity - expected).max() > 0.1
+
+
+def test_channels_are_made_linear_before_they_are_averaged():
+    frame = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), (120, 160, 3))
+    known = Calibration(CAMERA, Response("gamma", 2.0))
+    np.testing.assert_allclose(known.correct(frame * 0.5).intensity, 0.25 / 3, rtol=1e-6)
+
+
+def test_emission_counts_like_vignetting():
+    lens, light = Calibration(CAMERA, vignetting=AngularProfile(3.0)), Calibration(CAMERA, emission=AngularProfile(3.0))
+    np.testing.assert_array_equal(lens.falloff, light.falloff)
+    both = Calibration(CAMERA, vignetting=AngularProfile(1.0), emission=AngularProfile(2.0))
+    np.testing.assert_allclose(both.falloff, lens.falloff)
+
+
+def test_where_no_light_is_left_the_gain_is_limited_and_marked():
+    table = AngularProfile(angles=(0.0, 0.3, 0.4), values=(1.0, 1.0, 0.0))
+    corrected = Calibration(CAMERA, vignetting=table).correct(np.full((120, 160), 0.1, np.float32))
+    assert np.isfinite(corrected.intensity).all()
+    assert corrected.gain.max() == pytest.approx(1 / MIN_FALLOFF)
+    assert corrected.limited.any()
+    assert not corrected.limited[60, 80]
+    dark = Calibration(CAMERA, vignetting=AngularProfile(angles=(0.0, 1e-3), values=(1.0, 0.0)))
+    corrected = dark.correct(np.zeros((120, 160), np.float32))
+    np.testing.assert_array_equal(corrected.intensity, 0)
+    assert corrected.limited.all()
+
+
+def test_a_spot_that_reaches_into_the_limited_part_is_flagged():
+    table = AngularProfile(angles=(0.0, 0.3, 0.4), values=(1.0, 1.0, 0.0))
+    frame = spot(80 + 90 * np.tan(0.36), 60, 5.0)
+    (found,) = reconstruct(frame, Calibration(CAMERA, vignetting=table))
+    assert "vignetted" in found.estimates["cone_axis"].flags
+    (found,) = reconstruct(spot(), Calibration(CAMERA, vignetting=table))
+    assert found.estimates["cone_axis"].flags == ()
+
+
+def test_noise_is_carried_through_the_gain():
+    """Far out the correction multiplies the noise by up to 20: it must not be taken for highlights."""
+    camera = Camera(240, 240, 90.0, 90.0, 120.0, 120.0)
+    sensor = Sensor.model_validate({"vignetting": {"type": "cosine", "power": 8.0}, "noise_sigma": 0.05})
+    x, y = np.moveaxis(camera.pixel_centres(), -1, 0)
+    light = collect(np.exp(-((x - 125) ** 2 + (y - 118) ** 2) / 160).astype(np.float32), sensor, camera)
+    known = Calibration(camera, vignetting=AngularProfile(8.0))
+    naive = 0
+    for seed in range(4):
+        frame = capture(light, 1.0, sensor, np.random.default_rng(seed))
+        assert len(reconstruct(frame, known, smoothing_px=1.0)) == 1
+        smoothed = smooth(known.correct(frame).intensity, 1.0)
+        naive += len(detect(smoothed, estimate_noise(frame))) - 1
+    assert naive > 100
+
+
+def test_known_shot_noise_raises_the_threshold_where_it_is_bright():
+    """On a bright ground the shot noise is above what the dark frame around it shows."""
+    ground = np.where(CAMERA.pixel_centres()[..., 0] < 60, 1.0, 0.0).astype(np.float32)
+    sensor = Sensor.model_validate({"full_well": 50.0, "bits": 12, "exposure": {"gain": 1.0}})
+    frame = capture(0.5 * ground, 1.0, sensor, np.random.default_rng(0))
+    noise = NoiseModel(0.0, 50.0, 0.0, 12)
+    assert noise.at(0.5) == pytest.approx(0.1, rel=1e-3)
+    assert estimate_noise(frame) < 0.01
+    found = [len(reconstruct(frame, c)) for c in (Calibration(CAMERA, noise=noise), Calibration(CAMERA))]
+    assert found[0] == 0 <= found[1]
+
+
+# Saturation ----------------------------------------------------------------------------------------------------------
+
+
+def patch_of(frame, level=1.0):
+    smoothed = smooth(frame, 2.0)
+    return Patch.cut(smoothed, (0, 0, 160, 120), saturated=frame >= level)
+
+
+@pytest.mark.parametrize("place", [(80.3, 60.6), (71.9, 44.2)])
+def test_a_clipped_peak_lies_at_the_plateaus_centroid(place):
+    frame = np.minimum(spot(*place, height=2.5), 1.0)
+    clipped, blind = patch_of(frame), Patch.cut(smooth(frame, 2.0), (0, 0, 160, 120))
+    # The plateau is made of whole pixels.
+    np.testing.assert_allclose(clipped.peak_px, place, atol=0.2)
+    assert np.hypot(*(blind.peak_px - place)) > 2
+    assert clipped.peak_value == pytest.approx(1.0, abs=1e-3)
+    # A Gaussian clipped at 1/g: share log(g) / log(2 g) of the isophote at half of it.
+    assert clipped.saturated_share(0.5) == pytest.approx(np.log(2.5) / np.log(5), abs=0.01)
+
+
+def test_a_few_clipped_pixels_leave_the_parabola():
+    frame = np.minimum(spot(height=1.01), 1.0)
+    assert 0 < np.count_nonzero(frame >= 1.0) < 12
+    np.testing.assert_array_equal(patch_of(frame).peak_px, Patch.cut(smooth(frame, 2.0), (0, 0, 160, 120)).peak_px)
+
+
+def test_saturation_is_flagged_where_it_is_known():
+    frame = np.minimum(spot(height=2.0), 1.0)
+    for calibration, flags in (
+        (Calibration(CAMERA, saturation_level=1.0), ("saturated",)),
+        (Calibration(CAMERA), ()),
+        (CAMERA, ()),
+        (Calibration(CAMERA, saturation_level=1.1), ()),
+    ):
+        (found,) = reconstruct(frame, calibration)
+        assert {name: e.flags for name, e in found.estimates.items()} == dict.fromkeys(found.estimates, flags)
+    # A clipped corner elsewhere does not touch this spot.
+    frame = spot()
+    frame[:3, :3] = 5.0
+    (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=2.0), roi=(30, 10, 100, 100))
+    assert found.estimates["cone_axis"].flags == ()
+
+
+def test_one_clipped_channel_is_enough():
+    frame = np.minimum(spot(height=2.0)[..., None] * np.array([1.0, 0.4, 0.2], np.float32), 1.0)
+    (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=1.0))
+    assert found.patch.saturated_share(0.5) > 0.2
+
+
+def test_a_large_plateau_does_not_hide_the_other_spots():
+    """A plateau of more pixels than the peaks that are looked at."""
+    camera = Camera(400, 300, 200.0, 200.0, 200.0, 150.0)
+    x, y = np.moveaxis(camera.pixel_centres(), -1, 0)
+    broad = np.exp(-((x - 120) ** 2 + (y - 150) ** 2) / (2 * 30**2))
+    small = 0.5 * np.exp(-((x - 330) ** 2 + (y - 150) ** 2) / (2 * 8**2))
+    frame = np.minimum(4 * broad, 1.0) + small
+    assert np.count_nonzero(frame >= 1) > 2000
+    found = reconstruct(frame, Calibration(camera, saturation_level=1.0))
+    assert len(found) == 2
+    np.testing.assert_allclose([s.patch.peak_px for s in found], [[120, 150], [330, 150]], atol=0.3)
+
+
+def test_the_plateau_of_a_divided_frame_is_slanted_and_its_peak_is_not():
+    vignetting = AngularProfile(6.0)
+    sensor = Sensor.model_validate({"vignetting": {"type": "cosine", "power": 6.0}, "saturation": True})
+    place = (115.0, 60.0)
+    frame = capture(collect(spot(*place, height=2.5), sensor, CAMERA), 1.0, sensor, None)
+    (found,) = reconstruct(frame, Calibration(CAMERA, vignetting=vignetting, saturation_level=1.0))
+    (blind,) = reconstruct(frame, Calibration(CAMERA, vignetting=vignetting))
+    assert np.hypot(*(found.patch.peak_px - place)) < 0.5 * np.hypot(*(blind.patch.peak_px - place))
+    assert found.estimates["cone_axis"].flags == ("saturated",)
+
+
+def test_an_estimator_of_elsewhere_with_odd_isovalues_is_flagged_all_the_same():
+    frame = np.minimum(spot(height=2.0), 1.0)
+
+    def odd(patch, camera):
+        from simtest.estimators.cone_axis import cone_axis
+
+        made = cone_axis(patch, camera)
+        return dataclasses.replace(made, isophotes=tuple(dataclasses.replace(i, isovalue=2.0) for i in made.isophotes))
+
+    (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=1.0), {"odd": odd})
+    assert not isinstance(found.estimates["odd"], Failure)
+    assert found.estimates["odd"].flags == ("saturated",)
+
+
+def test_nothing_known_is_nothing_changed():
+    frame = spot() + 0.01 * np.random.default_rng(0).standard_normal((120, 160)).astype(np.float32)
+    (plain,), (told,) = reconstruct(frame, CAMERA), simtest.reconstruct(frame, simtest.Calibration(CAMERA))
+    assert plain.region == told.region
+    for name, estimate in plain.estimates.items():
+        np.testing.assert_array_equal(estimate.normal, told.estimates[name].normal)

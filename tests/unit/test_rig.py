@@ -1,0 +1,404 @@
+"""Rigs: emission against closed forms and Mitsuba's own integrators, presets, position errors, refused values."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simtest.errors import InputError
+from simtest.rendering import Session
+from simtest.rendering.direct import COLOCATED_MM
+from simtest.seeds import Stage, integer
+from simtest.spec import LightSpec, scene_from_dict
+from simtest.spec.experiment import Experiment
+from simtest.spec.rig import PRESETS
+from simtest.validation.cases import expand
+
+render = pytest.mark.render
+
+WIDTH, HEIGHT, FOCAL, D = 96, 80, 70.0, 10.0
+CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL}
+MATT = {"type": "phong", "specular": 0.0, "diffuse": 0.5}
+COSINE = {"type": "cosine", "power": 4.0}
+TABLE = {"type": "table", "angle_deg": [0, 10, 35, 60], "value": [1.0, 0.9, 0.4, 0.1]}
+
+
+def scene(lights=({},), surface=None, reflectance=None, rig=None, **render):
+    rig = {"lights": list(lights)} if rig is None else rig
+    tables = {"surface": surface or {"type": "plane"}, "rig": rig, "camera": CAMERA, "render": render}
+    return scene_from_dict(tables | {"reflectance": reflectance or MATT})
+
+
+@pytest.fixture(scope="module")
+def session():
+    return Session(scene())
+
+
+def positions():
+    """Points of the plane z = D on the pixels' sightlines."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    return np.stack([(u - WIDTH / 2) / FOCAL * D, (v - HEIGHT / 2) / FOCAL * D, np.full(u.shape, D)], axis=-1)
+
+
+def matt(light, factor):
+    """Radiance of a Lambertian plane of albedo 1/2 under a light; factor over the angle from its axis."""
+    spec = LightSpec.model_validate(light)
+    P = positions()
+    away = P - np.array(spec.place_mm)
+    squared = np.sum(away**2, axis=-1)
+    away /= np.sqrt(squared)[..., None]
+    axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
+    angle = np.arctan2(np.linalg.norm(np.cross(away, axis), axis=-1), away @ axis)
+    return 0.5 / np.pi * spec.power * factor(angle) * np.abs(away[..., 2]) / squared
+
+
+EMISSIONS = {
+    "cosine": ({"profile": COSINE}, lambda a: np.maximum(np.cos(a), 0) ** 4),
+    "cosine, steep": ({"profile": {"type": "cosine", "power": 60.0}}, lambda a: np.maximum(np.cos(a), 0) ** 60),
+    "table": ({"profile": TABLE}, lambda a: np.interp(np.degrees(a), TABLE["angle_deg"], TABLE["value"])),
+    "soft spot": (
+        {"spot_deg": 60.0, "soft_edge_deg": 12.0}, lambda a: np.clip((30 - np.degrees(a)) / 12, 0, 1)
+    ),
+    "spot of a half-space": ({"spot_deg": 180.0}, lambda a: (a <= np.pi / 2) * 1.0),
+    "soft cosine spot": (
+        {"profile": COSINE, "spot_deg": 80.0, "soft_edge_deg": 40.0},
+        lambda a: np.maximum(np.cos(a), 0) ** 4 * np.clip((40 - np.degrees(a)) / 40, 0, 1),
+    ),
+}  # fmt: skip
+
+
+@render
+@pytest.mark.parametrize("name", EMISSIONS)
+@pytest.mark.parametrize(
+    "place",
+    [{}, {"position_mm": [2.0, -1.0, 1.0], "direction": [0.3, 0.1, 2.0], "power": 3.0}],
+    ids=["camera", "aside"],
+)
+def test_radiance_of_a_plane_follows_the_emission(session, name, place):
+    emission, factor = EMISSIONS[name]
+    session.update(scene([{**place, **emission}]))
+    expected = matt({**place, **emission}, factor)
+    total = session.radiance().total
+    np.testing.assert_allclose(total, expected, rtol=1e-4, atol=3e-6 * expected.max())
+    assert total.max() > 0
+
+
+@render
+def test_a_hard_spot_ends_at_its_rim(session):
+    session.update(scene([{"spot_deg": 50.0}]))
+    total, angle = (
+        session.radiance().total,
+        np.degrees(np.arctan(np.hypot(*positions()[..., :2].transpose(2, 0, 1)) / D)),
+    )
+    assert (total[angle > 25.01] == 0).all()
+    isotropic = matt({}, lambda a: 1.0)
+    np.testing.assert_allclose(total[angle < 24.99], isotropic[angle < 24.99], rtol=1e-4)
+
+
+@render
+def test_lights_add_up(session):
+    lights = [
+        {"offset_mm": 2.0, "profile": COSINE},
+        {"position_mm": [-1.0, 1.0, 0.5], "spot_deg": 90.0},
+        {"power": 0.2},
+    ]
+    alone = []
+    for light in lights:
+        session.update(scene([light]))
+        alone.append(session.radiance().total.astype(float))
+    session.update(scene(lights))
+    np.testing.assert_allclose(session.radiance().total, sum(alone), rtol=1e-5, atol=1e-9)
+
+
+@render
+def test_the_numbers_of_a_light_are_updated_without_a_rebuild(session):
+    session.update(scene([{"profile": COSINE, "spot_deg": 80.0, "soft_edge_deg": 40.0}]))
+    built = session.rebuilds
+    for k, spot in ((1.0, 70.0), (9.0, 120.0)):
+        light = {"profile": {"type": "cosine", "power": k}, "spot_deg": spot, "soft_edge_deg": 10.0, "power": k}
+        session.update(scene([light]))
+        expected = matt(
+            light, lambda a, k=k, spot=spot: np.cos(a) ** k * np.clip((spot / 2 - np.degrees(a)) / 10, 0, 1)
+        )
+        np.testing.assert_allclose(session.radiance().total, expected, rtol=1e-4, atol=3e-6 * expected.max())
+    assert session.rebuilds == built
+
+
+# Against Mitsuba's integrators ---------------------------------------------------------------------------------------
+
+RIG = [
+    {"position_mm": [3.0, 1.0, 0.0], "profile": COSINE, "power": 2.0},
+    {"position_mm": [-3.0, 0.5, 0.0], "profile": TABLE, "direction": [0.2, 0.0, 1.0]},
+    {"offset_mm": 2.0, "azimuth_deg": 90.0, "spot_deg": 70.0, "soft_edge_deg": 15.0},
+    {"offset_mm": 1.0},
+]
+GLOSSY = {"type": "phong", "exponent": 20.0, "specular": 0.6, "diffuse": 0.4, "normalised": True}
+BALL = {"type": "sphere", "radius_mm": 6.0, "tilt_deg": 10.0}
+INSIDE = {"type": "sphere", "radius_mm": 9.0, "side": "inside"}
+
+
+def mitsuba_mean(session, integrator, seeds, samples):
+    """Means of the frame by one of Mitsuba's integrators, from the session's own scene, for several seeds."""
+    mi, camera = session.mi, session.camera
+    pose = session.surface.model_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    sensor = mi.load_dict(
+        {
+            "type": "perspective", "fov": float(2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))),
+            "fov_axis": "x", "near_clip": 1e-3, "far_clip": 1e5, "to_world": mi.ScalarTransform4f(pose.tolist()),
+            "film": {
+                "type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"},
+                "pixel_format": "luminance",
+            },
+        }
+    )  # fmt: skip
+    integrator = mi.load_dict(integrator)
+    frames = [
+        np.array(mi.render(session._built.scene, sensor=sensor, integrator=integrator, spp=samples, seed=seed))
+        for seed in seeds
+    ]
+    return np.array([frame.astype(float).mean() for frame in frames])
+
+
+@render
+@pytest.mark.parametrize("surface", [BALL, {"type": "plane", "tilt_deg": 20.0}], ids=["sphere", "plane"])
+def test_direct_light_is_that_of_mitsubas_direct_integrator(session, surface):
+    """Pooled means over seeds within three standard errors; a light of 2 % more power is told apart."""
+    ours = []
+    for seed in range(6):
+        session.update(scene(RIG, surface, GLOSSY, samples_per_pixel=16, seed=seed))
+        ours.append(float(session.radiance().total.mean(dtype=float)))
+    theirs = mitsuba_mean(session, {"type": "direct"}, range(100, 106), 64)
+    error = np.hypot(np.std(ours, ddof=1), np.std(theirs, ddof=1)) / np.sqrt(6)
+    gap = abs(np.mean(ours) - theirs.mean())
+    assert gap < 3 * error
+    session.update(scene([{**RIG[0], "power": 2.04}, *RIG[1:]], surface, GLOSSY, samples_per_pixel=16))
+    assert abs(session.radiance().total.mean(dtype=float) - theirs.mean()) > 3 * error
+
+
+@render
+def test_bounces_are_those_of_mitsubas_path_integrator(session):
+    ours = []
+    for seed in range(6):
+        session.update(scene(RIG, INSIDE, GLOSSY, samples_per_pixel=8, path_depth=4, seed=seed))
+        radiance = session.radiance()
+        ours.append(float(radiance.total.mean(dtype=float)))
+    assert radiance.indirect.mean() > 0.05 * radiance.total.mean()
+    path = {"type": "path", "max_depth": 4, "rr_depth": 10}
+    theirs = mitsuba_mean(session, path, range(100, 106), 32)
+    error = np.hypot(np.std(ours, ddof=1), np.std(theirs, ddof=1)) / np.sqrt(6)
+    assert abs(np.mean(ours) - theirs.mean()) < 3 * error < 0.03 * theirs.mean()
+
+
+# True highlights -----------------------------------------------------------------------------------------------------
+
+
+@render
+def test_each_light_has_its_own_highlight_at_the_mirror_condition(session):
+    """The emission shifts the brightest pixel, not the true BP; where a spot does not reach, the BP is not lit."""
+    shiny = {"type": "phong", "exponent": 300.0}
+    plain = [{"offset_mm": 2.0}, {"offset_mm": 2.0, "azimuth_deg": 180.0}]
+    session.update(scene(plain, reflectance=shiny))
+    expected = {h.light: h for h in session.highlights(session.radiance())}
+    assert sorted(expected) == [0, 1]
+    profiled = [{**plain[0], "profile": COSINE, "direction": [1.0, 0.0, 1.0]}, {**plain[1], "spot_deg": 5.0}]
+    session.update(scene(profiled, reflectance=shiny))
+    found = {h.light: h for h in session.highlights(session.radiance())}
+    for light in (0, 1):
+        np.testing.assert_allclose(found[light].bp_px, expected[light].bp_px, atol=1e-6)
+    assert found[0].lit
+    assert not found[1].lit
+
+
+@render
+def test_displaced_lights_are_rendered_and_their_highlights_are_true(session):
+    light = {"offset_mm": 2.0, "position_error_mm": 0.5}
+    shiny = {"type": "phong", "exponent": 300.0}
+    described = scene(rig={"lights": [light], "seed": 5}, reflectance=shiny)
+    (place,) = described.rig.true_mm()
+    assert 0.05 < np.linalg.norm(place - [2.0, 0, 0]) < 3
+    session.update(described)
+    displaced = session.radiance().total
+    (highlight,) = session.highlights(session.radiance())
+    P = highlight.position
+    half = -P / np.linalg.norm(P) + (place - P) / np.linalg.norm(place - P)
+    np.testing.assert_allclose(highlight.normal, half / np.linalg.norm(half), atol=1e-6)
+    session.update(scene([{"position_mm": place.tolist()}], reflectance=shiny))
+    np.testing.assert_allclose(session.radiance().total, displaced, rtol=1e-5)
+
+
+def test_position_errors_hang_on_the_seed_and_have_the_standard_deviation_given():
+    def places(seed, **light):
+        rig = {"preset": "laparoscope", "each": {"position_error_mm": 0.3, **light}, "seed": seed}
+        return scene(rig=rig).rig
+
+    assert places(1) == places(1)
+    np.testing.assert_array_equal(places(1).true_mm(), places(1).true_mm())
+    assert not np.array_equal(places(1).true_mm(), places(2).true_mm())
+    np.testing.assert_array_equal(places(1).nominal_mm(), places(2).nominal_mm())
+    errors = np.array([places(seed).true_mm() - places(seed).nominal_mm() for seed in range(400)]).ravel()
+    # 9600 numbers: 5 standard errors of the mean and of the standard deviation.
+    assert abs(errors.mean()) < 5 * 0.3 / np.sqrt(errors.size)
+    assert abs(errors.std() / 0.3 - 1) < 5 / np.sqrt(2 * errors.size)
+    np.testing.assert_array_equal(places(1, position_error_mm=0.0).true_mm(), places(1).nominal_mm())
+
+
+def test_an_experiment_draws_the_position_errors_anew_for_each_realisation():
+    group = {"scene": "plane", "set": {"rig.lights.0.offset_mm": 2.0, "rig.lights.0.position_error_mm": 0.1}}
+    experiment = Experiment.model_validate({"name": "rigs", "groups": [group], "seed": 3})
+    (case,) = expand(experiment)
+    rigs = [case.scene(experiment, number)[0].rig for number in (0, 1, 0)]
+    assert rigs[0] == rigs[2] != rigs[1]
+    assert rigs[0].seed == integer(3, "rigs", case.name, 0, Stage.RIG)
+    assert f"rig.seed={rigs[1].seed}" in case.again(experiment, 1)
+    fixed = Experiment.model_validate({"name": "rigs", "groups": [{"scene": "plane"}], "seed": 3})
+    (case,) = expand(fixed)
+    assert case.scene(fixed, 0)[0] == case.scene(fixed, 1)[0]
+    assert "rig.seed" not in case.again(fixed, 1)
+
+
+# Presets -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("preset", "count"), [("colocated", 1), ("laparoscope", 8), ("colonoscope_2", 2), ("colonoscope_3", 3)]
+)
+def test_presets_stand_on_a_ring_and_share_the_power(preset, count):
+    rig = scene(rig={"preset": preset}).rig
+    places = rig.nominal_mm()
+    assert len(places) == count == PRESETS[preset]["count"]
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), PRESETS[preset]["radius_mm"], atol=1e-12)
+    assert sum(light.power for light in rig.lights) == pytest.approx(1)
+    if count > 1:
+        np.testing.assert_allclose(places.mean(axis=0), 0, atol=1e-12)
+        assert 3 <= PRESETS[preset]["radius_mm"] <= 5
+    else:
+        assert np.linalg.norm(places) <= COLOCATED_MM
+
+
+@given(
+    count=st.integers(2, 12),
+    radius=st.floats(0.5, 9),
+    azimuth=st.floats(-360, 360),
+    axial=st.floats(-3, 3),
+    power=st.floats(0.1, 50),
+)
+def test_a_presets_numbers_can_be_overridden_and_read_back(count, radius, azimuth, axial, power):
+    rig = {"preset": "laparoscope", "count": count, "radius_mm": radius, "azimuth_deg": azimuth, "axial_mm": axial}
+    described = scene(rig={**rig, "power": power, "each": {"spot_deg": 120.0, "profile": TABLE}})
+    places = described.rig.nominal_mm()
+    first = np.radians(azimuth)
+    np.testing.assert_allclose(places[0], [radius * np.cos(first), radius * np.sin(first), axial], atol=1e-9)
+    gaps = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)
+    np.testing.assert_allclose(gaps, 2 * radius * np.sin(np.pi / count), rtol=1e-9)
+    assert all(light.spot_deg == 120 and light.power == pytest.approx(power / count) for light in described.rig.lights)
+    assert scene_from_dict(json.loads(described.model_dump_json())) == described
+
+
+# Refused -------------------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "no lights": ({"lights": []}, "rig.lights = []: must have at least 1 item"),
+    "unknown preset": ({"preset": "torch"}, "rig.preset = 'torch': must be 'colocated', 'laparoscope'"),
+    "preset and lights": ({"preset": "colocated", "lights": [{}]}, "preset and lights exclude each other"),
+    "count alone": ({"count": 3}, "rig: count: belongs to a preset"),
+    "all in one place": ({"preset": "colocated", "count": 3}, "count = 3: with radius_mm = 0"),
+    "wide spot": ({"lights": [{"spot_deg": 200.0}]}, "rig.lights.0: spot_deg = 200: must be at most 180"),
+    "spot 0": ({"lights": [{"spot_deg": 0.0}]}, "rig.lights.0.spot_deg = 0.0: must be greater than 0"),
+    "edge": ({"lights": [{"spot_deg": 50, "soft_edge_deg": 30}]}, "soft_edge_deg = 30: must be at most half of spot"),
+    "edge alone": ({"lights": [{"soft_edge_deg": 3}]}, "soft_edge_deg = 3: needs spot_deg"),
+    "no direction": ({"lights": [{"direction": [0, 0, 0]}]}, "direction = [0.0, 0.0, 0.0]: must have a length"),
+    "black": ({"lights": [{"colour": [0, 0, 0]}]}, "colour = [0.0, 0.0, 0.0]: one of the channels must be positive"),
+    "negative error": ({"lights": [{"position_error_mm": -1}]}, "position_error_mm = -1: must be greater than"),
+    "each of lights": ({"each": {"spot_deg": 200}, "preset": "laparoscope"}, "rig.each: spot_deg = 200"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_rigs_are_refused_in_one_line(name):
+    rig, message = REFUSED[name]
+    with pytest.raises(InputError) as error:
+        scene(rig=rig)
+    assert message in str(error.value)
+    assert str(error.value).isprintable()
+
+
+SOLIDS = {
+    "plane": {"type": "plane"},
+    "sphere": {"type": "sphere", "radius_mm": 4.0},
+    "cylinder": {"type": "cylinder", "radius_mm": 4.0},
+    "quadric": {"type": "quadric", "k1_per_mm": 0.1, "k2_per_mm": 0.1},
+    "liver": {"type": "anatomy", "path": "liver"},
+}
+
+
+@render
+@pytest.mark.parametrize("name", [*list(SOLIDS)[:-1], pytest.param("liver", marks=pytest.mark.slow)])
+def test_a_light_inside_a_body_is_refused_and_the_session_stays(session, name):
+    session.update(scene())
+    before = session.radiance().total
+    depth = 13.0 if name != "liver" else float(np.nanmin(_depth(SOLIDS[name])) + 10.0)
+    with pytest.raises(InputError, match=r"rig\.lights\.1 at .* lies .* mm inside the"):
+        session.update(scene([{}, {"position_mm": [0.0, 0.0, depth]}], SOLIDS[name]))
+    np.testing.assert_array_equal(session.radiance().total, before)
+    session.update(scene([{}, {"position_mm": [0.0, 0.0, 0.5 * depth if name != "liver" else 1.0]}], SOLIDS[name]))
+
+
+def _depth(surface):
+    return Session(scene(surface=surface)).truth(8).depth
+
+
+@render
+def test_a_camera_inside_the_wall_is_refused():
+    bowl = {"type": "quadric", "k1_per_mm": -0.5, "k2_per_mm": 0.0, "tilt_deg": 60.0}
+    with pytest.raises(InputError, match=r"the camera lies .* mm inside the wall"):
+        Session(scene(surface=bowl))
+
+
+@render
+def test_a_frame_that_no_light_reaches_is_dark(session):
+    """A light behind the lumen's wall, a spot that looks away: zeros, no NaN."""
+    for light, depth in (({"position_mm": [0.0, 0.0, 30.0]}, 3), ({"spot_deg": 60.0, "direction": [0, 0, -1.0]}, 2)):
+        session.update(scene([light], INSIDE, GLOSSY, samples_per_pixel=2, path_depth=depth))
+        frame = session.frame()
+        for part in (frame.radiance.specular, frame.radiance.diffuse, frame.radiance.indirect):
+            np.testing.assert_array_equal(part, 0)
+        assert not any(h.lit for h in session.highlights(frame.radiance))
+
+
+# Colour --------------------------------------------------------------------------------------------------------------
+
+_COLOURS = """
+import numpy as np, sys
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+def frame(colour, depth):
+    tables = {"surface": {"type": "sphere", "radius_mm": 9.0, "side": "inside"},
+              "rig": {"lights": [{"colour": colour}]}, "reflectance": {"type": "phong", "diffuse": 0.5},
+              "render": {"path_depth": depth, "samples_per_pixel": 2},
+              "camera": {"width": 32, "height": 32, "fx": 30, "fy": 30}}
+    return Session(scene_from_dict(tables), "llvm_ad_rgb").radiance()
+white, tinted = frame([1, 1, 1], 3), frame([1.0, 0.5, 0.0], 3)
+assert white.total.shape == (32, 32, 3)
+for part in ("specular", "diffuse", "indirect"):
+    a, b = getattr(white, part), getattr(tinted, part)
+    assert a.max() > 0, part
+    np.testing.assert_allclose(b, a * [1.0, 0.5, 0.0], rtol=1e-4, atol=1e-8)
+"""
+
+
+@render
+def test_colour_tints_all_parts():
+    done = subprocess.run([sys.executable, "-c", _COLOURS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@render
+def test_mono_variants_take_the_colours_luminance(session):
+    session.update(scene([{"colour": [1.0, 0.5, 0.0]}]))
+    tinted = session.radiance().total
+    session.update(scene())
+    np.testing.assert_allclose(tinted, (0.212671 + 0.5 * 0.715160) * session.radiance().total, rtol=1e-5)

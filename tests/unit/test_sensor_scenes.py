@@ -1,0 +1,316 @@
+"""Sensors in rendered scenes: the law of vignetting, dark frames, exposure, saturation, and pictures that read back."""
+
+import json
+import math
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.api import render
+from simtest.dataset import write_frame
+from simtest.errors import Failure, InputError, Reason
+from simtest.picture import reconstruct_picture
+from simtest.reconstruction import reconstruct
+from simtest.rendering import Session
+from simtest.spec import Experiment, load_calibration, scene_from_dict
+from simtest.validation import laws
+from simtest.validation.metrics import angle_deg
+from simtest.validation.realise import view
+from simtest.validation.runner import run_experiment
+
+pytestmark = pytest.mark.render
+
+COS4 = {"type": "cosine", "power": 4.0}
+LIMIT_DEG = 0.02
+ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+
+
+def scene(sensor=None, tilt=10.0, size=320, focal=250.0, surface=None, **keys):
+    shape = {"type": "plane", "tilt_deg": tilt, "azimuth_deg": 30.0, **(surface or {})}
+    camera = {"width": size, "height": size, "fx": focal, "fy": focal}
+    return scene_from_dict({"surface": shape, "camera": camera, "sensor": sensor or {}, **keys})
+
+
+@pytest.fixture(scope="module")
+def session():
+    return Session(scene())
+
+
+def errors(session, described, seeds=(0,)):
+    """Give each estimator's errors, deg, against the normal at the true BP."""
+    seen = view(session, described)
+    normal = seen.truths[0].highlight.normal
+    made = {name: [] for name in ESTIMATORS}
+    for seed in seeds:
+        (found,) = reconstruct(seen.frame(seed), seen.calibration)
+        for name, estimate in found.estimates.items():
+            made[name].append(float(angle_deg(estimate.candidates, normal).min()))
+    return made
+
+
+# Vignetting ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_known_vignetting_is_undone(session, sigma):
+    """cos^4, the highlight 20 deg off axis; the full-size frame, whose lobe is as wide as the project's others."""
+    sensor = {"vignetting": COS4, "noise_sigma": sigma}
+    made = errors(session, scene(sensor, tilt=20.0, size=560, focal=406.0), range(10 if sigma else 1))
+    assert np.max(made["cone_axis"]) < LIMIT_DEG
+
+
+@pytest.mark.parametrize("tilt", [5.0, 10.0, 20.0])
+@pytest.mark.parametrize("exponent", [50.0, 200.0])
+def test_unknown_vignetting_follows_its_law(session, tilt, exponent):
+    sensor = {"vignetting": COS4, "vignetting_known": False}
+    phong = {"type": "phong", "exponent": exponent}
+    made = errors(session, scene(sensor, tilt=tilt, size=560, focal=406.0, reflectance=phong))
+    phi = math.radians(tilt)
+    # To leading order, for all estimators (theory.md section 4).
+    leading = math.degrees(4 * math.tan(phi) / (4 * exponent + 2))
+    assert made["cone_axis"][0] == pytest.approx(leading, rel=0.03)
+    # Whole: the cone's axis at the default isovalues to 1 %, the peak to 2 % or a fiftieth of a pixel.
+    peak = math.degrees(laws.vignetting_shift(phi, 4.0, 4 * exponent))
+    axis = np.degrees(laws.vignetting_shift(phi, 4.0, 4 * exponent, isovalue=[0.3, 0.4, 0.5, 0.6, 0.7])).mean()
+    assert made["cone_axis"][0] == pytest.approx(axis, rel=0.01)
+    assert made["brightest_point"][0] == pytest.approx(peak, rel=0.02, abs=0.003)
+
+
+@pytest.mark.parametrize(("side", "radius"), [("outside", 10.0), ("outside", 5.0), ("inside", 30.0)])
+def test_the_law_holds_on_spheres(session, side, radius):
+    """By 1 + d k, convex and concave; the highlight is brought off axis by the tilt of the sphere."""
+    sensor = {"vignetting": {"type": "cosine", "power": 8.0}, "vignetting_known": False}
+    ball = {"type": "sphere", "side": side, "radius_mm": radius}
+    described = scene(sensor, tilt=20.0, size=400, focal=300.0, surface=ball)
+    seen = view(session, described)
+    truth = seen.truths[0].highlight
+    (found,) = reconstruct(seen.frame(0), seen.calibration)
+    estimate = found.estimates["cone_axis"]
+    phi = np.arccos(truth.position[2] / np.linalg.norm(truth.position))
+    isovalues = [i.isovalue for i in estimate.isophotes]
+    law = np.degrees(laws.vignetting_shift(phi, 8.0, 200.0, truth.kd_min, isovalues)).mean()
+    assert law > 0.02
+    assert float(angle_deg(estimate.normal, truth.normal)) == pytest.approx(law, rel=0.03)
+
+
+def test_the_law_is_in_the_rows_where_it_speaks(tmp_path):
+    group = {"scene": "plane", "isolated": False, "set": {
+        "camera.width": 320, "camera.height": 320, "camera.fx": 250.0, "camera.fy": 250.0, "sensor.noise_sigma": 0.0,
+        "sensor.vignetting": COS4,
+    }, "sweep": [{"sensor.vignetting_known": [True, False]}]}  # fmt: skip
+    experiment = Experiment.model_validate({"name": "law", "realisations": 1, "groups": [group]})
+    rows = run_experiment(experiment, tmp_path / "run").results
+    known = rows.filter(rows["sensor.vignetting_known"])
+    unknown = rows.filter(~rows["sensor.vignetting_known"] & (rows["estimator"] != "circle_pose"))
+    assert known["error_law_deg"].null_count() + known["error_law_deg"].eq(0).sum() >= 2
+    for row in unknown.iter_rows(named=True):
+        assert row["error_deg"] == pytest.approx(row["error_law_deg"], rel=0.02)
+
+
+# Exposure and saturation ---------------------------------------------------------------------------------------------
+
+
+def test_full_scale_is_fixed_or_a_percentile_or_the_highlights(session):
+    def full_scale(exposure):
+        return view(session, scene({"exposure": exposure})).full_scale
+
+    light = view(session, scene()).light
+    assert full_scale({"full_scale": 0.02}) == 0.02
+    assert full_scale({"full_scale": 0.02, "gain": 4.0}) == 0.005
+    assert full_scale({"percentile": 90.0}) == pytest.approx(float(np.percentile(light, 90)))
+    assert full_scale({"percentile": 100.0}) == pytest.approx(float(light.max()))
+    # The highlight's nearest pixel; the brightest is at most the next.
+    assert full_scale({}) == pytest.approx(float(light.max()), rel=1e-3)
+    assert full_scale({"gain": 2.0}) == full_scale({}) / 2
+
+
+def test_a_percentile_without_light_falls_back_on_the_maximum(session):
+    sharp = {"type": "phong", "exponent": 20000.0}
+    described = scene({"exposure": {"percentile": 1.0}}, reflectance=sharp, tilt=20.0)
+    with pytest.warns(UserWarning, match="percentile = 1") as caught:
+        seen = view(session, described)
+    assert len(caught) == 1
+    assert seen.full_scale == pytest.approx(float(seen.light.max()))
+
+
+@pytest.mark.parametrize("gain", [1.5, 2.0, 4.0])
+def test_clipped_highlights_are_answered_and_flagged(session, gain):
+    sensor = {"saturation": True, "exposure": {"gain": gain}, "noise_sigma": 0.02}
+    described = scene(sensor, size=406, focal=406.0)
+    seen = view(session, described)
+    assert seen.frame(0).max() == 1.0
+    (found,) = reconstruct(seen.frame(0), seen.calibration)
+    assert found.patch.saturated_share(0.5) == pytest.approx(math.log(gain) / math.log(2 * gain), abs=0.02)
+    assert all("saturated" in estimate.flags for estimate in found.estimates.values())
+    made = errors(session, described, range(5))
+    assert np.max(made["cone_axis"]) < LIMIT_DEG
+    assert np.max(made["brightest_point"]) < 0.25
+
+
+def test_peak_snr_is_that_of_the_peaks_level(session):
+    read = view(session, scene({"full_well": 400.0, "read_noise": 10.0})).truths[0].peak_snr
+    white = view(session, scene({"noise_sigma": 0.05})).truths[0].peak_snr
+    # sqrt(400 + 100) electrons of 400; the smoothed peak is a little below full scale.
+    assert read / white == pytest.approx(0.05 / (math.sqrt(500) / 400), rel=0.02)
+    assert view(session, scene()).truths[0].peak_snr == np.inf
+
+
+# Darkness ------------------------------------------------------------------------------------------------------------
+
+NO_LIGHT = {"vignetting": {"type": "table", "angle_deg": [0.0, 1e-6], "value": [1.0, 0.0]}}
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {},
+        {"exposure": {"percentile": 50.0}},
+        {"exposure": {"full_scale": 1.0}},
+        {"full_well": 100.0},
+        {"point_spread_px": 2.0, "saturation": True},
+        {"bits": 8, "response": {"type": "srgb"}},
+        {"response": {"type": "gamma"}, "vignetting_known": False},
+    ],
+    ids=str,
+)
+def test_a_dark_frame_is_zero_with_one_warning(session, sensor):
+    with pytest.warns(UserWarning, match="no light reaches the sensor") as caught:
+        seen = view(session, scene({**NO_LIGHT, **sensor}))
+    assert len(caught) == 1
+    assert seen.full_scale == 0
+    np.testing.assert_array_equal(seen.light, 0)
+    frame = seen.frame(0)
+    np.testing.assert_array_equal(frame, 0)
+    assert not any(truth.isolated for truth in seen.truths)
+    assert reconstruct(frame, seen.calibration) == []
+    (found,) = reconstruct(frame, seen.calibration, roi=(100, 100, 80, 80))
+    for result in found.estimates.values():
+        assert isinstance(result, Failure)
+        assert result.reason == Reason.NO_PEAK
+
+
+@pytest.mark.parametrize("isolated", [True, False])
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_rows_of_a_dark_frame_are_failures(tmp_path, isolated, sigma):
+    group = {"scene": "plane", "isolated": isolated, "set": {
+        "camera.width": 64, "camera.height": 64, "camera.fx": 64.0, "camera.fy": 64.0,
+        "sensor": {**NO_LIGHT, "noise_sigma": sigma},
+    }}  # fmt: skip
+    experiment = Experiment.model_validate({"name": "dark", "realisations": 3, "groups": [group]})
+    with pytest.warns(UserWarning, match="no light reaches the sensor") as caught:
+        run = run_experiment(experiment, tmp_path / "run")
+    assert len(caught) == 1
+    assert run.results["status"].to_list() == ["no_light"] * 9
+    (figures,) = {json.dumps(f) for f in run.summary["experiments"]["dark"]["settings"]["plane"].values()}
+    assert json.loads(figures)["n_failed_by_reason"] == {"no_light": 3}
+
+
+def test_a_dark_scene_is_rendered_without_nan(tmp_path):
+    with pytest.warns(UserWarning, match="no light"):
+        frame = render(scene(NO_LIGHT, size=64))
+    files = write_frame(frame, tmp_path)
+    assert not cv2.imread(str(files[0]), cv2.IMREAD_UNCHANGED).any()
+    assert json.loads((tmp_path / "frame.json").read_text())["full_scale"] == 0
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+ENCODED = [
+    {"bits": 8, "response": {"type": "gamma", "gamma": 2.2}},
+    {"bits": 8},
+    {"bits": 12, "response": {"type": "srgb"}, "vignetting": COS4, "noise_sigma": 0.01, "exposure": {"gain": 1.5}},
+    {"response": {"type": "table", "light": [0, 0.2, 1], "value": [0, 0.5, 1]}, "full_well": 2000, "read_noise": 5},
+    {"vignetting": COS4, "saturation": True, "exposure": {"gain": 2.0}},
+]
+
+
+@pytest.mark.parametrize("sensor", ENCODED, ids=range(len(ENCODED)))
+def test_pictures_read_back_as_the_frame(tmp_path, sensor):
+    described = scene(sensor, size=240, focal=200.0)
+    frame = render(described)
+    write_frame(frame, tmp_path)
+    bits = 16 if described.sensor.encodes and described.sensor.bits != 8 else 8
+    picture = cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED)
+    assert picture.dtype == (np.uint8 if bits == 8 else np.uint16)
+    if described.sensor.encodes:
+        step = 1 / (2 ** (described.sensor.bits or 16) - 1)
+        assert np.abs(picture / np.iinfo(picture.dtype).max - frame.image).max() < 0.5 * step
+        told = json.loads((tmp_path / "frame.json").read_text())["encoding"]
+        assert told["response"] == described.sensor.response.model_dump(mode="json")
+        assert (told["bits"], told["png_bits"]) == (described.sensor.bits, bits)
+    calibration = load_calibration(tmp_path / "calibration.toml")
+    assert calibration.vignetting == described.calibration().vignetting
+    assert calibration.camera == described.camera.model()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        count, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / "calibration.toml")
+    assert count == 1
+    (direct,) = reconstruct(frame.image, described.calibration())
+    (read,) = json.loads((tmp_path / "normals" / "normals.json").read_text())["specularities"]
+    for name, estimate in direct.estimates.items():
+        made = read["estimates"][name]
+        if name != "circle_pose":
+            assert angle_deg(np.array(made["normal"]), estimate.normal) < (0.005 if bits == 16 else 0.05)
+        assert made["flags"] == list(estimate.flags)
+    truth = frame.highlights[0].highlight.normal
+    assert angle_deg(np.array(read["estimates"]["cone_axis"]["normal"]), truth) < LIMIT_DEG
+
+
+LENS = {
+    "width": 400, "height": 400, "fx": 200.0, "fy": 200.0, "view_mask": {"radius": 190.0},
+    "distortion": {"type": "kannala_brandt", "k1": -0.02},
+}  # fmt: skip
+
+
+def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
+    """Lens, view mask, vignetting and response through the files; the lens and the falloff are missed if left out."""
+    surface = {"type": "plane", "tilt_deg": 40.0, "azimuth_deg": 30.0}
+    sensor = {"vignetting": COS4, "response": {"type": "gamma"}, "bits": 12, "exposure": {"gain": 0.8}}
+    frame = render(scene_from_dict({"surface": surface, "camera": LENS, "sensor": sensor}))
+    write_frame(frame, tmp_path)
+    truth = frame.highlights[0].highlight.normal
+    stated = (tmp_path / "calibration.toml").read_text()
+    assert load_calibration(tmp_path / "calibration.toml").camera == frame.camera
+
+    def error(text):
+        (tmp_path / "told.toml").write_text(text)
+        count, files = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / "told.toml")
+        document = json.loads(files[0].read_text())
+        assert count == 1
+        assert document["camera"]["view_mask"]["radius"] == 190.0
+        made = document["specularities"][0]["estimates"]["cone_axis"]
+        assert made["flags"] == []
+        return angle_deg(np.array(made["normal"]), truth)
+
+    assert error(stated) < LIMIT_DEG
+    without_lens = "\n".join(line for line in stated.splitlines() if not line.startswith("distortion"))
+    without_falloff = stated.replace("power = 4.0", "power = 0.0")
+    assert error(without_lens) > 1
+    # About 4 tan(phi) / (4 n + 2), the law of a pinhole's vignetting.
+    assert error(without_falloff) > 0.5
+
+
+def test_a_plain_sensor_writes_what_it_always_did(tmp_path):
+    frame = render(scene({"noise_sigma": 0.02}, size=80, focal=80.0))
+    names = [path.name for path in write_frame(frame, tmp_path)]
+    assert names == ["frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml"]
+    assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+    assert "encoding" not in json.loads((tmp_path / "frame.json").read_text())
+
+
+def test_what_is_not_known_is_not_written(tmp_path):
+    sensor = {"vignetting": COS4, "vignetting_known": False, "response": {"type": "gamma"}, "response_known": False}
+    write_frame(render(scene(sensor, size=80, focal=80.0)), tmp_path)
+    calibration = load_calibration(tmp_path / "calibration.toml")
+    assert calibration.response.kind == "linear"
+    assert calibration.falloff is None
+
+
+def test_two_encodings_are_refused(tmp_path):
+    write_frame(render(scene({"bits": 8}, size=80, focal=80.0)), tmp_path)
+    with pytest.raises(InputError, match="--encoding srgb: the calibration states the response"):
+        reconstruct_picture(
+            tmp_path / "frame.png", tmp_path / "normals", tmp_path / "calibration.toml", encoding="srgb"
+        )
