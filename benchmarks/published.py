@@ -72,7 +72,7 @@ def _ratio(name: str, setting: PaperSetting, rounds: int = 15) -> Figure:
     )
     each = {key: 1e3 * value / PAPER_CHUNK for key, value in times.items()}
     about = f"{each['rows']:.3f} ms a realisation against {each['floor']:.3f} ms"
-    return Figure(name, times["rows"] / times["floor"], 1.8, about=about)
+    return Figure(name, times["rows"] / times["floor"], about=about)
 
 
 def floor(setting: PaperSetting, seeds: list[int]) -> None:

@@ -26,6 +26,10 @@ PIXEL_CENTRE = 0.5
 DEFAULT_SMOOTHING_PX = 2.0
 """Standard deviation of the Gaussian that smooths a frame before isophotes are traced, in px."""
 
+PAPER_SMOOTHING_PX = 3.0
+"""The same in the published protocol, in px. The article does not state it; its slope against n and its best isovalue
+are those of about 3 px (docs/experiments.md)."""
+
 CIRCLE_POSE_ISOVALUE = 0.5
 """Default isovalue of `circle_pose` in rendered experiments."""
 

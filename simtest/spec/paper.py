@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.geometry.camera import Camera
 from simtest.spec.reading import Spec, validate
 
@@ -23,7 +23,7 @@ class PaperSetting(Spec):
     isovalue: float = Field(0.1, gt=0, lt=1, description="t")
     theta_deg: float = Field(58.0, ge=0, lt=90, description="slant, deg")
     smoothing_px: float = Field(
-        DEFAULT_SMOOTHING_PX, ge=0, le=50, description="standard deviation of the Gaussian smoothing, px"
+        PAPER_SMOOTHING_PX, ge=0, le=50, description="standard deviation of the Gaussian smoothing, px"
     )
     recentre: bool = Field(True, description="centre the texture's window at the BP; false: at the camera's foot")
 

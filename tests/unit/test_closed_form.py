@@ -128,7 +128,8 @@ def test_every_pixel_has_the_radiance_of_the_formula(session, name, exponent):
                 dark += np.count_nonzero(cos_light < -1e-6)
             compared += np.count_nonzero(bright)
     assert compared > 50_000
-    assert dark > (10_000 if name == "sphere" else 0)
+    # Seen from in front of it, a plane has no side that its light does not reach.
+    assert dark > 10_000 or name == "plane"
 
 
 # Mitsuba's own integrators -----------------------------------------------------------------------------------------

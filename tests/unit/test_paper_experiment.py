@@ -10,7 +10,7 @@ from simtest.validation.cases import expand
 from simtest.validation.metrics import SCHEMA
 from simtest.validation.runner import run_experiment
 
-SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3}
+SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3, "paper.smoothing_px": 2.0}
 
 
 def small(**more):

@@ -170,7 +170,7 @@ def test_statements_need_the_articles_settings_and_method(tmp_path):
     rows = rows_of("noise", "sigma", MEANS["sigma"], {"exponent": 70.0})
     rows += rows_of("slant", "theta_deg", MEANS["theta_deg"], estimator="cone_axis")
     assert {row.verdict for row in judged(tmp_path / "other", rows).values()} == {ABSENT}
-    wider = rows_of("noise", "sigma", MEANS["sigma"], {"smoothing_px": 3.0})
+    wider = rows_of("noise", "sigma", MEANS["sigma"], {"smoothing_px": 5.0})
     assert judged(tmp_path / "wider", wider)["the mean error grows with the noise"].verdict == AGREES
 
 
@@ -178,8 +178,8 @@ def test_the_slopes_explanation_is_computed(tmp_path):
     means = {30.0: 0.4, 75.0: 0.55, 120.0: 0.7}
     rows = rows_of("n", "exponent", means, law=lambda n: 0.0025 * n)
     reason = judged(tmp_path, rows)["about linear, slope about 10⁻² degrees per unit"].because
-    assert "0.0025° per unit is predicted at this run's s = 2 px" in reason
-    assert "about 4 px" in reason
+    assert "0.0025° per unit is predicted at this run's s = 3 px" in reason
+    assert "about 6 px" in reason
 
 
 def test_limits_are_judged(tmp_path):

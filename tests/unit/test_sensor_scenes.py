@@ -61,6 +61,24 @@ def test_known_vignetting_is_undone(session, sigma):
     assert np.max(made["cone_axis"]) < LIMIT_DEG
 
 
+def test_known_emission_is_undone_and_unknown_emission_follows_the_law_of_vignetting(session):
+    """A cos^4 light at the camera, the highlight 20 deg off axis."""
+    for known in (True, False):
+        rig = {"lights": [{"profile": COS4}], "emission_known": known}
+        described = scene(tilt=20.0, size=560, focal=406.0, rig=rig)
+        (error,) = errors(session, described)["cone_axis"]
+        law = math.degrees(laws.vignetting_shift(math.radians(20.0), 4.0, 200.0))
+        assert error < 0.002 if known else error == pytest.approx(law, rel=0.03)
+
+
+def test_the_emission_of_other_rigs_is_not_divided_away():
+    """Beside the camera, or aslant, what a pixel gets hangs on the distance too."""
+    light = {"profile": COS4}
+    for lights in ([{**light, "offset_mm": 1.0}], [{**light, "direction": [1, 0, 1]}], [light, {"offset_mm": 2.0}]):
+        assert scene(rig={"lights": lights}).calibration().emission.is_uniform
+    assert scene(rig={"lights": [light]}).calibration().emission.power == 4.0
+
+
 @pytest.mark.parametrize("tilt", [5.0, 10.0, 20.0])
 @pytest.mark.parametrize("exponent", [50.0, 200.0])
 def test_unknown_vignetting_follows_its_law(session, tilt, exponent):

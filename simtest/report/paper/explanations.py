@@ -1,6 +1,6 @@
 """Why this run departs from the article, where it does: two sentences each, shown under the table."""
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.report.paper.sweeps import Sweep
 from simtest.report.style import number
 
@@ -65,7 +65,7 @@ def exponent_slope(sweep: Sweep, law_slope: float, published: float) -> str:
             "The slope hangs on the smoothing's width, which the article does not state. "
             "This run has no prediction of the smoothing's bias to compare it with."
         )
-    width = float(sweep.fixed.get("smoothing_px") or DEFAULT_SMOOTHING_PX)
+    width = float(sweep.fixed.get("smoothing_px") or PAPER_SMOOTHING_PX)
     return (
         f"The slope is mainly the smoothing's bias, which grows with n s²: without noise {number(law_slope)}° per "
         f"unit is predicted at this run's s = {width:g} px. The article does not state its width; "
