@@ -81,7 +81,10 @@ class Exposure(Spec):
 
     full_scale: float | None = Field(None, gt=0, le=1e12, description="radiance at full scale, fixed")
     percentile: float | None = Field(
-        None, gt=0, le=100, description="automatic: this percentile of the frame's radiance becomes full scale"
+        None,
+        gt=0,
+        le=100,
+        description="automatic: this percentile of the frame's radiance, inside the view mask, becomes full scale",
     )
     gain: float = Field(1.0, gt=0, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 

@@ -310,6 +310,17 @@ def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
     assert error(without_falloff) > 0.5
 
 
+def test_the_automatic_exposure_goes_by_what_is_in_view(session):
+    described = {"surface": {"type": "plane"}, "camera": LENS | {"view_mask": {"radius": 60.0}}}
+    sensor = {"exposure": {"percentile": 50.0}, "vignetting": COS4}
+    seen = view(
+        session, scene_from_dict({**described, "reflectance": {"type": "phong", "diffuse": 0.3}, "sensor": sensor})
+    )
+    inside = session.camera.seen
+    assert np.median(seen.light) == 0
+    assert np.mean(seen.light[inside] > seen.full_scale) == pytest.approx(0.5, abs=0.01)
+
+
 def test_a_plain_sensor_writes_what_it_always_did(tmp_path):
     frame = render(scene({"noise_sigma": 0.02}, size=80, focal=80.0))
     names = [path.name for path in write_frame(frame, tmp_path)]
