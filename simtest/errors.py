@@ -31,6 +31,7 @@ class Reason(StrEnum):
     NOT_AN_ELLIPSE = "not_an_ellipse"
     DEGENERATE_CONIC = "degenerate_conic"
     NOT_FINITE = "not_finite"
+    NOT_CONVERGED = "not_converged"
     ESTIMATOR_ERROR = "estimator_error"
 
 

@@ -3,6 +3,7 @@
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -90,15 +91,16 @@ def reconstruct(
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
     roi = None if roi is None else _check_roi(roi)
     chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
-    seen, clipped = view.seen, corrected.saturated
+    seen = view.seen
+    masks: dict[str, Any] = {"saturated": corrected.saturated, "seen": seen, "raw": corrected.intensity}
     smoothed = smooth(corrected.intensity, smoothing_px, seen)
     if roi is not None:
-        patch = Patch.cut(smoothed, roi, saturated=clipped, seen=seen)
+        patch = Patch.cut(smoothed, roi, **masks)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
         regions = detect(smoothed, _noise(corrected, calibration, smoothing_px), isolated, seen)
-        found = [(r, Patch.cut(smoothed, r.box, r.peak, saturated=clipped, seen=seen)) for r in regions]
+        found = [(r, Patch.cut(smoothed, r.box, r.peak, **masks)) for r in regions]
     return [
         Specularity(
             region,

@@ -71,6 +71,8 @@ class Patch:
         Where the sensor is clipped; None where that is not known.
     seen : ndarray of bool, shape (h, w), optional
         The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
+    raw : ndarray, shape (h, w), optional
+        Intensities before smoothing, whose noise is independent from pixel to pixel.
     """
 
     values: Image | Array
@@ -80,6 +82,7 @@ class Patch:
     peak_pixel: tuple[int, int]
     saturated: Mask | None = None
     seen: Mask | None = None
+    raw: Image | Array | None = None
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -91,6 +94,7 @@ class Patch:
         origin_px: tuple[int, int] = (0, 0),
         saturated: Mask | None = None,
         seen: Mask | None = None,
+        raw: Image | Array | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -108,6 +112,8 @@ class Patch:
             Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
         seen : ndarray of bool, shape (H, W), optional
             The frame's pixels inside the camera's view mask; default all.
+        raw : ndarray, shape (H, W), optional
+            The frame before smoothing.
 
         Returns
         -------
@@ -139,6 +145,7 @@ class Patch:
         if value <= 0 or value <= lowest:
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         corner = (x + origin_px[0], y + origin_px[1])
+        unsmoothed = None if raw is None else raw[y : y + height, x : x + width]
         clipped = None if saturated is None else saturated[y : y + height, x : x + width]
         plateau = None if clipped is None else _plateau(clipped, row, column)
         if plateau is None:
@@ -149,7 +156,9 @@ class Patch:
             # Where falloff was divided away the plateau is slanted, and highest at its rim.
             column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
             value = float(values[row, column])
-        return cls(values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen)
+        return cls(
+            values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen, unsmoothed
+        )
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].

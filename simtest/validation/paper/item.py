@@ -46,7 +46,7 @@ def save_realisation(
     """
     pipeline = pipeline_with(setting, estimators)
     stages = pipeline.stages(from_integer(seed))
-    patch = pipeline.cut(stages.smoothed)
+    patch = pipeline.cut(stages.smoothed, stages.noisy)
     camera = setting.camera
     spot = _on_plane(setting, _bp(setting, stages))
     peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()

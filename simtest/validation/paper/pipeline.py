@@ -92,7 +92,8 @@ class Pipeline:
 
     def patch(self, rng: np.random.Generator) -> Patch | Failure:
         """Give the smoothed region of interest of one realisation (see `realise`)."""
-        return self.cut(self.stages(rng).smoothed)
+        stages = self.stages(rng)
+        return self.cut(stages.smoothed, stages.noisy)
 
     def stages(self, rng: np.random.Generator) -> Stages:
         """Make the pictures of one realisation (see `realise`)."""
@@ -108,11 +109,11 @@ class Pipeline:
             smoothed = cv2.GaussianBlur(noisy, (side, side), setting.smoothing_px, borderType=cv2.BORDER_REFLECT)
         return Stages(light, clean, noisy, smoothed)
 
-    def cut(self, smoothed: Array) -> Patch | Failure:
-        """Cut the region of interest out of the smoothed outer region."""
+    def cut(self, smoothed: Array, noisy: Array) -> Patch | Failure:
+        """Cut the region of interest out of the outer region, smoothed and not."""
         x, y, width, height = self.region
         box = (x - self.outer[0], y - self.outer[1], width, height)
-        return Patch.cut(smoothed, box, origin_px=self.outer[:2])
+        return Patch.cut(smoothed, box, origin_px=self.outer[:2], raw=noisy)
 
 
 def kernel_radius(setting: PaperSetting) -> int:

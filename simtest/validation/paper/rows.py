@@ -11,6 +11,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.checked import one_by_one
 from simtest.estimators.circle_pose import circle_poses
+from simtest.estimators.photometric import photometric_plane
 from simtest.seeds import from_integer
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import SCHEMA, angle_deg
@@ -65,6 +66,9 @@ def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipelin
     batched = {name: one_by_one(estimator) for name, estimator in load_estimators(estimators).items()}
     if "circle_pose" in batched:
         batched["circle_pose"] = partial(circle_poses, isovalue=setting.isovalue)
+    if "photometric" in batched:
+        # The camera is not at the light: the model is another one.
+        batched["photometric"] = one_by_one(photometric_plane)
     return Pipeline(setting, batched)
 
 

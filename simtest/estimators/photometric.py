@@ -1,0 +1,225 @@
+"""`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import Failure, Reason
+from simtest.estimators.base import Estimate, FittedIsophote
+from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.lobe_fit import LobeFit, fit_lobe
+from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
+from simtest.geometry import Camera, Patch, cone_rays
+from simtest.geometry.vectors import tangent_basis
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
+"""Isovalues whose region's pixels are fitted: the first one that closes. Further out there is little but noise."""
+
+START_ISOVALUE = 0.3
+"""Of the circle pose that a plane seen from aside starts with."""
+
+MAX_PIXELS = 16384
+"""Of a larger region every second, third ... pixel is fitted, evenly spread."""
+
+
+COARSE = 4
+"""Every so many pixels tell the two candidates of a plane apart."""
+
+
+SAME_RAD = 1e-3
+"""Two fits closer than this are one."""
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels that are fitted: their sightlines and intensities, and which are clipped."""
+
+    rays: Array
+    observed: Array
+    clipped: Mask | None
+
+    def every(self, step: int) -> "_Pixels":
+        """Give every so many pixels."""
+        clipped = None if self.clipped is None else self.clipped[::step]
+        return _Pixels(self.rays[::step], self.observed[::step], clipped)
+
+
+def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
+    """Fit a quadric patch seen by a camera with its own light, started from `cone_axis`.
+
+    N = -s with s the sightline of the BP; beside it the shape d S, the lobe's scale and, with the shape all but
+    degenerate, its exponent are open. Under white noise it is the maximum-likelihood estimate. Clipped pixels count
+    as "at least this bright". Pixels are those before smoothing where the patch has them.
+
+    Parameters
+    ----------
+    patch : Patch
+        Region of interest.
+    camera : Camera
+        Calibration.
+
+    Returns
+    -------
+    Estimate or Failure
+        One candidate with its covariance; it looks at the fitted BP.
+    """
+    start = cone_axis(patch, camera)
+    if isinstance(start, Failure):
+        return start
+    pixels = _pixels(patch, camera)
+    if isinstance(pixels, Failure):
+        return pixels
+    fitted = fit_lobe(_quadric(start, patch, pixels.rays), pixels.observed, pixels.clipped)
+    if fitted is None:
+        return Failure(Reason.NOT_CONVERGED, "the fit of a quadric did not converge")
+    e, f, s = fitted.model.frame
+    covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
+    ratio = _axis_ratio(fitted.model)
+    return _estimate(fitted, fitted.model.normal[None], camera.project(s), covariance, start.isophotes, ratio)
+
+
+def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = START_ISOVALUE) -> Estimate | Failure:
+    """Fit a plane that is lit from above the BP and pictured from aside [MB, section 3.1], started from `circle_pose`.
+
+    Both candidates of the pose are fitted. They see the picture's perspective differently, so that the sum of squares
+    tells them apart: `choice_margin` is the root of its difference over the noise.
+
+    Parameters
+    ----------
+    patch : Patch
+        Region of interest.
+    camera : Camera
+        Calibration.
+    start_isovalue : float
+        Of the circle pose; higher ones are tried where it does not close.
+
+    Returns
+    -------
+    Estimate or Failure
+        The fitted normals, the better one first, with its covariance; it looks at the fitted BP.
+    """
+    start = _pose(patch, camera, start_isovalue)
+    if isinstance(start, Failure):
+        return start
+    pixels = _pixels(patch, camera)
+    if isinstance(pixels, Failure):
+        return pixels
+    foot = camera.unproject(patch.peak_px)
+    few, fits = pixels.every(COARSE), []
+    for normal in start.candidates:
+        if normal @ foot < 0:
+            model = _plane(normal, foot / foot[2], start.isophotes[0], patch.peak_value, few.rays)
+            fitted = fit_lobe(model, few.observed, few.clipped)
+            if fitted is not None and (pixels.rays @ fitted.model.normal < 0).all():
+                fits.append(fitted)
+    fits.sort(key=lambda fitted: fitted.chi2)
+    if len(fits) > 1 and fits[0].model.normal @ fits[1].model.normal > np.cos(SAME_RAD):
+        # Near the branch point both lead to one minimum.
+        fits.pop()
+    best = fit_lobe(replace(fits[0].model, rays=pixels.rays), pixels.observed, pixels.clipped) if fits else None
+    if best is None:
+        return Failure(Reason.NOT_CONVERGED, "no fit of a plane converged")
+    basis = np.stack([direction[0] for direction in tangent_basis(best.model.normal[None])])
+    covariance = _turned(best.covariance[:2, :2], best.model.normal, basis)
+    margin = None
+    if len(fits) > 1 and best.sigma > 0:
+        margin = float(np.sqrt(COARSE * (fits[1].chi2 - fits[0].chi2)) / best.sigma)
+    normals = np.stack([fitted.model.normal for fitted in (best, *fits[1:])])
+    return _estimate(best, normals, camera.project(best.model.foot), covariance, start.isophotes, None, margin)
+
+
+def _estimate(
+    fitted: LobeFit[Any], normals: Array, look: Array, covariance: Array, isophotes: tuple[FittedIsophote, ...],
+    axis_ratio: float | None, margin: float | None = None,
+) -> Estimate:  # fmt: skip
+    return Estimate(
+        normal=normals[0],
+        candidates=normals,
+        look_px=look,
+        axis_ratio=axis_ratio,
+        isophotes=isophotes,
+        choice_margin=margin,
+        covariance=covariance,
+    )
+
+
+def _pose(patch: Patch, camera: Camera, isovalue: float) -> Estimate | Failure:
+    """Give the circle pose at the first isovalue that closes."""
+    tried = [isovalue, *(t for t in (0.4, 0.5, 0.6, 0.7) if t > isovalue)]
+    results = (circle_pose(patch, camera, t) for t in tried)
+    first: Failure | None = None
+    for result in results:
+        if not isinstance(result, Failure):
+            return result
+        first = first or result
+    assert first is not None
+    return first
+
+
+def _pixels(patch: Patch, camera: Camera) -> _Pixels | Failure:
+    """Gather the pixels of the first region that closes."""
+    for t in REGIONS:
+        crossings = patch.crossings(t)
+        if not isinstance(crossings, Failure):
+            break
+    else:
+        return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")
+    rows, columns = np.nonzero(patch.inside(t))
+    step = -(-len(rows) // MAX_PIXELS)
+    # A step that shares no factor with a row's length spreads over the columns too.
+    rows, columns = rows[::step], columns[::step]
+    centres = np.stack([columns, rows], axis=1) + 0.5 + np.array(patch.origin_px)
+    rays = camera.unproject(centres)
+    sound = np.isfinite(rays).all(axis=1)
+    values = patch.values if patch.raw is None else patch.raw
+    clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
+    return _Pixels(rays[sound], values[rows, columns][sound].astype(float), clipped)
+
+
+def _quadric(start: Estimate, patch: Patch, rays: Array) -> ColocatedQuadric:
+    """Start from the middle isophote: its larger half-axis as on a plane gives n, the smaller one then gives K."""
+    isophote = start.isophotes[len(start.isophotes) // 2]
+    s = -start.normal
+    e, f = (basis[0] for basis in tangent_basis(s[None]))
+    basis = np.stack([e, f, s])
+    cone = basis @ isophote.cone @ basis.T
+    # On the plane across s at unit distance the cone is an ellipse: w^T Q w = 1.
+    values, vectors = np.linalg.eigh(cone[:2, :2] / -cone[2, 2])
+    exponent = -np.log(isophote.isovalue) * values[0] / 2
+    gain = np.sqrt(values[1] / values[0])
+    K = (gain - 1) * np.outer(vectors[:, 1], vectors[:, 1])
+    shape = np.array([K[0, 0], K[0, 1], K[1, 1]])
+    return ColocatedQuadric(rays, basis, shape, float(np.log(patch.peak_value)), float(exponent))
+
+
+def _plane(normal: Array, foot: Array, isophote: FittedIsophote, peak: float, rays: Array) -> PlaneFromAside:
+    """Start with the exponent that the isophote's radius on the plane stands for."""
+    points = isophote_rays(isophote)
+    reach = (normal @ foot) / (points @ normal)
+    rho2 = float(np.median(np.sum((points * reach[:, None] - foot) ** 2, axis=1)))
+    cosine = max((1 - rho2) / (1 + rho2), 0.1)
+    exponent = np.log(isophote.isovalue) / np.log(cosine)
+    return PlaneFromAside(rays, normal, foot, float(np.log(exponent)), float(np.log(peak)))
+
+
+def isophote_rays(isophote: FittedIsophote) -> Array:
+    """Give sightlines along a fitted isophote, shape (N, 3)."""
+    return cone_rays(isophote.cone, isophote.sightline)
+
+
+def _axis_ratio(model: ColocatedQuadric) -> float:
+    """Give the smaller over the larger abs(1 + d k)."""
+    gains = np.abs(1 + np.linalg.eigvalsh(model.shape))
+    return float(gains.min() / gains.max())
+
+
+def _turned(covariance: Array, normal: Array, basis: Array) -> Array:
+    """Express a covariance of tilts along `basis`, rows, in the tangent basis of the normal."""
+    turn = np.stack([direction[0] for direction in tangent_basis(normal[None])]) @ basis.T
+    return np.asarray(turn @ covariance @ turn.T)
