@@ -30,7 +30,7 @@ def validate(
     ----------
     experiment : str
         An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, reflectance,
-        sensor, rig, interreflection, anatomy, paper, paper_limits.
+        sensor, camera, rig, interreflection, anatomy, paper, paper_limits.
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
