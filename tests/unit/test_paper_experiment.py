@@ -13,6 +13,20 @@ from simtest.validation.runner import run_experiment
 SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3, "paper.smoothing_px": 2.0}
 
 
+def test_an_estimator_with_a_covariance_has_its_coverage_in_the_results(tmp_path):
+    groups = [{"scene": "published", "set": SMALL}]
+    estimators = ("circle_pose", "photometric")
+    run = run_experiment(Experiment(name="pair", realisations=40, groups=groups, estimators=estimators), tmp_path)
+    (figures,) = run.summary["experiments"]["pair"]["settings"].values()
+    assert figures["circle_pose"]["coverage95"] is None
+    assert 0.8 <= figures["photometric"]["coverage95"] <= 1.0
+    rows = run.results.filter(pl.col("estimator") == "photometric")
+    assert (
+        rows.select("cov_11", "cov_12", "cov_22", "mahalanobis2", "choice_margin").null_count().sum_horizontal()[0] == 0
+    )
+    assert (rows["error_deg"] == rows["error_oracle_deg"]).all()
+
+
 def small(**more):
     groups = [{"scene": "published", "label": "noise", "set": SMALL, "sweep": [{"paper.sigma": [0.0, 0.05]}]}]
     groups += [{"scene": "published", "label": "offset", "set": SMALL, "sweep": [{"paper.eps": [60.0]}]}]

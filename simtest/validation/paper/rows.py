@@ -14,7 +14,7 @@ from simtest.estimators.circle_pose import circle_poses
 from simtest.estimators.photometric import photometric_plane
 from simtest.seeds import from_integer
 from simtest.spec.paper import PaperSetting
-from simtest.validation.metrics import SCHEMA, angle_deg
+from simtest.validation.metrics import SCHEMA, angle_deg, mahalanobis2
 from simtest.validation.paper.pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
 
@@ -93,7 +93,11 @@ def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[s
         "isovalue": [t[0] if len(t) == 1 else None for t in isovalues],
         "isovalues": [",".join(f"{value:g}" for value in t) or None for t in isovalues],
         "axis_ratio": [e.axis_ratio for e in ok],
+        "choice_margin": [e.choice_margin for e in ok],
+        "mahalanobis2": [mahalanobis2(e, setting.normal) for e in ok],
     }
+    for name, place in (("cov_11", (0, 0)), ("cov_12", (0, 1)), ("cov_22", (1, 1))):
+        columns[name] = [None if e.covariance is None else float(e.covariance[place]) for e in ok]
     columns |= {f"normal_{axis}": [float(e.normal[i]) for e in ok] for i, axis in enumerate("xyz")}
     status = ["ok" if isinstance(r, Estimate) else str(r.reason) for r in results]
     flags = [",".join(r.flags) if isinstance(r, Estimate) else r.detail for r in results]
