@@ -129,6 +129,26 @@ def endoscopic_isocurve(points: npt.ArrayLike, camera: npt.ArrayLike, kappa_valu
     return np.asarray(k * squared**2 + 2 * height * (k - 2) * squared + k * height**2)
 
 
+def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
+    """Give the radius r- of the isophote at t about the foot of V = L, abs(V_Z) tan(acos(tau)/2) [MB, section 2.2].
+
+    Parameters
+    ----------
+    isovalue, exponent : float
+        t in (0, 1), relative to c, and n > 0.
+    height : float
+        V_Z.
+
+    Returns
+    -------
+    float
+        In the unit of V_Z. Computed from log tau, which keeps its digits for large n and for small ones.
+    """
+    log_tau = np.log(isovalue) / exponent
+    # tan(acos(tau) / 2)^2 = (1 - tau) / (1 + tau)
+    return float(abs(height) * np.sqrt(-np.expm1(log_tau) / (1 + np.exp(log_tau))))
+
+
 def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[Array, Array]:
     """Give the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2].
 

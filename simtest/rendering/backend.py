@@ -254,10 +254,20 @@ def _set_library(needed: bool) -> None:
         if failed.origin == LIBRARY_VARIABLE:
             warnings.warn(f"{LIBRARY_VARIABLE}={failed.path}: {failed.verdict}; using {chosen.path}", stacklevel=3)
     os.environ[LIBRARY_VARIABLE] = chosen.path
+    _chosen.add(chosen.path)
+
+
+_chosen: set[str] = set()
+"""The library that this process told Dr.Jit to load, once it did."""
 
 
 def _check_library_in_memory() -> None:
-    """Refuse a libLLVM that something else has loaded before and that would end the process."""
+    """Refuse a libLLVM that something else made Dr.Jit load and that would end the process.
+
+    Where simtest chose the library, others may be in memory too: Mesa's software renderer brings its own.
+    """
+    if _chosen:
+        return
     for path in _mapped_libraries():
         verdict = probe(Candidate("in memory", path)).verdict
         if verdict != "ok":

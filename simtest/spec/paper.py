@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.geometry.camera import Camera
@@ -26,6 +26,15 @@ class PaperSetting(Spec):
         PAPER_SMOOTHING_PX, ge=0, le=50, description="standard deviation of the Gaussian smoothing, px"
     )
     recentre: bool = Field(True, description="centre the texture's window at the BP; false: at the camera's foot")
+
+    @model_validator(mode="after")
+    def _light_in_front(self) -> "PaperSetting":
+        if self.eps >= 2 * self.height:
+            raise ValueError(
+                f"eps = {self.eps:g} and height = {self.height:g}: the lowest light, at height - eps / 2, would lie "
+                "behind the plane; eps must be less than 2 height"
+            )
+        return self
 
     @property
     def camera(self) -> Camera:

@@ -208,7 +208,8 @@ class _Work:
             seed = case.noise_seed(experiment, numbers[0])
             save_realisation(item, setting, experiment.estimators, seed, names)
         # The bound is that of the light at V.
-        common["bound_deg"] = float(np.degrees(cramer_rao_bound(setting))) if setting.eps == 0 else None
+        bound = cramer_rao_bound(setting) if setting.eps == 0 else None
+        common["bound_deg"] = None if bound is None else float(np.degrees(bound))
         tasks = []
         for first in range(0, len(numbers), PAPER_CHUNK):
             chunk = numbers[first : first + PAPER_CHUNK]

@@ -310,11 +310,20 @@ def test_a_bad_library_in_memory_is_refused(monkeypatch, tmp_path):
     library = tmp_path / "libLLVM.so.15"
     library.write_bytes(b"no library")
     monkeypatch.setattr(backend, "_drjit_loaded", lambda: True)
+    monkeypatch.setattr(backend, "_chosen", set())
     monkeypatch.setattr(backend, "_mapped_libraries", lambda: [str(library)])
     with pytest.raises(BackendError, match=f"libLLVM {library}, loaded before simtest could choose: .* before drjit"):
         backend.load("llvm_ad_mono")
     monkeypatch.setattr(backend, "_run_probe", lambda path: "ok")
     monkeypatch.setattr(backend, "_read_cache", lambda: {})
+    backend.load("llvm_ad_mono")
+
+
+def test_another_library_in_memory_beside_the_chosen_one_does_no_harm(monkeypatch):
+    """A viewer's software renderer may bring an older one after simtest has made its choice."""
+    backend.load("llvm_ad_mono")
+    monkeypatch.setattr(backend, "_mapped_libraries", lambda: ["/usr/lib/libLLVM-15.so.1"])
+    monkeypatch.setattr(backend, "_run_probe", lambda path: "aborts")
     backend.load("llvm_ad_mono")
 
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from simtest.errors import InputError
-from simtest.geometry.isocurves import cosine_beta
+from simtest.geometry.isocurves import cosine_beta, cosine_of_isovalue, isocurve_radii, isophote_radius, kappa
 from simtest.spec.paper import PaperSetting, paper_from_dict
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.protocol import (
@@ -97,3 +98,25 @@ def test_texture_is_the_specular_term_of_the_isocurves():
     points = np.stack(np.meshgrid(side, side), axis=-1) + window_centre(setting, light)
     expected = np.maximum(cosine_beta(points, light, np.array([0, 0, setting.height])), 0) ** setting.exponent
     np.testing.assert_allclose(texture(setting, light), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "values", [{"size": 16}, {"size": 32}, {"height": 1e5}, {"theta_deg": 89.99}, {"exponent": 1e5}]
+)
+def test_a_frame_that_determines_nothing_has_no_bound(values):
+    assert cramer_rao_bound(PaperSetting(**values)) is None
+
+
+@pytest.mark.parametrize("eps", [2000.0, 5000.0])
+def test_a_light_behind_the_plane_is_refused(eps):
+    with pytest.raises(ValidationError, match="eps must be less than 2 height"):
+        PaperSetting(eps=eps)
+    PaperSetting(eps=1999.0)
+
+
+def test_the_isophotes_radius_keeps_its_digits():
+    """For n where tau or 1 - tau is rounding; in between it is that of the circles."""
+    assert isophote_radius(0.1, 0.1, 2.0) == pytest.approx(2.0, rel=1e-9)
+    assert isophote_radius(0.5, 1e12, 1.0) == pytest.approx(np.sqrt(np.log(2) / 2e12), rel=1e-9)
+    tau = cosine_of_isovalue(0.3, 40.0)
+    assert isophote_radius(0.3, 40.0, 5.0) == pytest.approx(float(isocurve_radii(kappa(tau), 5.0)[0]), rel=1e-12)

@@ -16,7 +16,7 @@ from simtest.report.paper.fits import line, offset_inside_window
 from simtest.report.paper.isocurves import KAPPA, OFFSET_LIGHT, isocurve_figure
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.paper.stages import stages
-from simtest.report.paper.statements import ABSENT, AGREES, DIFFERS, statements
+from simtest.report.paper.statements import ABSENT, AGREES, DIFFERS, FEW, PART, statements
 from simtest.report.paper.sweeps import sweep_figures
 from simtest.report.run import read_run
 from simtest.report.series import line_figures
@@ -172,6 +172,23 @@ def test_statements_need_the_articles_settings_and_method(tmp_path):
     assert {row.verdict for row in judged(tmp_path / "other", rows).values()} == {ABSENT}
     wider = rows_of("noise", "sigma", MEANS["sigma"], {"smoothing_px": 5.0})
     assert judged(tmp_path / "wider", wider)["the mean error grows with the noise"].verdict == AGREES
+
+
+def test_one_realisation_is_too_few_to_judge_by(tmp_path):
+    rows = judged(tmp_path, planted(count=1, spread=0))
+    for claim in ("the mean error grows with the noise", "about linear, slope about 10⁻² degrees per unit"):
+        assert rows[claim].verdict == FEW
+        assert not rows[claim].because
+    assert rows["the mean stays below 1.25° throughout to 10\u00a0%"].verdict == AGREES
+
+
+def test_part_of_the_range_is_not_the_claim(tmp_path):
+    """What holds in part may fail in the rest; what fails in part fails."""
+    part = {"sigma": {0.0: 0.2, 0.01: 0.3}, "theta_deg": {40.0: 0.5, 58.0: 0.9}, "exponent": {30.0: 0.4, 40.0: 0.5}}
+    rows = judged(tmp_path / "part", planted(part))
+    assert {row.verdict for row in rows.values()} == {PART, ABSENT}
+    high = rows_of("sigma", "sigma", {0.0: 1.1, 0.01: 1.4})
+    assert judged(tmp_path / "high", high)["the mean stays below 1.25° throughout to 10\u00a0%"].verdict == DIFFERS
 
 
 def test_the_slopes_explanation_is_computed(tmp_path):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry.isocurves import cosine_of_isovalue, isocurve_radii, kappa
+from simtest.geometry.isocurves import isophote_radius
 
 Array = npt.NDArray[np.float64]
 
@@ -64,7 +64,6 @@ def offset_inside_window(fixed: Mapping[str, Any]) -> float:
     float
         Texture units.
     """
-    tau = cosine_of_isovalue(fixed["isovalue"], fixed["exponent"])
     height = float(fixed["height"])
-    room = fixed["size"] / 2 - float(isocurve_radii(kappa(tau), height)[0])
+    room = fixed["size"] / 2 - isophote_radius(fixed["isovalue"], fixed["exponent"], height)
     return max(0.0, 2 * height * room / (height + room / 2))

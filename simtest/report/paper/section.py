@@ -82,7 +82,7 @@ def _stages_part(data: Stages | None, colours: Mapping[str, str], folder: Path, 
 
 
 def _headline(rows: Sequence[Statement]) -> str:
-    own = [row for row in rows if row.source == ARTICLE and row.measured]
+    own = [row for row in rows if row.source == ARTICLE and row.verdict in (AGREES, DIFFERS)]
     if not own:
         return "The run holds none of the article's own sweeps; its statements are not compared."
     differing = list(dict.fromkeys(row.sweep for row in own if row.verdict == DIFFERS))

@@ -12,7 +12,14 @@ _STEPS = np.array([1e-5, 1e-5, 1e-2, 1e-2, 1e-4, 1e-2, 1e-3])
 """Central-difference steps of the parameters: tilts (rad), BP (px), log scale, n, c."""
 
 
-def cramer_rao_bound(setting: PaperSetting) -> float:
+MOST_CONDITION = 1e13
+"""Of the scaled information matrix: beyond it the inverse is rounding."""
+
+LARGEST_RAD = 0.5
+"""The bound is one of small angles."""
+
+
+def cramer_rao_bound(setting: PaperSetting) -> float | None:
     """Give the bound on the RMS angle between estimated and true normal (theory.md section 2).
 
     The frame is c max(0, cos beta)^n on the slanted plane with white noise; unknown are two tilts, the BP (two), the
@@ -25,8 +32,8 @@ def cramer_rao_bound(setting: PaperSetting) -> float:
 
     Returns
     -------
-    float
-        rad; 0 without noise.
+    float or None
+        rad; 0 without noise; None where the frame does not determine the parameters, or only to half a radian.
     """
     if setting.sigma == 0:
         return 0.0
@@ -40,10 +47,17 @@ def cramer_rao_bound(setting: PaperSetting) -> float:
         columns.append((difference / (2 * step))[inside])
     J = np.stack(columns, axis=1)
     information = J.T @ J / setting.sigma**2
+    diagonal = np.diag(information)
+    if not (np.isfinite(diagonal).all() and (diagonal > 0).all()):
+        return None
     # Scaled to unit diagonal: the parameters' units differ by orders of magnitude.
-    scale = 1 / np.sqrt(np.diag(information))
-    covariance = np.linalg.inv(information * scale[:, None] * scale) * scale[:, None] * scale
-    return float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
+    scale = 1 / np.sqrt(diagonal)
+    scaled = information * scale[:, None] * scale
+    if np.linalg.cond(scaled) > MOST_CONDITION:
+        return None
+    covariance = np.linalg.inv(scaled) * scale[:, None] * scale
+    bound = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
+    return bound if bound < LARGEST_RAD else None
 
 
 def _sightlines(setting: PaperSetting) -> Array:

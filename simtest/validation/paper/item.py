@@ -49,6 +49,8 @@ def save_realisation(
     patch = pipeline.cut(stages.smoothed, stages.noisy)
     camera = setting.camera
     spot = _on_plane(setting, _bp(setting, stages))
+    # Behind the imaging camera the BP is nowhere in the picture.
+    bp_px = camera.project(spot).tolist() if spot[2] > 0 else None
     peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()
     entries = [
         {
@@ -61,7 +63,7 @@ def save_realisation(
         for name, (result,) in pipeline.reconstruct([patch]).items()
     ]
     true = {
-        "id": 0, "bp_px": camera.project(spot).tolist(), "normal": setting.normal.tolist(), "position": spot.tolist(),
+        "id": 0, "bp_px": bp_px, "normal": setting.normal.tolist(), "position": spot.tolist(),
         "kd_min": 0.0, "kd_max": 0.0, "isolated": True,
     }  # fmt: skip
     meta: dict[str, Any] = {

@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.geometry.circle_pose import circle_pose
-from simtest.geometry.isocurves import cosine_of_isovalue, isocurve_radii, kappa
+from simtest.geometry.isocurves import isophote_radius
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.protocol import plane_from_image
@@ -46,7 +46,7 @@ def smoothing_bias(setting: PaperSetting) -> float | None:
         Error of the better candidate, rad; None with the light off V, or where the texture's window ends less than
         `MARGIN_WIDTHS` smoothing widths beyond the isophote.
     """
-    radius = isophote_radius(setting)
+    radius = isophote_radius(setting.isovalue, setting.exponent, setting.height)
     if setting.eps > 0 or not _window_goes_on(setting, radius):
         return None
     H = plane_from_image(setting)
@@ -66,12 +66,6 @@ def smoothing_bias(setting: PaperSetting) -> float | None:
     if isinstance(pose, Failure):
         return None
     return float(min(np.linalg.norm(tangent_coordinates(normal, setting.normal)) for normal in pose.normals))
-
-
-def isophote_radius(setting: PaperSetting) -> float:
-    """Give the radius r- of the isophote on the plane with the light at V, texture units [MB, section 2.2]."""
-    tau = cosine_of_isovalue(setting.isovalue, setting.exponent)
-    return float(isocurve_radii(kappa(tau), setting.height)[0])
 
 
 def _window_goes_on(setting: PaperSetting, radius: float) -> bool:
