@@ -8,10 +8,14 @@ import polars as pl
 from simtest.report.curves import Ask, Curve, gather, prepared, varies
 from simtest.report.run import Run
 from simtest.report.style import Axis, curvature_axis, estimator_order
+from simtest.spec.describe import describe_key, name_key
 
 TOLERANCE_DEG = 0.3
 TOLERANCE_SHARE = 0.03
 """A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4)."""
+
+MOST_TITLE = 70
+"""Characters of a description that fit under an axis."""
 
 _ERROR_TITLE = "angular error (deg)"
 
@@ -86,7 +90,7 @@ def line_figures(run: Run) -> list[LineFigure]:
     return figures + _sweep_figures(run, rows)
 
 
-def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 6) -> list[LineFigure]:
+def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigure]:
     """Error against every other swept parameter whose values do not already show as curvature or offset."""
     figures: list[LineFigure] = []
     # Sweeps of the published protocol have figures of their own.
@@ -102,14 +106,22 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 6) -> list[LineFigu
             continue
         part = pl.concat(kept).with_columns(pl.col(name).cast(pl.Float64))
         part = part.with_columns(setting=pl.lit(f"{name} = ") + pl.col(name).cast(pl.String))
-        curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg"), Axis(name))
+        x = Axis(_axis_title(name))
+        curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg"), x)
         if curves:
             slug = "".join(c if c.isalnum() else "_" for c in name)
-            about = f"The mean angle between the better candidate and the true normal against {name}, over all else."
-            title = f"Error against {name}"
+            meaning = f" ({text})" if (text := describe_key(name)) else ""
+            about = f"The mean angle between the better candidate and the true normal against {name}{meaning}."
+            title = f"Error against {name_key(name)}"
             y = Axis(_ERROR_TITLE, "log")
-            figures.append(LineFigure(f"error_vs_{slug}", title, about, Axis(name), y, tuple(curves), tuple(empty)))
+            figures.append(LineFigure(f"error_vs_{slug}", title, about, x, y, tuple(curves), tuple(empty)))
     return figures
+
+
+def _axis_title(name: str) -> str:
+    """Name a swept parameter with its unit, or by the start of its description where its name has none."""
+    short, meaning = name_key(name), describe_key(name).split(";")[0]
+    return short if short.endswith(")") or not meaning or len(meaning) > MOST_TITLE else f"{short}: {meaning}"
 
 
 def law_misses(figure: LineFigure) -> dict[str, tuple[int, int, float, str]]:
