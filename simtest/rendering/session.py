@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
 from simtest.rendering import backend, emission, exact, highlights, phong
-from simtest.rendering.direct import COLOCATED_MM, DirectLight, Material
+from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
@@ -17,6 +17,7 @@ from simtest.rendering.places import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.refine import Refinement
 from simtest.rendering.shapes import make_shape
+from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
 
@@ -284,15 +285,15 @@ class Session:
 
     def lit(self, positions: Array, light: int) -> Any:
         """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
-        place = self.scene.rig.true_mm()[light : light + 1]
+        place = self.scene.rig.true_mm()[light]
         towards = positions - place
         distance = np.linalg.norm(towards, axis=1)
         directions = towards / distance[:, None]
         emitted = self.scene.rig.lights[light].factor(directions) > 0
-        if np.linalg.norm(place) <= COLOCATED_MM:
+        if is_at_camera(place):
             return emitted
         pose = self.surface.model_from_camera
-        origins = np.broadcast_to(self.to_model(place), positions.shape)
+        origins = np.broadcast_to(self.to_model(place[None]), positions.shape)
         hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)
         # A blocker stands clearly before the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))
