@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.geometry.checks import check_number, check_numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -26,7 +27,7 @@ class AngularProfile:
     Raises
     ------
     InputError
-        If the power is negative or not finite, or the table is malformed.
+        If the power is no finite number >= 0, or the table is malformed.
     """
 
     power: float = 0.0
@@ -34,8 +35,9 @@ class AngularProfile:
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.power) and self.power >= 0):
-            raise InputError(f"profile power = {self.power!r}: must be a finite number >= 0")
+        check_number("profile power", self.power, least=0)
+        for name in ("angles", "values"):
+            check_numbers(f"profile {name}", getattr(self, name))
         if len(self.angles) != len(self.values):
             raise InputError(f"profile: {len(self.angles)} angles and {len(self.values)} values; must be as many")
         if not self.angles:
@@ -43,8 +45,8 @@ class AngularProfile:
         angles, values = np.array(self.angles), np.array(self.values)
         if len(angles) < 2 or angles[0] != 0 or not (np.diff(angles) > 0).all() or angles[-1] > np.pi + 1e-12:
             raise InputError(f"profile angles = {list(self.angles)}: must rise from 0 to at most pi, two or more")
-        if not (np.isfinite(values).all() and (values >= 0).all() and values[0] > 0):
-            raise InputError(f"profile values = {list(self.values)}: must be finite, >= 0 and positive on the axis")
+        if not ((values >= 0).all() and values[0] > 0):
+            raise InputError(f"profile values = {list(self.values)}: must be >= 0 and positive on the axis")
 
     @property
     def is_uniform(self) -> bool:
