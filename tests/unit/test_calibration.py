@@ -9,7 +9,7 @@ import simtest
 from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.calibration.calibration import MIN_FALLOFF
 from simtest.detection import detect, estimate_noise
-from simtest.errors import Failure, InputError
+from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.profile import AngularProfile
 from simtest.reconstruction import reconstruct
@@ -274,6 +274,25 @@ def test_a_clipped_peak_lies_at_the_plateaus_centroid(place):
     assert clipped.peak_value == pytest.approx(1.0, abs=1e-3)
     # A Gaussian clipped at 1/g: share log(g) / log(2 g) of the isophote at half of it.
     assert clipped.saturated_share(0.5) == pytest.approx(np.log(2.5) / np.log(5), abs=0.01)
+
+
+def test_the_peak_of_a_plateau_does_not_lie_in_its_hole():
+    """A dark hole of one pixel, closed, at the centroid."""
+    frame = np.zeros((21, 21), np.float32)
+    frame[7:14, 7:14] = 1.0
+    frame[10, 10] = -1.0
+    patch = Patch.cut(frame, (0, 0, 21, 21), saturated=frame >= 1)
+    assert patch.peak_value == 1.0
+    column, row = patch.peak_pixel
+    assert frame[row, column] == 1.0
+    np.testing.assert_allclose(patch.peak_px, [10.5, 10.5])
+    assert len(patch.crossings(0.5)) == 28
+    # All of the plateau dark, as after a falsely stated level: no peak.
+    dark = np.where(frame == 0, 0.5, 0).astype(np.float32)
+    dark[3, 10] = 1.0
+    result = Patch.cut(dark, (0, 0, 21, 21), (7, 7), saturated=frame >= 1)
+    assert isinstance(result, Failure)
+    assert result.reason is Reason.NO_PEAK
 
 
 def test_a_few_clipped_pixels_leave_the_parabola():
