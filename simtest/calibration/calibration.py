@@ -131,5 +131,5 @@ class Calibration:
 
 def falloff_map(camera: Camera, profile: AngularProfile) -> npt.NDArray[np.float64]:
     """Give a profile about the optical axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
-    cosine = camera.unproject(camera.pixel_centres())[..., 2]
-    return np.where(np.isfinite(cosine), profile.at(cosine), 0.0)
+    x, y, cosine = np.moveaxis(camera.unproject(camera.pixel_centres()), -1, 0)
+    return np.where(np.isfinite(cosine), profile.at(cosine, np.hypot(x, y)), 0.0)

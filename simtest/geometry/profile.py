@@ -53,12 +53,14 @@ class AngularProfile:
         """Whether the factor is 1 in all directions."""
         return self.power == 0 and not self.angles
 
-    def at(self, cosine: npt.ArrayLike) -> Array:
+    def at(self, cosine: npt.ArrayLike, sine: npt.ArrayLike | None = None) -> Array:
         """Give the factor where the angle from the axis has this cosine.
 
         Parameters
         ----------
         cosine : array_like, shape (...)
+        sine : array_like, shape (...), optional
+            Of the same angle, >= 0: with it a table keeps the digits that the cosine has lost next to the axis.
 
         Returns
         -------
@@ -67,5 +69,6 @@ class AngularProfile:
         """
         c = np.clip(np.asarray(cosine, dtype=float), -1.0, 1.0)
         if self.angles:
-            return np.asarray(np.interp(np.arccos(c), self.angles, self.values))
+            angle = np.arccos(c) if sine is None else np.arctan2(sine, c)
+            return np.asarray(np.interp(angle, self.angles, self.values))
         return np.ones_like(c) if self.power == 0 else np.asarray(np.maximum(c, 0.0) ** self.power)

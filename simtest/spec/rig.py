@@ -96,12 +96,11 @@ class Emission(Spec):
         ndarray, shape (N,)
         """
         away = np.asarray(directions, dtype=float)
-        cosine = away @ self.axis
-        value = self.profile.model().at(cosine)
+        cosine, sine = away @ self.axis, np.linalg.norm(np.cross(away, self.axis), axis=1)
+        value = self.profile.model().at(cosine, sine)
         if self.spot_deg is None:
             return value
-        angle = np.arctan2(np.linalg.norm(np.cross(away, self.axis), axis=1), cosine)
-        inside = math.radians(self.spot_deg / 2) - angle
+        inside = math.radians(self.spot_deg / 2) - np.arctan2(sine, cosine)
         edge = math.radians(self.soft_edge_deg)
         return value * (np.clip(inside / edge, 0.0, 1.0) if edge > 0 else (inside >= 0))
 

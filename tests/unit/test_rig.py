@@ -88,6 +88,19 @@ def test_radiance_of_a_plane_follows_the_emission(session, name, place):
 
 
 @render
+@pytest.mark.parametrize("power", [100.0, 1000.0])
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], ids=["along", "aslant"])
+def test_a_narrow_emission_keeps_its_digits(session, power, direction):
+    """Down to 1e-3 of the peak; by the power of a dot product the error would be up to 4e-5."""
+    light = {"profile": {"type": "cosine", "power": power}, "direction": direction}
+    session.update(scene([light]))
+    expected = matt(light, lambda a: np.maximum(np.cos(a), 0) ** power)
+    lobe = expected > 1e-3 * expected.max()
+    assert lobe.sum() > 30
+    np.testing.assert_allclose(session.radiance().total[lobe], expected[lobe], rtol=1e-5)
+
+
+@render
 def test_a_hard_spot_ends_at_its_rim(session):
     session.update(scene([{"spot_deg": 50.0}]))
     total, angle = (
