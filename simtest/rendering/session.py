@@ -215,11 +215,8 @@ class Session:
         return self._built.labels
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
-        built, effort = self._built, self.scene.render
+        built, effort, tracer = self._built, self.scene.render, self._tracer()
         assert built is not None
-        material = Material(built.scene.shapes()[0].bsdf(), built.base)
-        refinement = Refinement(self.mi, self._shape)
-        tracer = Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
         bounces = None
         if effort.path_depth > 2:
             bounces = Bounces(self.mi, built.scene, effort.path_depth, effort.seed)
@@ -229,6 +226,21 @@ class Session:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
         return as_radiance(parts), channels
+
+    def _tracer(self) -> Tracer:
+        built = self._built
+        assert built is not None
+        material = Material(built.scene.shapes()[0].bsdf(), built.base)
+        refinement = Refinement(self.mi, self._shape)
+        return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
+
+    def _centre_hits(self) -> list[FloatImage]:
+        """Give the labels of a frame, or the same without curvatures, which need a mesh's shape operators."""
+        if not self._centre:
+            assert self._built is not None
+            labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)
+            self._centre = self._tracer().centres(None, False, labels)[1]
+        return self._centre
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
@@ -276,8 +288,9 @@ class Session:
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]
         pixels = centres.reshape(-1, 2)
-        if stride == 1 and self._centre:
-            hits, shading, geometric = as_hits(self._centre)
+        if stride == 1:
+            # As a frame's labels are, so that the truth does not depend on whether there was a frame.
+            hits, shading, geometric = as_hits(self._centre_hits())
             points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
             points, shading, geometric = self._cast(*self.sightlines.in_view(pixels))
