@@ -66,8 +66,8 @@ class Session:
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
-        self.mi = backend.load(variant)
-        self.variant = str(self.mi.variant())
+        self._mitsuba = backend.load(variant)
+        self.variant = str(self._mitsuba.variant())
         self.plugin = phong.register(self.mi, self.variant)
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
@@ -76,6 +76,13 @@ class Session:
         self._load_surface(scene)
         self._set_camera(scene)
         self.update(scene)
+
+    @property
+    def mi(self) -> Any:
+        """The mitsuba module, at this session's variant: it is one for all sessions, and another may have moved it."""
+        if self._mitsuba.variant() != self.variant:
+            self._mitsuba.set_variant(self.variant)
+        return self._mitsuba
 
     def update(self, scene: Scene) -> None:
         """Move to another scene; only what changed is updated, and only another structure is rebuilt.

@@ -1,6 +1,8 @@
 """Labelled frames and frames of several samples: against the exact truth, closed forms, and themselves."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -102,6 +104,45 @@ def test_labels_and_radiance_of_one_pass_are_those_of_two(session):
     np.testing.assert_allclose(session.frame().radiance.total, session.radiance().total, rtol=1e-6)
 
 
+_TWO_VARIANTS = """
+import numpy as np
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+def scene(tilt):
+    return scene_from_dict({"surface": {"type": "plane", "tilt_deg": tilt},
+        "reflectance": {"type": "phong", "diffuse": 0.3}, "camera": {"width": 32, "height": 24, "fx": 30, "fy": 30}})
+def all_of(session):
+    frame = session.frame()
+    found = session.highlights(frame.radiance)
+    cast, _, _ = session.cast(np.array([[16.0, 12.0]]))
+    arrays = [session.radiance().total, frame.radiance.total, frame.labels.depth, session.truth().normal,
+              found[0].bp_px, cast.position]
+    return [array.tobytes() for array in arrays]
+mono = Session(scene(5.0), "llvm_ad_mono")
+alone = all_of(mono)
+colour = Session(scene(5.0), "llvm_ad_rgb")
+for session, channels in ((mono, ()), (colour, (3,)), (mono, ())):
+    assert session.radiance().total.shape == (24, 32, *channels)
+for step in ("radiance", "frame", "highlights", "truth", "update"):
+    colour.radiance()
+    if step == "highlights":
+        mono.highlights(radiance)
+    elif step == "update":
+        mono.update(scene(9.0))
+        mono.update(scene(5.0))
+    else:
+        made = getattr(mono, step)()
+        radiance = made if step == "radiance" else radiance
+colour.frame()
+assert all_of(mono) == alone
+"""
+
+
+def test_sessions_of_two_variants_do_not_disturb_each_other():
+    done = subprocess.run([sys.executable, "-c", _TWO_VARIANTS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 # Several samples -----------------------------------------------------------------------------------------------------
 
 
@@ -171,7 +212,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(session, dep
 
 
 @pytest.mark.parametrize("samples", [1, 7])
-def test_the_launches_size_changes_nothing(session, monkeypatch, samples):
+def test_the_launches_size_changes_nothing_of_direct_light(session, monkeypatch, samples):
     session.update(scene(LABELLED["sphere"][0], (ASIDE,), {"diffuse": 0.3}, samples_per_pixel=samples))
     whole = session.frame()
     told = []
