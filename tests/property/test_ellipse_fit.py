@@ -178,7 +178,7 @@ def test_what_is_no_ellipse_is_refused(name):
         ([[1.0, 2.0], [3.0]], "contour 0: must be numbers"),
         ([["a", "b"]] * 8, "contour 0: must be numbers"),
     ],
-    ids=str,
+    ids=range(8),
 )
 def test_what_is_no_list_of_points_is_malformed(points, message):
     with pytest.raises(InputError, match=message):

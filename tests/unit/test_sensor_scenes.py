@@ -204,6 +204,26 @@ def test_a_percentile_without_light_falls_back_on_the_maximum(session):
     assert seen.full_scale == pytest.approx(float(seen.light.max()))
 
 
+def test_a_percentile_of_all_but_darkness_falls_back_too(session):
+    """A share of 1e-38 of the peak would make a frame that single precision does not hold."""
+    sharp = {"type": "phong", "exponent": 100.0}
+    described = scene({"exposure": {"percentile": 1.0}}, reflectance=sharp, tilt=20.0)
+    with pytest.warns(UserWarning, match="percentile = 1: .* 1e-12 of its maximum or less"):
+        seen = view(session, described)
+    assert 0 < np.percentile(seen.light, 1.0) < 1e-12 * seen.light.max()
+    assert seen.full_scale == pytest.approx(float(seen.light.max()))
+
+
+def test_a_frames_description_holds_the_places_that_its_keys_do_not_show(tmp_path):
+    rigs = ({"preset": "colonoscope_2"}, {"lights": [{"position_error_mm": 0.1}], "seed": 3}, {})
+    for rig in rigs:
+        described = scene(size=48, focal=48.0, rig=rig)
+        write_frame(render(described), tmp_path)
+        told = json.loads((tmp_path / "frame.json").read_text())
+        assert told.get("lights_mm") == (described.rig.true_mm().tolist() if rig else None)
+        assert scene_from_dict(told["scene"]) == described
+
+
 @pytest.mark.parametrize("gain", [1.5, 2.0, 4.0])
 def test_clipped_highlights_are_answered_and_flagged(session, gain):
     sensor = {"saturation": True, "exposure": {"gain": gain}, "noise_sigma": 0.02}
