@@ -10,6 +10,7 @@ from simtest.calibration.noise import NoiseModel
 from simtest.calibration.response import Response
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.geometry.checks import check_kind, check_number
 from simtest.geometry.profile import AngularProfile
 
 Image = npt.NDArray[np.float32]
@@ -69,7 +70,7 @@ class Calibration:
     Raises
     ------
     InputError
-        If the saturation level is not positive.
+        If a part is of another type, or the saturation level is no finite number > 0.
     """
 
     camera: Camera
@@ -82,8 +83,13 @@ class Calibration:
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):
             raise InputError(f"calibration camera is a {type(self.camera).__name__}: must be a simtest.Camera")
-        if self.saturation_level is not None and not self.saturation_level > 0:
-            raise InputError(f"saturation_level = {self.saturation_level!r}: must be > 0")
+        if self.response is not None:
+            check_kind("calibration response", self.response, Response)
+        for name in ("vignetting", "emission"):
+            check_kind(f"calibration {name}", getattr(self, name), AngularProfile)
+        check_kind("calibration noise", self.noise, NoiseModel)
+        if self.saturation_level is not None:
+            check_number("saturation_level", self.saturation_level, above=0)
 
     @cached_property
     def falloff(self) -> npt.NDArray[np.float64] | None:
@@ -125,5 +131,5 @@ class Calibration:
 
 def falloff_map(camera: Camera, profile: AngularProfile) -> npt.NDArray[np.float64]:
     """Give a profile about the optical axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
-    cosine = camera.unproject(camera.pixel_centres())[..., 2]
-    return np.where(np.isfinite(cosine), profile.at(cosine), 0.0)
+    x, y, cosine = np.moveaxis(camera.unproject(camera.pixel_centres()), -1, 0)
+    return np.where(np.isfinite(cosine), profile.at(cosine, np.hypot(x, y)), 0.0)

@@ -6,6 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration.response import Response
+from simtest.errors import InputError
+from simtest.geometry.checks import check_integer, check_kind, check_number
+
+MAX_BITS = 32
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,11 @@ class NoiseModel:
         Of the values; default: not quantised.
     response : Response
         The curve before quantisation: it sets the light between two values.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or out of range, the response is none, or read noise has no full well.
     """
 
     sigma: float = 0.0
@@ -31,6 +40,17 @@ class NoiseModel:
     read_noise: float = 0.0
     bits: int | None = None
     response: Response = field(default_factory=Response)
+
+    def __post_init__(self) -> None:
+        check_number("noise sigma", self.sigma, least=0)
+        check_number("noise read_noise", self.read_noise, least=0)
+        if self.full_well is not None:
+            check_number("noise full_well", self.full_well, above=0)
+        elif self.read_noise > 0:
+            raise InputError(f"noise read_noise = {self.read_noise:g} electrons: needs full_well as well")
+        if self.bits is not None:
+            check_integer("noise bits", self.bits, 1, MAX_BITS)
+        check_kind("noise response", self.response, Response)
 
     @property
     def is_silent(self) -> bool:

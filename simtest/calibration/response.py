@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.geometry.checks import check_number, check_numbers
 
 Array = TypeVar("Array", npt.NDArray[np.float32], npt.NDArray[np.float64])
 
@@ -37,7 +38,7 @@ class Response:
     Raises
     ------
     InputError
-        If gamma is not positive or the table is malformed.
+        If the kind is unknown, gamma is no finite number > 0, or the table is malformed.
     """
 
     kind: Literal["linear", "gamma", "srgb", "table"] = "linear"
@@ -48,8 +49,7 @@ class Response:
     def __post_init__(self) -> None:
         if self.kind not in ("linear", "gamma", "srgb", "table"):
             raise InputError(f"response kind = {self.kind!r}: must be linear, gamma, srgb or table")
-        if not (np.isfinite(self.gamma) and self.gamma > 0):
-            raise InputError(f"response gamma = {self.gamma!r}: must be a finite number > 0")
+        check_number("response gamma", self.gamma, above=0)
         if self.kind == "table":
             check_table(self.light, self.value)
 
@@ -76,6 +76,8 @@ class Response:
 
 def check_table(light: tuple[float, ...], value: tuple[float, ...]) -> None:
     """Raise `InputError` where the points of a curve do not both rise from 0 to 1."""
+    check_numbers("light", light)
+    check_numbers("value", value)
     if len(light) != len(value):
         raise InputError(f"value has {len(value)} entries, light {len(light)}; must be as many")
     for name, points in (("light", light), ("value", value)):

@@ -6,7 +6,8 @@ from simtest.cli.options import Out, Settings, Variant
 def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
-    A sensor with a response, bits, saturation, vignetting or a full well also gets calibration.toml.
+    A sensor with a response, bits, saturation, vignetting or a full well also gets calibration.toml, and so does a
+    light at the camera whose emission is known (rig.emission_known).
 
     Parameters
     ----------

@@ -93,7 +93,7 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml for a sensor that needs it.
+    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where there is more to know.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[2], lambda part: np.savez_compressed(part, **_truth(frame)))
         write_json(files[3], _description(frame))
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
-        if _is_calibrated(frame.scene.sensor):
+        if _is_calibrated(frame.scene):
             files.append(out / "calibration.toml")
             write_atomically(files[5], lambda part: part.write_text(_calibration_file(frame.scene), encoding="utf-8"))
     except OSError as error:
@@ -128,9 +128,11 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     return files
 
 
-def _is_calibrated(sensor: Sensor) -> bool:
-    """Tell whether there is more to know of a sensor than its camera."""
-    return sensor.clips or sensor.full_well is not None or not sensor.vignetting.model().is_uniform
+def _is_calibrated(scene: Scene) -> bool:
+    """Tell whether there is more to know of a frame than its camera."""
+    sensor, emission = scene.sensor, scene.rig.known_emission()
+    vignetted = not sensor.vignetting.model().is_uniform
+    return sensor.clips or sensor.full_well is not None or vignetted or emission is not None
 
 
 def _png_bits(sensor: Sensor) -> int:
@@ -218,10 +220,17 @@ def _description(frame: LabelledFrame) -> dict[str, Any]:
         "camera": describe_camera(frame.camera),
         "full_scale": frame.full_scale,
         **encoding,
+        **_places(frame.scene),
         "highlights": [_highlight(judged) for judged in frame.highlights],
         "fields": fields,
         "provenance": {**provenance.environment(), "variant": frame.variant},
     }
+
+
+def _places(scene: Scene) -> dict[str, Any]:
+    """Give the lights' true places where the scene's keys do not show them: a preset's, and those that were drawn."""
+    rig = scene.rig
+    return {} if rig.preset is None and not rig.is_drawn else {"lights_mm": rig.true_mm().tolist()}
 
 
 def _highlight(judged: JudgedHighlight) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
+from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.distortion import Distortion
 
 Array = npt.NDArray[np.float64]
@@ -101,13 +102,9 @@ class Camera:
 
     def _check_numbers(self) -> None:
         for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise InputError(f"camera.{name} = {value!r}: must be an integer >= 1")
+            check_integer(f"camera.{name}", getattr(self, name), 1)
         for name in ("fx", "fy", "cx", "cy", "skew"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
-                raise InputError(f"camera.{name} = {value!r}: must be a finite number")
+            check_number(f"camera.{name}", getattr(self, name))
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be > 0, else K is singular")

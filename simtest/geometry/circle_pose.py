@@ -1,5 +1,6 @@
 """Circle pose from one conic [F91; MB, section 2.3, step 4] and the axis of the back-projected cone."""
 
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -53,7 +54,12 @@ class CirclePoses:
     centres: Array
     failures: Mapping[int, Failure]
 
+    def __len__(self) -> int:
+        return len(self.normals)
+
     def __getitem__(self, index: int) -> CirclePose | Failure:
+        # Failures are numbered from 0: one that is asked for from the end must be found too.
+        index = range(len(self))[operator.index(index)]
         failure = self.failures.get(index)
         ratio = float(self.axis_ratios[index])
         return failure or CirclePose(self.normals[index], self.axes[index], ratio, self.centres[index])

@@ -1,12 +1,13 @@
 """Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled, of many contours at once."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.errors import Failure, Reason
+from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.ellipse_pencil import constrained_minimum
 
 Array = npt.NDArray[np.float64]
@@ -79,6 +80,8 @@ class FittedConics:
         return len(self.normalised)
 
     def __getitem__(self, index: int) -> FittedConic | Failure:
+        # Failures are numbered from 0: one that is asked for from the end must be found too.
+        index = range(len(self))[operator.index(index)]
         failure = self.failures.get(index)
         return failure or FittedConic(self.normalised[index], self.normalised_from_image[index])
 
@@ -106,6 +109,11 @@ def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
     -------
     FittedConic or Failure
         A Failure for fewer than 6 points, values that are not finite, points on a line, or no elliptic solution.
+
+    Raises
+    ------
+    InputError
+        If the points are no numbers of shape (N, 2).
     """
     return fit_ellipses([points])[0]
 
@@ -122,14 +130,19 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
     -------
     FittedConics
         In the order of the contours.
+
+    Raises
+    ------
+    InputError
+        If a contour is no numbers of shape (N, 2).
     """
     count = len(contours)
     normalised, transforms = np.tile(np.eye(3), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1))
     failures: dict[int, Failure] = {}
     alike: dict[int, list[int]] = {}
-    arrays = [np.asarray(points, dtype=float) for points in contours]
+    arrays = [_points(points, index) for index, points in enumerate(contours)]
     for index, xy in enumerate(arrays):
-        if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < MIN_POINTS:
+        if len(xy) < MIN_POINTS:
             failures[index] = Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
         else:
             alike.setdefault(-(-len(xy) // _STEP) * _STEP, []).append(index)
@@ -141,6 +154,19 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
             normalised[part], transforms[part] = fitted.normalised, fitted.normalised_from_image
             failures |= {part[i]: failure for i, failure in fitted.failures.items()}
     return FittedConics(normalised, transforms, failures)
+
+
+def _points(points: npt.ArrayLike, index: int) -> Array:
+    """Give a contour as an array of shape (N, 2)."""
+    try:
+        xy = np.asarray(points, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"contour {index}: must be numbers of shape (N, 2)") from None
+    if xy.shape == (0,):
+        return xy.reshape(0, 2)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InputError(f"contour {index} has shape {xy.shape}: must be (N, 2)")
+    return xy
 
 
 def _fit_padded(contours: list[Array], length: int) -> FittedConics:

@@ -138,24 +138,23 @@ class Patch:
             row, column = divmod(int(values.argmax()), values.shape[1])
         else:
             column, row = peak[0] - x, peak[1] - y
-        value = float(values[row, column])
         if seen is not None:
             seen = seen[y : y + height, x : x + width]
             lowest = float(values.min(where=seen, initial=np.inf))
-        if value <= 0 or value <= lowest:
-            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         corner = (x + origin_px[0], y + origin_px[1])
         unsmoothed = None if raw is None else raw[y : y + height, x : x + width]
         clipped = None if saturated is None else saturated[y : y + height, x : x + width]
         plateau = None if clipped is None else _plateau(clipped, row, column)
-        if plateau is None:
+        if clipped is None or plateau is None:
             place = _parabolic_peak(values, row, column)
         else:
-            pixels = np.argwhere(plateau)[:, ::-1]
-            place = pixels.mean(axis=0)
-            # Where falloff was divided away the plateau is slanted, and highest at its rim.
+            place = np.argwhere(plateau)[:, ::-1].mean(axis=0)
+            # Where falloff was divided away the plateau is slanted, and highest at its rim; its holes may be dark.
+            pixels = np.argwhere(plateau & clipped)[:, ::-1]
             column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
-            value = float(values[row, column])
+        value = float(values[row, column])
+        if value <= 0 or value <= lowest:
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         return cls(
             values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen, unsmoothed
         )
@@ -174,7 +173,7 @@ class Patch:
         Returns
         -------
         ndarray, shape (N, 2), or Failure
-            In the frame, px, each point once.
+            In the frame, px, each point once: where a pixel's value is the level, several of these lines cross at it.
 
         Raises
         ------
@@ -185,7 +184,10 @@ class Patch:
         return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
 
     def isophote(self, isovalue: float) -> Array | Failure:
-        """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end."""
+        """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.
+
+        A point where the border meets itself, a pixel whose value is the level, is passed more than once.
+        """
         found = self._level_set(isovalue)
         return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
 
@@ -227,7 +229,7 @@ def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
         return None
     labels, _ = ndimage.label(whole, np.ones((3, 3)))
     plateau = np.asarray(labels == labels[row, column])
-    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX else None
+    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX and (plateau & clipped).any() else None
 
 
 def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:

@@ -16,6 +16,7 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+_AT_PIXEL = 0.5 - 1e-9
 _ABOVE, _REGION, _OUTSIDE = 1, 2, 3
 
 
@@ -43,7 +44,8 @@ class LevelSet:
     def crossings(self) -> Array:
         """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
 
-        Those between horizontal neighbours first, row by row, then those between vertical ones.
+        Those between horizontal neighbours first, row by row, then those between vertical ones; each point once, though
+        several lines cross the border at a pixel whose value is the level.
         """
         width = self.inside.shape[1]
         rows, columns = np.divmod(np.flatnonzero(self.inside[:, 1:] != self.inside[:, :-1]), width - 1)
@@ -60,14 +62,23 @@ class LevelSet:
         points[:across, 0], points[:across, 1] = columns + share[:across], rows
         points[across:, 0], points[across:, 1] = columns_down, rows_down + share[across:]
         points += self.corner
-        return points
+        # Rounding too can put a crossing onto a pixel.
+        at_pixel = np.abs(share - 0.5) > _AT_PIXEL
+        return _each_once(points, at_pixel) if at_pixel.any() else points
 
     def polygon(self) -> Array:
-        """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred."""
-        above = np.nextafter(self.level, np.inf)
-        values = self.values.astype(float)
-        clean = np.where(self.inside, np.maximum(values, above), np.minimum(values, self.level))
-        return np.asarray(find_contours(clean, self.level)[0][:, ::-1] + self.corner)
+        """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
+
+        A pixel whose value is the level is passed once for each time that the border comes to it.
+        """
+        # Traced on the region itself: on the values, contours that meet at such a pixel would fall apart there.
+        (middles,) = find_contours(self.inside.astype(float), 0.5)
+        first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)
+        start, end = (self.values[at[:, 0], at[:, 1]].astype(float) for at in (first, last))
+        points = first + (last - first) * ((self.level - start) / (end - start))[:, None]
+        points = points[:, ::-1] + self.corner
+        moved = (points[1:] != points[:-1]).any(axis=1)
+        return np.asarray(points[np.append(True, moved)])
 
 
 def level_set_around(
@@ -104,3 +115,12 @@ def level_set_around(
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))
+
+
+def _each_once(points: Array, suspects: Mask) -> Array:
+    """Drop all but the first of equal points, shape (N, 2), among the suspects; the order is kept."""
+    places = np.flatnonzero(suspects)
+    _, first = np.unique(points[places], axis=0, return_index=True)
+    keep = ~suspects
+    keep[places[first]] = True
+    return np.asarray(points[keep])

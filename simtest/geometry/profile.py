@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.geometry.checks import check_number, check_numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -26,7 +27,7 @@ class AngularProfile:
     Raises
     ------
     InputError
-        If the power is negative or not finite, or the table is malformed.
+        If the power is no finite number >= 0, or the table is malformed.
     """
 
     power: float = 0.0
@@ -34,8 +35,9 @@ class AngularProfile:
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.power) and self.power >= 0):
-            raise InputError(f"profile power = {self.power!r}: must be a finite number >= 0")
+        check_number("profile power", self.power, least=0)
+        for name in ("angles", "values"):
+            check_numbers(f"profile {name}", getattr(self, name))
         if len(self.angles) != len(self.values):
             raise InputError(f"profile: {len(self.angles)} angles and {len(self.values)} values; must be as many")
         if not self.angles:
@@ -43,20 +45,22 @@ class AngularProfile:
         angles, values = np.array(self.angles), np.array(self.values)
         if len(angles) < 2 or angles[0] != 0 or not (np.diff(angles) > 0).all() or angles[-1] > np.pi + 1e-12:
             raise InputError(f"profile angles = {list(self.angles)}: must rise from 0 to at most pi, two or more")
-        if not (np.isfinite(values).all() and (values >= 0).all() and values[0] > 0):
-            raise InputError(f"profile values = {list(self.values)}: must be finite, >= 0 and positive on the axis")
+        if not ((values >= 0).all() and values[0] > 0):
+            raise InputError(f"profile values = {list(self.values)}: must be >= 0 and positive on the axis")
 
     @property
     def is_uniform(self) -> bool:
         """Whether the factor is 1 in all directions."""
         return self.power == 0 and not self.angles
 
-    def at(self, cosine: npt.ArrayLike) -> Array:
+    def at(self, cosine: npt.ArrayLike, sine: npt.ArrayLike | None = None) -> Array:
         """Give the factor where the angle from the axis has this cosine.
 
         Parameters
         ----------
         cosine : array_like, shape (...)
+        sine : array_like, shape (...), optional
+            Of the same angle, >= 0: with it a table keeps the digits that the cosine has lost next to the axis.
 
         Returns
         -------
@@ -65,5 +69,6 @@ class AngularProfile:
         """
         c = np.clip(np.asarray(cosine, dtype=float), -1.0, 1.0)
         if self.angles:
-            return np.asarray(np.interp(np.arccos(c), self.angles, self.values))
+            angle = np.arccos(c) if sine is None else np.arctan2(sine, c)
+            return np.asarray(np.interp(angle, self.angles, self.values))
         return np.ones_like(c) if self.power == 0 else np.asarray(np.maximum(c, 0.0) ** self.power)

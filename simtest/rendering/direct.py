@@ -5,10 +5,7 @@ from typing import Any
 
 from simtest.rendering import emission
 from simtest.rendering.frames import Array
-from simtest.spec.rig import Rig
-
-COLOCATED_MM = 1e-9
-"""A light nearer to the camera than this sees what the camera sees: no shadow rays."""
+from simtest.spec.rig import Rig, is_at_camera
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,8 @@ class DirectLight:
 
         self.mi = mi
         self.kinds = [emission.kind_of(light) for light in rig.lights]
-        self.shadows = [bool((place**2).sum() > COLOCATED_MM**2) for place in rig.true_mm()]
+        # A light at the camera sees what the camera sees.
+        self.shadows = [not is_at_camera(place) for place in rig.true_mm()]
         self.values = [
             emission.parameters(mi, light, place, axis)
             for light, place, axis in zip(rig.lights, places, axes, strict=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from simtest.rendering import lobes
 from simtest.rendering.spectrum import spectrum
 from simtest.spec.profile import CosineProfile, TableProfile
 from simtest.spec.rig import LightSpec
@@ -103,12 +104,13 @@ def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
     if kind.profile == "uniform" and not kind.spot:
         return mi.Float(1)
     axis = values["axis"]
-    cosine, value = dr.dot(axis, away), mi.Float(1)
+    value = mi.Float(1)
     if kind.profile == "cosine":
-        value = dr.select(cosine > 0, dr.maximum(cosine, 0) ** values["exponent"], 0)
+        log_cosine, ahead = lobes.log_cosine(away, axis)
+        value = dr.select(ahead, dr.exp(values["exponent"] * log_cosine), 0)
     if kind.profile == "table" or kind.spot:
         # Not the arc cosine, which loses half of the digits next to the axis.
-        angle = dr.atan2(dr.norm(dr.cross(axis, away)), cosine)
+        angle = dr.atan2(dr.norm(dr.cross(axis, away)), dr.dot(axis, away))
         if kind.profile == "table":
             value = _interpolate(mi, values["angles"], values["values"], angle, kind.entries)
         if kind.spot:

@@ -23,7 +23,7 @@ Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
 
 LANES = 2**22
-"""Pixels of one launch: they bound the memory."""
+"""Pixels of one launch: they bound the memory. Another number gives bounces other noise, and changes nothing else."""
 
 RAYS = 2**24
 """Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between two."""

@@ -32,10 +32,12 @@ class ShapeLabels:
     shape_operators : ndarray, shape (V, 3, 3), or None
         Of a mesh: S at its vertices for normals on the camera's side, model frame, 1/mm. None for a sphere, cylinder
         or plane, whose derivatives Mitsuba knows exactly.
+    curved : bool
+        Whether to give the curvatures; they are NaN otherwise, and all else is the same.
     """
 
-    def __init__(self, mi: Any, shape: Any, shape_operators: Array | None) -> None:
-        self.mi, self._shape = mi, shape
+    def __init__(self, mi: Any, shape: Any, shape_operators: Array | None, curved: bool = True) -> None:
+        self.mi, self._shape, self._curved = mi, shape, curved
         self._operators = None
         if shape_operators is not None:
             rows, columns = np.triu_indices(3)
@@ -68,10 +70,13 @@ class ShapeLabels:
         # Rendered shapes are seen from either side.
         facing = dr.select(dr.dot(si.n, rays.traced.d) > 0, mi.Float(-1), mi.Float(1))
         shading, geometric = rotation @ mi.Vector3f(si.sh_frame.n), rotation @ (mi.Vector3f(si.n) * facing)
-        a, b, c = self._second_form(preliminary, si, seen)
-        mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
+        curvatures = [mi.Float(dr.nan), mi.Float(dr.nan)]
+        if self._curved:
+            a, b, c = self._second_form(preliminary, si, seen)
+            mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
+            curvatures = [facing * mean - half, facing * mean + half]
         position = rays.sightline * si.t
-        channels = [si.t, *position, *shading, *geometric, facing * mean - half, facing * mean + half]
+        channels = [si.t, *position, *shading, *geometric, *curvatures]
         channels = [dr.select(seen, channel, dr.nan) for channel in channels]
         face = dr.reinterpret_array(mi.Float, preliminary.prim_index)
         return [*channels, face, *preliminary.prim_uv]

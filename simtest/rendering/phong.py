@@ -3,6 +3,8 @@
 from functools import cache
 from typing import Any
 
+from simtest.rendering import lobes
+
 PLUGIN = "simtest_phong"
 
 
@@ -67,18 +69,6 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
                 ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
             )
 
-        def _log_cosine(self, wi: Any, wo: Any) -> tuple[Any, Any]:
-            """Give log cos(beta), and whether beta is below 90 deg.
-
-            With t = tan(beta/2) = |wo - m|/|wo + m|, m the mirror direction, log cos(beta) = -2 artanh(t^2). The
-            cosine itself, by a dot product, has lost the digits that count next to 1: its power's relative error
-            would be n eps, while this form's is sqrt(n) eps within the lobe.
-            """
-            mirror = mi.reflect(wi)
-            squared = dr.squared_norm(wo - mirror) / dr.squared_norm(wo + mirror)
-            ahead = squared < 1
-            return -2 * dr.atanh(dr.select(ahead, squared, 0)), ahead
-
         def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             """Give f cos(theta) and the sampling density of the enabled lobes."""
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
@@ -87,7 +77,8 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             share = self._share(ctx, si, active)
             glossy, diffuse = self._enabled(ctx)
             if glossy:
-                log_cosine, ahead = self._log_cosine(si.wi, wo)
+                # beta is the angle to the mirror direction.
+                log_cosine, ahead = lobes.log_cosine(wo, mi.reflect(si.wi))
                 scale = (self.exponent + 2) * dr.inv_two_pi * cos_o if self.normalised else mi.Float(1)
                 value += dr.select(ahead, self.specular * scale * dr.exp(self.exponent * log_cosine), 0)
                 # How samples are drawn is no part of what is differentiated.

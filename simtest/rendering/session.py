@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
 from simtest.rendering import backend, emission, exact, highlights, phong
-from simtest.rendering.direct import COLOCATED_MM, DirectLight, Material
+from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
@@ -17,6 +17,7 @@ from simtest.rendering.places import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.refine import Refinement
 from simtest.rendering.shapes import make_shape
+from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
 
@@ -65,8 +66,8 @@ class Session:
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
-        self.mi = backend.load(variant)
-        self.variant = str(self.mi.variant())
+        self._mitsuba = backend.load(variant)
+        self.variant = str(self._mitsuba.variant())
         self.plugin = phong.register(self.mi, self.variant)
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
@@ -75,6 +76,13 @@ class Session:
         self._load_surface(scene)
         self._set_camera(scene)
         self.update(scene)
+
+    @property
+    def mi(self) -> Any:
+        """The mitsuba module, at this session's variant: it is one for all sessions, and another may have moved it."""
+        if self._mitsuba.variant() != self.variant:
+            self._mitsuba.set_variant(self.variant)
+        return self._mitsuba
 
     def update(self, scene: Scene) -> None:
         """Move to another scene; only what changed is updated, and only another structure is rebuilt.
@@ -214,11 +222,8 @@ class Session:
         return self._built.labels
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
-        built, effort = self._built, self.scene.render
+        built, effort, tracer = self._built, self.scene.render, self._tracer()
         assert built is not None
-        material = Material(built.scene.shapes()[0].bsdf(), built.base)
-        refinement = Refinement(self.mi, self._shape)
-        tracer = Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
         bounces = None
         if effort.path_depth > 2:
             bounces = Bounces(self.mi, built.scene, effort.path_depth, effort.seed)
@@ -228,6 +233,21 @@ class Session:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
         return as_radiance(parts), channels
+
+    def _tracer(self) -> Tracer:
+        built = self._built
+        assert built is not None
+        material = Material(built.scene.shapes()[0].bsdf(), built.base)
+        refinement = Refinement(self.mi, self._shape)
+        return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
+
+    def _centre_hits(self) -> list[FloatImage]:
+        """Give the labels of a frame, or the same without curvatures, which need a mesh's shape operators."""
+        if not self._centre:
+            assert self._built is not None
+            labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)
+            self._centre = self._tracer().centres(None, False, labels)[1]
+        return self._centre
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
@@ -275,8 +295,9 @@ class Session:
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]
         pixels = centres.reshape(-1, 2)
-        if stride == 1 and self._centre:
-            hits, shading, geometric = as_hits(self._centre)
+        if stride == 1:
+            # As a frame's labels are, so that the truth does not depend on whether there was a frame.
+            hits, shading, geometric = as_hits(self._centre_hits())
             points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
             points, shading, geometric = self._cast(*self.sightlines.in_view(pixels))
@@ -284,15 +305,15 @@ class Session:
 
     def lit(self, positions: Array, light: int) -> Any:
         """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
-        place = self.scene.rig.true_mm()[light : light + 1]
+        place = self.scene.rig.true_mm()[light]
         towards = positions - place
         distance = np.linalg.norm(towards, axis=1)
         directions = towards / distance[:, None]
         emitted = self.scene.rig.lights[light].factor(directions) > 0
-        if np.linalg.norm(place) <= COLOCATED_MM:
+        if is_at_camera(place):
             return emitted
         pose = self.surface.model_from_camera
-        origins = np.broadcast_to(self.to_model(place), positions.shape)
+        origins = np.broadcast_to(self.to_model(place[None]), positions.shape)
         hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)
         # A blocker stands clearly before the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))

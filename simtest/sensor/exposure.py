@@ -32,7 +32,8 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
     ValueError
         If noise is asked for without a generator.
     """
-    frame = radiance / np.float32(full_scale) if full_scale > 0 else np.zeros_like(radiance)
+    # In double precision: a small full scale is 0 in single precision.
+    frame = (radiance / np.float64(full_scale)).astype(np.float32) if full_scale > 0 else np.zeros_like(radiance)
     if noise_sigma > 0:
         if rng is None:
             raise ValueError("noise needs a generator")

@@ -6,7 +6,7 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Response
-from simtest.spec.camera import NOT_OF_THE_CAMERA, CameraSpec, load_camera
+from simtest.spec.camera import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.profile import CosineProfile, Profile
 from simtest.spec.reading import Spec, read_toml, validate
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
@@ -48,8 +48,8 @@ def load_calibration(path: str | Path) -> Calibration:
     Parameters
     ----------
     path : str or Path
-        ``*.toml`` with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level; or
-        anything that `load_camera` reads.
+        TOML with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level, under any name
+        that is not by its suffix a file of OpenCV, ROS or MATLAB; or anything else that `load_camera` reads.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     path = Path(path)
     camera = load_camera(path)
-    data = read_toml(path) if path.suffix.lower() == ".toml" else {}
+    data = read_toml(path) if is_toml(path) else {}
     if not isinstance(data.get("camera"), Mapping):
         # The camera's keys stand at top level, before the other tables.
         data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}

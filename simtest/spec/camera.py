@@ -20,6 +20,9 @@ PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor"})
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration` reads them."""
 
+OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
+MATLAB_SUFFIX = ".mat"
+
 
 class BrownConradySpec(Spec):
     """A perspective lens: OpenCV's models of 5 and 8 coefficients, ROS' plumb_bob and rational_polynomial.
@@ -172,11 +175,11 @@ def load_camera(path: str | Path) -> Camera:
     # Imported here: OpenCV and SciPy are slow to load, and scenes need neither.
     path = Path(path)
     kind = path.suffix.lower()
-    if kind in (".yml", ".yaml", ".xml", ".json"):
+    if kind in OPENCV_SUFFIXES:
         from simtest.spec.camera_files import read_opencv
 
         return _validated(read_opencv(path), path)
-    if kind == ".mat":
+    if kind == MATLAB_SUFFIX:
         from simtest.spec.camera_matlab import read_matlab
 
         return _validated(read_matlab(path), path)
@@ -186,6 +189,11 @@ def load_camera(path: str | Path) -> Camera:
     if missing:
         raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, fx, fy")
     return _validated(table, path)
+
+
+def is_toml(path: Path) -> bool:
+    """Tell whether `load_camera` reads a file as TOML: by its suffix it is none of OpenCV's, ROS' or MATLAB's."""
+    return path.suffix.lower() not in (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
 
 
 def _validated(table: Mapping[str, Any], path: Path) -> Camera:
@@ -219,7 +227,7 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     from simtest.files import write_atomically
     from simtest.spec.camera_files import opencv_text, ros_text
 
-    suffixes = {"toml": (".toml",), "opencv": (".yml", ".yaml", ".xml", ".json"), "ros": (".yml", ".yaml")}
+    suffixes = {"toml": (".toml",), "opencv": OPENCV_SUFFIXES, "ros": (".yml", ".yaml")}
     chosen = format or ("toml" if path.suffix.lower() == ".toml" else "opencv")
     if chosen not in suffixes:
         raise InputError(f"format = {shown(chosen)!r}: must be one of {', '.join(CAMERA_FORMATS)}")

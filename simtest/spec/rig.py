@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.seeds import from_integer
 from simtest.spec.profile import CosineProfile, Profile, TableProfile
@@ -16,6 +16,14 @@ Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
 Gain = Annotated[float, Field(ge=0, le=1e6)]
 Power = Annotated[float, Field(gt=0, le=1e12)]
 Vector = tuple[float, float, float]
+
+COLOCATED_MM = 1e-9
+"""A light no farther than this from the camera centre is at the camera: it sees what the camera sees."""
+
+
+def is_at_camera(place_mm: npt.ArrayLike) -> bool:
+    """Tell whether a place, shape (3,), camera frame, mm, is the camera's."""
+    return float(np.linalg.norm(place_mm)) <= COLOCATED_MM
 
 
 class Emission(Spec):
@@ -66,7 +74,8 @@ class Emission(Spec):
     @property
     def axis(self) -> npt.NDArray[np.float64]:
         """Unit axis of profile and spot, shape (3,), camera frame."""
-        axis = np.array(self.direction)
+        # The squares of a very short direction would underflow.
+        axis = np.array(self.direction) / np.abs(self.direction).max()
         return np.asarray(axis / np.linalg.norm(axis))
 
     @property
@@ -87,12 +96,11 @@ class Emission(Spec):
         ndarray, shape (N,)
         """
         away = np.asarray(directions, dtype=float)
-        cosine = away @ self.axis
-        value = self.profile.model().at(cosine)
+        cosine, sine = away @ self.axis, np.linalg.norm(np.cross(away, self.axis), axis=1)
+        value = self.profile.model().at(cosine, sine)
         if self.spot_deg is None:
             return value
-        angle = np.arctan2(np.linalg.norm(np.cross(away, self.axis), axis=1), cosine)
-        inside = math.radians(self.spot_deg / 2) - angle
+        inside = math.radians(self.spot_deg / 2) - np.arctan2(sine, cosine)
         edge = math.radians(self.soft_edge_deg)
         return value * (np.clip(inside / edge, 0.0, 1.0) if edge > 0 else (inside >= 0))
 
@@ -123,6 +131,16 @@ class LightSpec(Emission):
             return self.position_mm
         angle = math.radians(self.azimuth_deg)
         return (self.offset_mm * math.cos(angle), self.offset_mm * math.sin(angle), 0.0)
+
+    @property
+    def profile_of_view(self) -> CosineProfile | TableProfile | None:
+        """The emission over the angle of the sightline from the optical axis; None where it is no function of that.
+
+        It is one of a light at the camera that shines along the optical axis. A spot is left out: beyond its rim
+        there is nothing to divide.
+        """
+        along = not any(self.direction[:2]) and self.direction[2] > 0
+        return self.profile if along and self.spot_deg is None and is_at_camera(self.place_mm) else None
 
 
 Preset = Literal["colocated", "laparoscope", "colonoscope_2", "colonoscope_3"]
@@ -156,7 +174,9 @@ class Rig(Spec):
     seed: int = Field(0, ge=0, lt=2**63, description="of the position errors; experiments draw one a realisation")
 
     emission_known: bool = Field(
-        True, description="whether reconstruction is told the profile of a single light at the camera"
+        True,
+        description="whether reconstruction is told, and divides by, the profile of a single light at the camera that "
+        "shines along the optical axis and is no spot; that of other rigs it is never told",
     )
 
     @model_validator(mode="after")
@@ -167,11 +187,19 @@ class Rig(Spec):
                     raise ValueError(f"{name}: belongs to a preset; give preset, or the place of each of lights")
             return self
         ring = self._ring()
-        # Equal lights are those of a dumped model that is read back.
+        # Equal lights are those of an older frame.json, which held both.
         if "lights" in self.model_fields_set and self.lights != ring:
             raise ValueError("preset and lights exclude each other; give one of them")
         object.__setattr__(self, "lights", ring)
         return self
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out the lights that a preset gives: beside them none of its numbers could be changed."""
+        dumped: dict[str, Any] = dump(self)
+        if self.preset is not None:
+            dumped.pop("lights", None)
+        return dumped
 
     def _ring(self) -> tuple[LightSpec, ...]:
         """Give the preset's lights."""
@@ -193,13 +221,11 @@ class Rig(Spec):
     def known_emission(self) -> CosineProfile | TableProfile | None:
         """Give the profile that reconstruction may divide by: of a single light at the camera, along the optical axis.
 
-        None where it is uniform or not known, and for other rigs, whose falloff hangs on the distance too.
+        None where it is uniform or not known, for a spot, and for other rigs, whose falloff hangs on the distance too.
         """
-        light = self.lights[0]
-        at_camera = len(self.lights) == 1 and not any(light.place_mm) and light.spot_deg is None
-        along = not any(light.direction[:2]) and light.direction[2] > 0
-        told = self.emission_known and at_camera and along and not light.profile.model().is_uniform
-        return light.profile if told else None
+        profile = self.lights[0].profile_of_view if len(self.lights) == 1 else None
+        told = self.emission_known and profile is not None and not profile.model().is_uniform
+        return profile if told else None
 
     @property
     def is_drawn(self) -> bool:

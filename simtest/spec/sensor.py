@@ -79,14 +79,14 @@ ResponseSpec = Annotated[LinearResponse | GammaResponse | SrgbResponse | TableRe
 class Exposure(Spec):
     """Which radiance becomes full scale: that of the brightest isolated highlight, unless one of the keys says else."""
 
-    full_scale: float | None = Field(None, gt=0, le=1e12, description="radiance at full scale, fixed")
+    full_scale: float | None = Field(None, ge=1e-12, le=1e12, description="radiance at full scale, fixed")
     percentile: float | None = Field(
         None,
         gt=0,
         le=100,
         description="automatic: this percentile of the frame's radiance, inside the view mask, becomes full scale",
     )
-    gain: float = Field(1.0, gt=0, le=1e6, description="exposure over that of the rule; 2 halves full scale")
+    gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 
     @model_validator(mode="after")
     def _one_way(self) -> "Exposure":

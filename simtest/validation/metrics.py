@@ -15,6 +15,7 @@ from simtest.rendering import Session
 from simtest.rendering.frames import Array
 from simtest.spec.profile import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.truth import JudgedHighlight
@@ -188,18 +189,20 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
 def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
     """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
 
-    With a light at the camera: circle pose (two candidates) on a curved surface; the shift by unknown vignetting for
-    estimators of one candidate. With an offset light: half the angle between light and camera for those.
+    With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
+    vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
+    camera for those.
     """
     highlight = truth.highlight
     light = scene.rig.true_mm()[highlight.light]
-    offset = float(np.linalg.norm(light)) > 0
+    offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
+    if power is None or (offset and power > 0):
+        return None
     if len(estimate.candidates) == 1:
-        unknown = not (scene.sensor.vignetting_known or scene.sensor.vignetting.model().is_uniform)
-        if offset and not unknown:
+        if offset:
             return float(np.degrees(laws.bisector_angle(highlight.position, light)))
-        return _vignetting_law_deg(scene, estimate, truth) if unknown and not offset else None
-    if offset or len(estimate.isophotes) != 1:
+        return _vignetting_law_deg(scene, estimate, truth, power) if power > 0 else None
+    if offset or power > 0 or len(estimate.isophotes) != 1:
         return None
     a, b = laws.isophote_half_axes(
         estimate.isophotes[0].isovalue, lobe_curvature(scene), highlight.kd_min, highlight.kd_max
@@ -208,14 +211,26 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     return error if np.isfinite(error) else None
 
 
-def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
-    """Give the shift by unknown vignetting, deg; None for a table, and where the curvatures differ."""
-    highlight, vignetting = truth.highlight, scene.sensor.vignetting
-    if not isinstance(vignetting, CosineProfile) or abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
+def unknown_falloff(scene: Scene, light: int) -> float | None:
+    """Give k of the falloff cos^k about the optical axis that reconstruction is not told; None for another form."""
+    sensor, emitter = scene.sensor, scene.rig.lights[light]
+    parts = [] if sensor.vignetting_known else [sensor.vignetting]
+    if scene.rig.known_emission() is None and not emitter.is_isotropic:
+        if (profile := emitter.profile_of_view) is None:
+            return None
+        parts.append(profile)
+    powers = [part.power if isinstance(part, CosineProfile) else None for part in parts]
+    return None if None in powers else float(sum(power for power in powers if power))
+
+
+def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight, power: float) -> float | None:
+    """Give the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
+    highlight = truth.highlight
+    if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
         return None
     off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
     isovalues = [isophote.isovalue for isophote in estimate.isophotes] or [1.0]
-    shifts = laws.vignetting_shift(off_axis, vignetting.power, lobe_curvature(scene), highlight.kd_min, isovalues)
+    shifts = laws.vignetting_shift(off_axis, power, lobe_curvature(scene), highlight.kd_min, isovalues)
     return float(np.degrees(shifts.mean())) if np.isfinite(shifts).all() else None
 
 

@@ -23,6 +23,9 @@ from simtest.validation.truth import JudgedHighlight, judge
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
+LEAST_SHARE = 1e-12
+"""A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -119,10 +122,10 @@ def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], see
         radiance = exposure.full_scale
     elif exposure.percentile is not None:
         radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))
-        if radiance <= 0:
+        if radiance <= LEAST_SHARE * peak:
             warnings.warn(
-                f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is 0; "
-                "the frame's maximum becomes full scale",
+                f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is "
+                f"{radiance:g}, {LEAST_SHARE:g} of its maximum or less; the frame's maximum becomes full scale",
                 stacklevel=3,
             )
             radiance = peak

@@ -1,6 +1,7 @@
 """Fits and poses of many conics at once are those of each alone, to the last bit, failures included."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,6 +88,15 @@ def test_a_batch_holds_every_kind_of_outcome():
     """So that the test above cannot pass by meeting failures alone, or none."""
     rng = np.random.default_rng(0)
     fitted = fit_ellipses([contour(rng) for _ in range(400)])
+    poses = circle_poses(np.where(rng.random((400, 1, 1)) < 0.5, np.eye(3), np.diag([1.0, 1.0, -1.0])))
+    for batch in (fitted, poses):
+        for i in (0, *list(batch.failures)[:3]):
+            assert isinstance(batch[i], Failure) == isinstance(batch[i - len(batch)], Failure) == (i in batch.failures)
+        for outside in (400, -401):
+            with pytest.raises(IndexError):
+                batch[outside]
+        with pytest.raises(TypeError):
+            batch[1:3]
     reasons = {failure.reason for failure in fitted.failures.values()}
     assert len(reasons) >= 3
     assert len(fitted.failures) < 200

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import EllipseModel
 
-from simtest.errors import Failure, Reason
-from simtest.geometry import FittedConic, ellipse_of_conic, fit_ellipse
+from simtest.errors import Failure, InputError, Reason
+from simtest.geometry import FittedConic, ellipse_of_conic, fit_ellipse, fit_ellipses
 
 
 def ellipse_points(centre, a, b, angle, phase):
@@ -140,8 +140,7 @@ T = np.linspace(-1.5, 1.5, 15)
 REFUSED = {
     "none": (np.empty((0, 2)), Reason.TOO_FEW_POINTS),
     "five": (ellipse_points((0, 0), 2, 1, 0, phases(5)), Reason.TOO_FEW_POINTS),
-    "three columns": (np.ones((10, 3)), Reason.TOO_FEW_POINTS),
-    "flat": (np.arange(12.0), Reason.TOO_FEW_POINTS),
+    "empty list": ([], Reason.TOO_FEW_POINTS),
     "collinear": (LINE, None),
     "collinear, along x": (LINE * [1, 0], None),
     "collinear, along y": (LINE * [0, 1] + [7, 0], None),
@@ -165,6 +164,28 @@ def test_what_is_no_ellipse_is_refused(name):
     result = fit_ellipse(points)
     assert isinstance(result, Failure)
     assert reason is None or result.reason is reason
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((10, 3)), r"contour 0 has shape \(10, 3\): must be \(N, 2\)"),
+        (np.zeros((3, 3)), r"shape \(3, 3\)"),
+        (np.arange(12.0), r"shape \(12,\)"),
+        (np.zeros((7, 2, 1)), r"shape \(7, 2, 1\)"),
+        (5.0, r"shape \(\)"),
+        (None, "contour 0"),
+        ([[1.0, 2.0], [3.0]], "contour 0: must be numbers"),
+        ([["a", "b"]] * 8, "contour 0: must be numbers"),
+    ],
+    ids=range(8),
+)
+def test_what_is_no_list_of_points_is_malformed(points, message):
+    with pytest.raises(InputError, match=message):
+        fit_ellipse(points)
+    good = ellipse_points((0, 0), 2, 1, 0, phases(9))
+    with pytest.raises(InputError, match="contour 1"):
+        fit_ellipses([good, points])
 
 
 @pytest.mark.parametrize("branches", [1, 2])

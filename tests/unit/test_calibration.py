@@ -9,7 +9,7 @@ import simtest
 from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.calibration.calibration import MIN_FALLOFF
 from simtest.detection import detect, estimate_noise
-from simtest.errors import Failure, InputError
+from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.profile import AngularProfile
 from simtest.reconstruction import reconstruct
@@ -79,6 +79,12 @@ def test_a_camera_file_is_a_calibration_of_nothing_else(tmp_path, text):
     assert read.saturation_level is None
 
 
+@pytest.mark.parametrize("name", ["a.txt", "calib.cfg", "calibration", "c.TOML"])
+def test_the_other_tables_are_read_whatever_the_file_is_called(tmp_path, name):
+    text = CAMERA_TABLE + WHOLE
+    assert load_calibration(write(tmp_path, text, name)) == load_calibration(write(tmp_path, text))
+
+
 def test_lens_and_view_mask_are_read_beside_the_other_tables(tmp_path):
     table = CAMERA_TABLE + 'distortion = { type = "kannala_brandt", k1 = 0.01 }\nview_mask = { radius = 50.0 }\n'
     camera = dataclasses.replace(CAMERA, distortion=KannalaBrandt(0.01), view_mask=ViewMask(80.0, 60.0, 50.0))
@@ -124,6 +130,48 @@ def test_malformed_calibrations_are_refused():
         Calibration(CAMERA, saturation_level=0.0)
     with pytest.raises(InputError, match=r"must be a simtest\.Camera or simtest\.Calibration"):
         reconstruct(spot(), "camera.toml")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Calibration(CAMERA, response="srgb"), "calibration response is a str: must be a simtest Response"),
+        (lambda: Calibration(CAMERA, vignetting=4.0), "calibration vignetting is a float: must be a simtest Angular"),
+        (lambda: Calibration(CAMERA, emission=None), "calibration emission is a NoneType"),
+        (lambda: Calibration(CAMERA, noise=0.05), "calibration noise is a float"),
+        (lambda: Calibration(CAMERA, saturation_level="x"), "saturation_level = 'x': must be a finite number > 0"),
+        (lambda: Calibration(CAMERA, saturation_level=np.nan), "saturation_level = nan"),
+        (lambda: Response("film"), "response kind = 'film'"),
+        (lambda: Response("gamma", "x"), "response gamma = 'x': must be a finite number > 0"),
+        (lambda: Response("gamma", True), "response gamma = True"),
+        (lambda: Response("gamma", 10**400), "response gamma = 1000"),
+        (lambda: Response("table", light=5, value=6), "light = 5: must be a sequence of finite numbers"),
+        (lambda: Response("table", light=(0, 1), value="01"), "value = '01'"),
+        (lambda: Response("table", light=(0, "a", 1), value=(0, 0.5, 1)), "light = "),
+        (lambda: AngularProfile(power="a"), "profile power = 'a': must be a finite number >= 0"),
+        (lambda: AngularProfile(power=None), "profile power = None"),
+        (lambda: AngularProfile(angles=(0, "a"), values=(1, 1)), "profile angles = "),
+        (lambda: AngularProfile(angles=0.5, values=(1, 1)), "profile angles = 0.5: must be a sequence"),
+        (lambda: AngularProfile(angles=(0, 1), values=(1, np.nan)), "profile values = "),
+        (lambda: NoiseModel(full_well=0), "noise full_well = 0: must be a finite number > 0"),
+        (lambda: NoiseModel(np.nan), "noise sigma = nan: must be a finite number >= 0"),
+        (lambda: NoiseModel(-1), "noise sigma = -1"),
+        (lambda: NoiseModel(0.0, 100.0, -1.0), "noise read_noise = -1.0"),
+        (lambda: NoiseModel(read_noise=5.0), "noise read_noise = 5 electrons: needs full_well"),
+        (lambda: NoiseModel(bits=8.5), "noise bits = 8.5: must be an integer from 1 to 32"),
+        (lambda: NoiseModel(bits=0), "noise bits = 0"),
+        (lambda: NoiseModel(response="srgb"), "noise response is a str"),
+    ],
+)  # fmt: skip
+def test_malformed_parts_of_a_calibration_are_refused_in_one_line(make, message):
+    with pytest.raises(InputError, match=message) as error:
+        make()
+    assert str(error.value).isprintable()
+
+
+def test_numpys_numbers_are_numbers():
+    assert NoiseModel(np.float32(0.5), np.int64(100), np.float64(2), np.int16(8)).at(0.0) > 0
+    assert AngularProfile(np.float32(2)).at(0.5) == 0.25
 
 
 # What is undone ------------------------------------------------------------------------------------------------------
@@ -226,6 +274,25 @@ def test_a_clipped_peak_lies_at_the_plateaus_centroid(place):
     assert clipped.peak_value == pytest.approx(1.0, abs=1e-3)
     # A Gaussian clipped at 1/g: share log(g) / log(2 g) of the isophote at half of it.
     assert clipped.saturated_share(0.5) == pytest.approx(np.log(2.5) / np.log(5), abs=0.01)
+
+
+def test_the_peak_of_a_plateau_does_not_lie_in_its_hole():
+    """A dark hole of one pixel, closed, at the centroid."""
+    frame = np.zeros((21, 21), np.float32)
+    frame[7:14, 7:14] = 1.0
+    frame[10, 10] = -1.0
+    patch = Patch.cut(frame, (0, 0, 21, 21), saturated=frame >= 1)
+    assert patch.peak_value == 1.0
+    column, row = patch.peak_pixel
+    assert frame[row, column] == 1.0
+    np.testing.assert_allclose(patch.peak_px, [10.5, 10.5])
+    assert len(patch.crossings(0.5)) == 28
+    # All of the plateau dark, as after a falsely stated level: no peak.
+    dark = np.where(frame == 0, 0.5, 0).astype(np.float32)
+    dark[3, 10] = 1.0
+    result = Patch.cut(dark, (0, 0, 21, 21), (7, 7), saturated=frame >= 1)
+    assert isinstance(result, Failure)
+    assert result.reason is Reason.NO_PEAK
 
 
 def test_a_few_clipped_pixels_leave_the_parabola():

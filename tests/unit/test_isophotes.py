@@ -122,6 +122,42 @@ def test_crossings_are_the_points_of_marching_squares(number, t, width):
     assert (polygon[0] == polygon[-1]).all()
 
 
+@given(number=st.integers(0, 2**32 - 1), steps=st.integers(2, 16), width=st.floats(0.0, 3.0), data=st.data())
+def test_crossings_of_a_quantised_image_are_each_there_once(number, steps, width, data):
+    """Where pixels have the level's own value many lines cross the border in one point."""
+    rng = np.random.default_rng(number)
+    image = smooth(rng.standard_normal((40, 50)), width) + 1.5 * spot((25, 20), 5.0)[:40, :50]
+    image = (np.rint(image / image.max() * steps) / steps).astype(np.float32)
+    t = data.draw(st.integers(1, steps - 1)) / steps
+    patch = patch_of(image, (0, 0, 50, 40))
+    points, polygon = patch.crossings(t), patch.isophote(t)
+    if isinstance(points, Failure):
+        assert isinstance(polygon, Failure)
+        return
+    assert len(np.unique(np.round(points, 9), axis=0)) == len(points)
+    assert same_points(np.unique(polygon, axis=0), points)
+    assert (polygon[0] == polygon[-1]).all()
+    # In order: from one point to the next within a cell, and on.
+    steps_taken = np.linalg.norm(np.diff(polygon, axis=0), axis=1)
+    assert 0 < steps_taken.min() <= steps_taken.max() <= np.sqrt(2) + 1e-6
+    region = patch.inside(t)
+    assert (encloses_all(polygon, np.argwhere(region)[:, ::-1] + 0.5)).all()
+
+
+def encloses_all(polygon, points):
+    return np.array([encloses(polygon, point) for point in points])
+
+
+def test_a_pixel_at_the_level_is_one_point():
+    """A plus of pixels: 8 points of the polygon, of which its 4 outer corners are crossed twice."""
+    image = np.zeros((7, 7), np.float32)
+    image[2:5, 2:5] = 0.5
+    image[3, 2:5] = image[2:5, 3] = 1.0
+    patch = patch_of(image)
+    polygon = patch.isophote(0.5)
+    assert len(patch.crossings(0.5)) == len(polygon) - 1 == 8
+
+
 @given(
     number=st.integers(0, 2**32 - 1), t=st.floats(0.2, 0.9), x=st.floats(5, 45), y=st.floats(5, 35),
     radius=st.floats(4, 40),

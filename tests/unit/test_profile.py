@@ -25,6 +25,14 @@ def test_table_is_linear_in_the_angle_and_holds_its_last_value():
     np.testing.assert_allclose(profile.at(np.cos(np.radians([0, 10, 30, 40, 170]))), [2, 1.5, 0.75, 0.5, 0.5])
 
 
+def test_a_table_keeps_its_digits_next_to_the_axis():
+    profile, angle = AngularProfile(angles=(0.0, 1e-6), values=(1.0, 0.5)), np.array([1e-9, 1e-8, 5e-7])
+    expected = 1 - 0.5e6 * angle
+    np.testing.assert_allclose(profile.at(np.cos(angle), np.sin(angle)), expected, rtol=1e-12)
+    # The cosine alone has lost them.
+    assert np.abs(profile.at(np.cos(angle)) - expected).max() > 1e-3
+
+
 @pytest.mark.parametrize(
     ("table", "key"),
     [

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.rendering import Session
-from simtest.rendering.direct import COLOCATED_MM
 from simtest.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
 from simtest.spec.experiment import Experiment
-from simtest.spec.rig import PRESETS
+from simtest.spec.reading import apply_settings
+from simtest.spec.rig import COLOCATED_MM, PRESETS, Rig
 from simtest.validation.cases import expand
 
 render = pytest.mark.render
@@ -85,6 +85,19 @@ def test_radiance_of_a_plane_follows_the_emission(session, name, place):
     total = session.radiance().total
     np.testing.assert_allclose(total, expected, rtol=1e-4, atol=3e-6 * expected.max())
     assert total.max() > 0
+
+
+@render
+@pytest.mark.parametrize("power", [100.0, 1000.0])
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], ids=["along", "aslant"])
+def test_a_narrow_emission_keeps_its_digits(session, power, direction):
+    """Down to 1e-3 of the peak; by the power of a dot product the error would be up to 4e-5."""
+    light = {"profile": {"type": "cosine", "power": power}, "direction": direction}
+    session.update(scene([light]))
+    expected = matt(light, lambda a: np.maximum(np.cos(a), 0) ** power)
+    lobe = expected > 1e-3 * expected.max()
+    assert lobe.sum() > 30
+    np.testing.assert_allclose(session.radiance().total[lobe], expected[lobe], rtol=1e-5)
 
 
 @render
@@ -298,6 +311,23 @@ def test_a_presets_numbers_can_be_overridden_and_read_back(count, radius, azimut
     assert scene_from_dict(json.loads(described.model_dump_json())) == described
 
 
+def test_a_dumped_preset_can_be_changed():
+    described = scene(rig={"preset": "laparoscope"})
+    dumped = described.model_dump()
+    assert "lights" not in dumped["rig"]
+    changed = scene_from_dict(apply_settings(dumped, {"rig.radius_mm": 2.0}, "dump"))
+    np.testing.assert_allclose(np.linalg.norm(changed.rig.nominal_mm(), axis=1), 2.0)
+    # Older dumps held both.
+    lights = [light.model_dump() for light in described.rig.lights]
+    assert scene_from_dict({**dumped, "rig": {**dumped["rig"], "lights": lights}}) == described
+    assert len(scene([{}, {"offset_mm": 2.0}]).model_dump()["rig"]["lights"]) == 2
+
+
+@pytest.mark.parametrize("size", [5e-324, 1e-200, 1.0, 1e6])
+def test_a_direction_of_any_length_is_an_axis(size):
+    np.testing.assert_array_equal(LightSpec(direction=(size, 0, 0)).axis, [1, 0, 0])
+
+
 # Refused -------------------------------------------------------------------------------------------------------------
 
 REFUSED = {
@@ -345,6 +375,16 @@ def test_a_light_inside_a_body_is_refused_and_the_session_stays(session, name):
         session.update(scene([{}, {"position_mm": [0.0, 0.0, depth]}], SOLIDS[name]))
     np.testing.assert_array_equal(session.radiance().total, before)
     session.update(scene([{}, {"position_mm": [0.0, 0.0, 0.5 * depth if name != "liver" else 1.0]}], SOLIDS[name]))
+
+
+@render
+def test_a_draw_into_a_body_names_the_keys(session):
+    light = {"position_mm": [0.0, 0.0, 9.99], "position_error_mm": 0.1}
+    inside = [seed for seed in range(20) if Rig(lights=(light,), seed=seed).true_mm()[0, 2] > D]
+    with pytest.raises(InputError, match=rf"position_error_mm = 0\.1 drew that place with rig\.seed = {inside[0]}"):
+        session.update(scene(rig={"lights": [light], "seed": inside[0]}))
+    with pytest.raises(InputError, match=r"a light must be in free space$"):
+        session.update(scene(rig={"lights": [{**light, "position_mm": [0.0, 0.0, 15.0]}]}))
 
 
 def _depth(surface):

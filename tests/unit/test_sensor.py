@@ -119,6 +119,8 @@ def test_curves_have_their_published_values():
         ({"sensor": {"bits": 17}}, "sensor.bits = 17"),
         ({"sensor": {"bits": 8.5}}, "sensor.bits = 8.5"),
         ({"sensor": {"exposure": {"full_scale": 0.0}}}, "sensor.exposure.full_scale = 0.0"),
+        ({"sensor": {"exposure": {"full_scale": 1e-46}}}, "sensor.exposure.full_scale = 1e-46"),
+        ({"sensor": {"exposure": {"gain": 1e-300}}}, "sensor.exposure.gain = 1e-300"),
         ({"sensor": {"exposure": {"percentile": 0}}}, "sensor.exposure.percentile = 0"),
         ({"sensor": {"exposure": {"percentile": 100.1}}}, "sensor.exposure.percentile = 100.1"),
         ({"sensor": {"exposure": {"percentile": 99, "full_scale": 1.0}}}, "sensor.exposure: .*exclude each other"),
@@ -139,6 +141,11 @@ def test_malformed_sensors_name_the_key(table, key):
 def test_noise_without_a_generator_is_refused():
     with pytest.raises(ValueError, match="generator"):
         capture(image(), 1.0, sensor(full_well=100), None)
+
+
+def test_a_full_scale_below_single_precision_divides_all_the_same():
+    frame = expose(np.array([[0.0, 1e-38]], np.float32), 1e-46, 0.0, None)
+    np.testing.assert_allclose(frame, [[0.0, 1e8]], rtol=1e-6)
 
 
 def test_electrons_beyond_all_counting_stay_finite():

@@ -16,7 +16,7 @@ from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import angle_deg
+from simtest.validation.metrics import angle_deg, unknown_falloff
 from simtest.validation.realise import view
 from simtest.validation.runner import run_experiment
 
@@ -74,9 +74,14 @@ def test_known_emission_is_undone_and_unknown_emission_follows_the_law_of_vignet
 def test_the_emission_of_other_rigs_is_not_divided_away():
     """Beside the camera, or aslant, what a pixel gets hangs on the distance too."""
     light = {"profile": COS4}
-    for lights in ([{**light, "offset_mm": 1.0}], [{**light, "direction": [1, 0, 1]}], [light, {"offset_mm": 2.0}]):
+    for lights in (
+        [{**light, "offset_mm": 1.0}], [{**light, "direction": [1, 0, 1]}], [light, {"offset_mm": 2.0}],
+        [{**light, "spot_deg": 90.0}], [{**light, "offset_mm": 1e-8}],
+    ):  # fmt: skip
         assert scene(rig={"lights": lights}).calibration().emission.is_uniform
-    assert scene(rig={"lights": [light]}).calibration().emission.power == 4.0
+    # As the renderer has it, a light within COLOCATED_MM is at the camera.
+    for own in ({}, {"offset_mm": 1e-10}):
+        assert scene(rig={"lights": [{**light, **own}]}).calibration().emission.power == 4.0
 
 
 @pytest.mark.parametrize("tilt", [5.0, 10.0, 20.0])
@@ -127,6 +132,52 @@ def test_the_law_is_in_the_rows_where_it_speaks(tmp_path):
         assert row["error_deg"] == pytest.approx(row["error_law_deg"], rel=0.02)
 
 
+def row_errors(tmp_path, settings, sweep):
+    base = {
+        "camera.width": 320,
+        "camera.height": 320,
+        "camera.fx": 250.0,
+        "camera.fy": 250.0,
+        "sensor.noise_sigma": 0.0,
+    }
+    group = {"scene": "plane", "isolated": False, "set": {**base, **settings}, "sweep": [sweep]}
+    experiment = Experiment.model_validate({"name": "law", "realisations": 1, "groups": [group]})
+    return run_experiment(experiment, tmp_path / "run").results
+
+
+def test_powers_of_unknown_vignetting_and_emission_add_up_in_the_law(tmp_path):
+    settings = {
+        "rig.lights.0.profile": COS4, "sensor.vignetting": {"type": "cosine", "power": 2.0},
+        "sensor.vignetting_known": False,
+    }  # fmt: skip
+    rows = row_errors(tmp_path, settings, {"rig.emission_known": [True, False]})
+    single = rows.filter(rows["estimator"] != "circle_pose")
+    laws_by = {}
+    for row in single.iter_rows(named=True):
+        assert row["error_deg"] == pytest.approx(row["error_law_deg"], rel=0.02)
+        laws_by.setdefault(row["estimator"], []).append(row["error_law_deg"])
+    for known, unknown in laws_by.values():
+        assert unknown == pytest.approx(3 * known, rel=0.1)
+    # Circle pose's law knows no falloff.
+    assert rows.filter(rows["estimator"] == "circle_pose")["error_law_deg"].null_count() == 2
+
+
+@pytest.mark.parametrize(
+    ("light", "power"),
+    [
+        ({}, 0.0), ({"profile": COS4}, 4.0), ({"offset_mm": 1.0}, 0.0), ({"offset_mm": 1.0, "profile": COS4}, None),
+        ({"profile": COS4, "spot_deg": 90.0}, None), ({"profile": COS4, "direction": [1.0, 0.0, 1.0]}, None),
+        ({"profile": {"type": "table", "angle_deg": [0, 50], "value": [1, 0.5]}}, None),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_law_is_silent_on_emission_of_another_form(light, power):
+    rig = {"lights": [light], "emission_known": False}
+    assert unknown_falloff(scene(rig=rig), 0) == power
+    vignetted = scene({"vignetting": COS4, "vignetting_known": False}, rig=rig)
+    assert unknown_falloff(vignetted, 0) == (None if power is None else power + 4.0)
+
+
 # Exposure and saturation ---------------------------------------------------------------------------------------------
 
 
@@ -151,6 +202,26 @@ def test_a_percentile_without_light_falls_back_on_the_maximum(session):
         seen = view(session, described)
     assert len(caught) == 1
     assert seen.full_scale == pytest.approx(float(seen.light.max()))
+
+
+def test_a_percentile_of_all_but_darkness_falls_back_too(session):
+    """A share of 1e-38 of the peak would make a frame that single precision does not hold."""
+    sharp = {"type": "phong", "exponent": 100.0}
+    described = scene({"exposure": {"percentile": 1.0}}, reflectance=sharp, tilt=20.0)
+    with pytest.warns(UserWarning, match="percentile = 1: .* 1e-12 of its maximum or less"):
+        seen = view(session, described)
+    assert 0 < np.percentile(seen.light, 1.0) < 1e-12 * seen.light.max()
+    assert seen.full_scale == pytest.approx(float(seen.light.max()))
+
+
+def test_a_frames_description_holds_the_places_that_its_keys_do_not_show(tmp_path):
+    rigs = ({"preset": "colonoscope_2"}, {"lights": [{"position_error_mm": 0.1}], "seed": 3}, {})
+    for rig in rigs:
+        described = scene(size=48, focal=48.0, rig=rig)
+        write_frame(render(described), tmp_path)
+        told = json.loads((tmp_path / "frame.json").read_text())
+        assert told.get("lights_mm") == (described.rig.true_mm().tolist() if rig else None)
+        assert scene_from_dict(told["scene"]) == described
 
 
 @pytest.mark.parametrize("gain", [1.5, 2.0, 4.0])
@@ -319,6 +390,22 @@ def test_the_automatic_exposure_goes_by_what_is_in_view(session):
     inside = session.camera.seen
     assert np.median(seen.light) == 0
     assert np.mean(seen.light[inside] > seen.full_scale) == pytest.approx(0.5, abs=0.01)
+
+
+def test_known_emission_reads_back(tmp_path):
+    """A cos^4 light at the camera and a plain sensor: the files alone undo the falloff."""
+    described = scene(tilt=20.0, size=560, focal=406.0, rig={"lights": [{"profile": COS4}]})
+    frame = render(described)
+    names = [path.name for path in write_frame(frame, tmp_path)]
+    assert names[-1] == "calibration.toml"
+    assert load_calibration(tmp_path / names[-1]).emission == described.calibration().emission
+    errors = {}
+    for told in ("calibration.toml", "camera.toml"):
+        _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / told)
+        (read,) = json.loads(file.read_text())["specularities"]
+        normal = np.array(read["estimates"]["cone_axis"]["normal"])
+        errors[told] = angle_deg(normal, frame.highlights[0].highlight.normal)
+    assert errors["calibration.toml"] < LIMIT_DEG < 0.3 < errors["camera.toml"]
 
 
 def test_a_plain_sensor_writes_what_it_always_did(tmp_path):
