@@ -15,6 +15,8 @@ from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
 
+MAX_TRIANGLES = 5_000_000
+
 
 @dataclass(frozen=True)
 class _Build:
@@ -39,14 +41,22 @@ class _Build:
         free = (radial < self.tube.radius(u, v).f) & (u >= 0) & (u <= self.tube.recipe.length_mm)
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
+    def shape_operators(self) -> Array:
+        """Give S at the mesh's vertices by the tube's formulas, 1/mm, shape (V, 3, 3)."""
+        places = np.empty((len(self.mesh.vertices), 2))
+        places[self.mesh.faces.ravel()] = self.corners.reshape(-1, 2)
+        return self.tube.normal_and_shape_operator(places[:, 0], places[:, 1])[1]
+
 
 @lru_cache(maxsize=4)
-def build(recipe: ColonRecipe) -> _Build:
+def build(recipe: ColonRecipe, edge_mm: float | None = None) -> _Build:
     """Make the surface and the mesh of a recipe.
 
     Parameters
     ----------
     recipe : ColonRecipe
+    edge_mm : float, optional
+        Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
 
     Returns
     -------
@@ -56,11 +66,15 @@ def build(recipe: ColonRecipe) -> _Build:
     Raises
     ------
     InputError
-        If the folds close the lumen or the tube bends into itself.
+        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube = Tube(recipe)
-    cell = math.sqrt(2 * recipe.length_mm * 2 * math.pi * recipe.radius_mm / TRIANGLES)
-    rows, columns = round(recipe.length_mm / cell), round(2 * math.pi * recipe.radius_mm / cell)
+    area = recipe.length_mm * 2 * math.pi * recipe.radius_mm
+    cell = math.sqrt(2 * area / TRIANGLES) if edge_mm is None else edge_mm
+    if (count := 2 * area / cell**2) > MAX_TRIANGLES:
+        raise InputError(f"edge_mm = {cell:g}: gives {count:.0f} triangles; at most {MAX_TRIANGLES} are allowed")
+    rows = max(1, round(recipe.length_mm / cell))
+    columns = max(8, round(2 * math.pi * recipe.radius_mm / cell))
     u, v = np.linspace(0, recipe.length_mm, rows + 1), 2 * math.pi / columns * np.arange(columns + 1)
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
     # Two triangles a cell, counter-clockwise seen from the lumen as P_u x P_v points there.
@@ -73,7 +87,7 @@ def build(recipe: ColonRecipe) -> _Build:
     vertices, along, around = tube.tangents(grid_u, grid_v)
     normals = np.cross(along, around)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    digest = blake2b(recipe.model_dump_json().encode(), digest_size=12).hexdigest()
+    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
     return _Build(tube, TriangleMesh(vertices, faces, normals), corners, f"colon-{digest}")
 
 
@@ -114,9 +128,7 @@ class Colon(SurfaceModel):
 
     def vertex_shape_operators(self) -> Array:
         """Give S at the mesh's vertices by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
-        mesh, places = self._build.mesh, np.empty((len(self._build.mesh.vertices), 2))
-        places[mesh.faces.ravel()] = self._build.corners.reshape(-1, 2)
-        return self._build.tube.normal_and_shape_operator(places[:, 0], places[:, 1])[1]
+        return self._build.shape_operators()
 
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), model frame, to the wall, mm; positive in the lumen."""
