@@ -190,6 +190,8 @@ def main() -> None:
             text = " ".join(f"{a:.4f}/{100 * b:.2f}" for a, b in cells)
             print(f"{name:<22} {shading:<10} {text}  failed {failed}", flush=True)
         axes[0, column].set_title(name)
+        axes[1, column].set_xticks(RATIOS, [f"{ratio:g}" for ratio in RATIOS])
+        axes[1, column].minorticks_off()
         axes[1, column].set_xlabel("edge / half-width of the highlight")
     axes[0, 0].set_ylabel("error of the normal, deg (90 %)")
     axes[1, 0].set_ylabel("error of the axis ratio, % (90 %)")

@@ -7,7 +7,17 @@ from hashlib import blake2b
 
 import numpy as np
 
-from simtest.anatomy.base import Array, RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, pack_points
+from simtest.anatomy.base import (
+    Array,
+    IntArray,
+    RayHits,
+    Shape,
+    SurfaceModel,
+    SurfacePoints,
+    TriangleMesh,
+    pack_points,
+)
+from simtest.anatomy.cutting import face_edges, halve, rough_edges
 from simtest.anatomy.recipe import ColonRecipe
 from simtest.anatomy.tube import Tube
 from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
@@ -15,6 +25,10 @@ from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
 
+MAX_NORMAL_ERROR_DEG = 0.2
+"""Largest error of the interpolated normal at an edge's middle that is left as it is, as far as `_SPLITS` go."""
+
+_SPLITS = 2
 MAX_TRIANGLES = 5_000_000
 
 
@@ -80,15 +94,41 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> _Build:
     # Two triangles a cell, counter-clockwise seen from the lumen as P_u x P_v points there.
     di, dj = np.array([[0, 1, 1], [0, 1, 0]]), np.array([[0, 0, 1], [0, 1, 1]])
     row, column = i[:, None, None] + di, j[:, None, None] + dj
-    # A corner beyond the seam keeps v = 2 pi while its vertex is that of v = 0.
-    corners = np.stack([u[row], v[column]], axis=-1).reshape(-1, 3, 2)
     faces = (row * columns + column % columns).reshape(-1, 3)
-    grid_u, grid_v = (g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij"))
-    vertices, along, around = tube.tangents(grid_u, grid_v)
-    normals = np.cross(along, around)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    places = np.stack([g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij")], axis=1)
+    for _ in range(_SPLITS if edge_mm is None else 0):
+        places, faces = _split(tube, places, faces)
+    corners = places[faces]
+    # A corner beyond the seam has v = 2 pi, or a little more, while its vertex is that of v = 0.
+    around = corners[:, :, 1]
+    corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
+    vertices, normals = _positions(tube, places)
     digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
     return _Build(tube, TriangleMesh(vertices, faces, normals), corners, f"colon-{digest}")
+
+
+def _positions(tube: Tube, places: Array) -> tuple[Array, Array]:
+    """Give positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
+    positions, along, around = tube.tangents(places[:, 0], places[:, 1])
+    normals = np.cross(along, around)
+    return positions, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _split(tube: Tube, places: Array, faces: IntArray) -> tuple[Array, IntArray]:
+    """Halve the edges at whose middle the mean of the end normals is off: a sharp polyp; the shipped colon has none."""
+    edges, index = face_edges(faces)
+
+    def middles(chosen: IntArray) -> Array:
+        (u0, v0), (u1, v1) = places[edges[chosen]].transpose(1, 2, 0)
+        # The short way around, across the seam too.
+        turn = np.remainder(v1 - v0 + math.pi, 2 * math.pi) - math.pi
+        return np.stack([(u0 + u1) / 2, np.remainder(v0 + turn / 2, 2 * math.pi)], axis=1)
+
+    def normals(chosen: IntArray) -> Array:
+        return _positions(tube, middles(chosen))[1]
+
+    rough = rough_edges(_positions(tube, places)[1], edges, normals, MAX_NORMAL_ERROR_DEG)
+    return np.vstack([places, middles(rough)]), halve(faces, index, rough, len(places), len(edges))
 
 
 class Colon(SurfaceModel):

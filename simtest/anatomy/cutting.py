@@ -1,8 +1,11 @@
 """Cutting triangles at the middles of some of their edges, without a gap to their neighbours."""
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 
-from simtest.anatomy.base import IntArray
+from simtest.anatomy.base import Array, IntArray
 
 
 def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
@@ -54,3 +57,38 @@ def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
     add(count == 2, (p, b, q), (a, p, q), (a, q, c))
     add(count == 3, (a, p, r), (p, b, q), (r, q, c), (p, q, r))
     return np.concatenate(parts)
+
+
+def rough_edges(
+    normals: Array, edges: IntArray, middle_normals: Callable[[IntArray], Array], limit_deg: float
+) -> IntArray:
+    """Find the edges at whose middle the mean of the end normals is off.
+
+    Parameters
+    ----------
+    normals : ndarray, shape (V, 3)
+        Exact unit normals at the vertices.
+    edges : ndarray of int, shape (E, 2)
+    middle_normals : callable
+        Gives the exact unit normals at the middles of edges, by their numbers.
+    limit_deg : float
+        Error that is allowed.
+
+    Returns
+    -------
+    ndarray of int
+        Numbers of the edges.
+    """
+    limit, ends = math.radians(limit_deg), normals[edges]
+    # Where the end normals nearly agree nothing between can be far off: most edges need no more.
+    tried = np.flatnonzero(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 10 * limit)
+    between = ends[tried].sum(axis=1)
+    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    return np.asarray(tried[np.linalg.norm(np.cross(between, middle_normals(tried)), axis=1) > limit])
+
+
+def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
+    """Cut the faces at the chosen edges, whose middles are vertices from `first_vertex` on, in their order."""
+    added = np.full(edge_count, -1, dtype=np.int64)
+    added[chosen] = first_vertex + np.arange(len(chosen))
+    return cut_faces(faces, added[index])

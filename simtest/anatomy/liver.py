@@ -30,7 +30,7 @@ from simtest.anatomy.base import (
     implicit_shape_operator,
     pack_points,
 )
-from simtest.anatomy.cutting import cut_faces, face_edges
+from simtest.anatomy.cutting import face_edges, halve, rough_edges
 from simtest.anatomy.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.anatomy.viewpoints import MeshProbe, organ_pose
 from simtest.errors import InputError
@@ -293,17 +293,12 @@ def _even(body: Body, vertices: Array, faces: IntArray) -> Array:
 def _split(body: Body, vertices: Array, faces: IntArray) -> tuple[Array, IntArray]:
     """Halve the edges at whose middle the mean of the end normals is off, and cut the triangles that have such."""
     edges, index = face_edges(faces)
-    ends = body.normals(vertices)[edges]
-    # Where the end normals nearly agree nothing between can be far off: most edges need no more.
-    tried = np.flatnonzero(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 10 * math.radians(MAX_NORMAL_ERROR_DEG))
-    middle = _project(body, vertices[edges[tried]].mean(axis=1), 3)
-    between = ends[tried].sum(axis=1)
-    between /= np.linalg.norm(between, axis=1, keepdims=True)
-    off = np.linalg.norm(np.cross(between, body.normals(middle)), axis=1) > math.radians(MAX_NORMAL_ERROR_DEG)
-    halved, middle = tried[off], middle[off]
-    added = np.full(len(edges), -1)
-    added[halved] = len(vertices) + np.arange(len(halved))
-    return np.vstack([vertices, middle]), cut_faces(faces, added[index])
+
+    def middles(chosen: IntArray) -> Array:
+        return _project(body, vertices[edges[chosen]].mean(axis=1), 3)
+
+    rough = rough_edges(body.normals(vertices), edges, lambda e: body.normals(middles(e)), MAX_NORMAL_ERROR_DEG)
+    return np.vstack([vertices, middles(rough)]), halve(faces, index, rough, len(vertices), len(edges))
 
 
 def _project(body: Body, points: Array, steps: int) -> Array:

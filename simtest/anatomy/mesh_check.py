@@ -116,6 +116,7 @@ class Verdict:
             yield "crossings   none"
         for sentence in self.repairs.sentences(self.lumen):
             yield f"repaired    {sentence}"
+        yield "normals     computed from the triangles; those of a file are not used"
         yield f"edges       median {self.edge_median_mm:.3g} mm, 95th percentile {self.edge_p95_mm:.3g} mm"
         for problem in self.problems:
             yield f"problem     {problem}"

@@ -21,7 +21,9 @@ MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
 
 MAX_FACES = 5_000_000
-MAX_BYTES = 2_000_000_000
+MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
+"""What `MAX_FACES` faces take at most as text, about; reading takes some ten times as much memory."""
+
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
 
@@ -108,15 +110,15 @@ def _check_file(path: Path, suffix: str) -> None:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if size == 0:
         raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES} are allowed")
+    if size > MAX_BYTES[suffix]:
+        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
     declared = 0
     if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
         declared = int(match[1])
     elif suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
         declared = count
     if declared > MAX_FACES:  # before any memory is asked for
-        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed")
+        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed: decimate the mesh")
 
 
 @contextmanager
