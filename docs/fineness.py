@@ -97,7 +97,7 @@ def lattice(edge: float, reach: float, rng: np.random.Generator) -> tuple[np.nda
             np.stack([corner + side, corner + side + 1, corner + 1], axis=1),
         ]
     )
-    keep = (np.abs(points[faces] @ cut.T).max(axis=(1, 2)) < reach + 2 * edge)
+    keep = np.abs(points[faces] @ cut.T).max(axis=(1, 2)) < reach + 2 * edge
     used, faces = np.unique(faces[keep], return_inverse=True)
     return points[used] @ cut.T, faces.reshape(-1, 3).astype(np.int64)
 

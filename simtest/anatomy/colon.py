@@ -21,6 +21,7 @@ from simtest.anatomy.cutting import face_edges, halve, rough_edges
 from simtest.anatomy.recipe import ColonRecipe
 from simtest.anatomy.tube import Tube
 from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
+from simtest.errors import InputError
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""

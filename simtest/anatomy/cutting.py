@@ -9,7 +9,7 @@ from simtest.anatomy.base import Array, IntArray
 
 
 def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Number the edges.
+    """Give each edge a number.
 
     Parameters
     ----------

@@ -70,9 +70,7 @@ def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: A
     k_min, k_max : ndarray, shape (N,)
         Principal curvatures, 1/mm.
     """
-    narrow = np.minimum(
-        half_width(distance_mm, concentration, k_min), half_width(distance_mm, concentration, k_max)
-    )
+    narrow = np.minimum(half_width(distance_mm, concentration, k_min), half_width(distance_mm, concentration, k_max))
     return np.asarray(narrow / EDGES_PER_HALF_WIDTH)
 
 

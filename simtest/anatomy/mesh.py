@@ -195,9 +195,8 @@ def _say(path: str, vertices: Array, faces: IntArray, repairs: list[str]) -> Non
 def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float]:
     """Give how often to subdivide, and the wavelength to smooth, mm."""
     smoothing, wanted = how.smoothing_mm or 0.0, how.subdivisions
-    if how.edge_mm is not None:
-        if how.smoothing_mm is None:
-            smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
+    if how.edge_mm is not None and how.smoothing_mm is None:
+        smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
     smoothing = allowed_smoothing(path, faces, smoothing)
     if how.edge_mm is not None:
         edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm

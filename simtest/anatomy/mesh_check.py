@@ -1,4 +1,4 @@
-"""The verdict on a user's mesh: what is wrong with it, what was mended, and whether it is fine enough for highlights."""
+"""The verdict on a user's mesh: what is wrong with it, what was mended, and whether it is fine for highlights."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -132,8 +132,8 @@ class Verdict:
         )
         lobe = f"n = {self.concentration / 4:.3g} at {self.distance_mm:g} mm"
         yield (
-            f"highlights  of {lobe}: {100 * self.fine_share:.1f} % of the surface has {EDGES_PER_HALF_WIDTH:g} edges in "
-            "a half-width"
+            f"highlights  of {lobe}: {100 * self.fine_share:.1f} % of the surface has {EDGES_PER_HALF_WIDTH:g} edges "
+            "in a half-width"
         )
         if self.fine:
             yield "verdict     fine enough" + ("; but see the problems above" if self.problems else "")

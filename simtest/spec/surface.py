@@ -10,7 +10,6 @@ from simtest.resources import find
 from simtest.spec.quantities import Curvature, Millimetres
 from simtest.spec.reading import Spec
 
-
 EdgeLength = Annotated[float, Field(ge=0.01, le=100)]
 
 

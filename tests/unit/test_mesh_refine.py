@@ -77,7 +77,7 @@ def test_principal_curvatures_are_the_eigenvalues_in_the_tangent_plane():
 
 
 def test_fair_smoothing_halves_the_wave_of_its_length_and_keeps_long_ones():
-    plane, faces = plane_lattice(161, 40.0)
+    plane, faces = plane_lattice(121, 40.0)
     inner = (np.abs(plane) < 25).all(axis=1)
     for length, kept in ((8.0, 0.5), (32.0, 1 / (1 + 0.25**4)), (4.0, 1 / 17)):
         wave = 0.05 * np.cos(2 * np.pi / length * plane[:, 0])
@@ -103,17 +103,18 @@ def test_edges_are_halved_until_they_are_short_enough():
     assert len(fine) == 10 * 4**5 + 2
 
 
-def test_a_scene_may_ask_for_an_edge_length(tmp_path):
+def test_a_scene_may_ask_for_an_edge_length(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(3, radius=15.0).export(path)
     prepared = prepare(path, Refinement(edge_mm=1.5))
     assert prepared.subdivisions == 1
     radius = np.linalg.norm(prepared.mesh.vertices, axis=1)
     assert radius.mean() == pytest.approx(15, rel=0.01)  # fair smoothing hardly shrinks
+    monkeypatch.setattr("simtest.anatomy.mesh.AUTO_CONCENTRATION", 40.0)  # a wide lobe: fewer faces
     automatic = prepare(path, Refinement(edge_mm="auto"))
-    assert automatic.subdivisions > 1
+    assert automatic.subdivisions == 2  # 40 mm sqrt(2 ln 2 / 40) / (1 + 40/15) / 2 = 1.0 mm
     assert automatic.key != prepared.key
-    with pytest.raises(ValueError, match="subdivisions = 2 and edge_mm = 0.5: only one of them"):
+    with pytest.raises(ValueError, match=r"subdivisions = 2 and edge_mm = 0\.5: only one of them"):
         AnatomySurface(path="x.ply", subdivisions=2, edge_mm=0.5)
     with pytest.raises(ValueError, match="edge_mm"):
         AnatomySurface(path="x.ply", edge_mm="fine")

@@ -174,7 +174,10 @@ def test_orientation_is_mended(tmp_path):
     ball = sphere(level=3)
     flip = np.random.default_rng(0).random(len(ball.faces)) < 0.5
     faces = np.where(flip[:, None], ball.faces[:, ::-1], ball.faces)
-    for name, wrong, said in (("mixed", faces, "reversed"), ("out", ball.faces[:, ::-1], "turned 1 piece that was ins")):
+    for name, wrong, said in (
+        ("mixed", faces, "reversed"),
+        ("out", ball.faces[:, ::-1], "turned 1 piece that was ins"),
+    ):
         path = save(trimesh.Trimesh(ball.vertices, wrong, process=False), tmp_path / f"{name}.ply")
         with pytest.warns(UserWarning, match=said):
             mesh = prepare(path, 0).mesh
