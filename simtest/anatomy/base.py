@@ -202,6 +202,17 @@ def pack_points(
     )
 
 
+def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:
+    """Give k_min and k_max, 1/mm, two arrays of shape (N,), of shape operators, shape (N, 3, 3); NaN stays NaN.
+
+    With the trace t and the Frobenius norm f, the two curvatures in the tangent plane are (t +- sqrt(2 f^2 - t^2))/2.
+    """
+    mean = np.trace(shape_operator, axis1=1, axis2=2) / 2
+    square = np.einsum("nij,nij->n", shape_operator, shape_operator) / 2
+    half = np.sqrt(np.maximum(square - mean**2, 0.0))
+    return mean - half, mean + half
+
+
 def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Array]:
     """Give normal and shape operator of a level set from gradient, shape (N, 3), and Hessian, shape (N, 3, 3).
 

@@ -7,13 +7,30 @@ from hashlib import blake2b
 
 import numpy as np
 
-from simtest.anatomy.base import Array, RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, pack_points
+from simtest.anatomy.base import (
+    Array,
+    IntArray,
+    RayHits,
+    Shape,
+    SurfaceModel,
+    SurfacePoints,
+    TriangleMesh,
+    pack_points,
+)
+from simtest.anatomy.cutting import face_edges, halve, rough_edges
 from simtest.anatomy.recipe import ColonRecipe
 from simtest.anatomy.tube import Tube
 from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
+from simtest.errors import InputError
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
+
+MAX_NORMAL_ERROR_DEG = 0.2
+"""Largest error of the interpolated normal at an edge's middle that is left as it is, as far as `_SPLITS` go."""
+
+_SPLITS = 2
+MAX_TRIANGLES = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -39,14 +56,22 @@ class _Build:
         free = (radial < self.tube.radius(u, v).f) & (u >= 0) & (u <= self.tube.recipe.length_mm)
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
+    def shape_operators(self) -> Array:
+        """Give S at the mesh's vertices by the tube's formulas, 1/mm, shape (V, 3, 3)."""
+        places = np.empty((len(self.mesh.vertices), 2))
+        places[self.mesh.faces.ravel()] = self.corners.reshape(-1, 2)
+        return self.tube.normal_and_shape_operator(places[:, 0], places[:, 1])[1]
+
 
 @lru_cache(maxsize=4)
-def build(recipe: ColonRecipe) -> _Build:
+def build(recipe: ColonRecipe, edge_mm: float | None = None) -> _Build:
     """Make the surface and the mesh of a recipe.
 
     Parameters
     ----------
     recipe : ColonRecipe
+    edge_mm : float, optional
+        Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
 
     Returns
     -------
@@ -56,25 +81,55 @@ def build(recipe: ColonRecipe) -> _Build:
     Raises
     ------
     InputError
-        If the folds close the lumen or the tube bends into itself.
+        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube = Tube(recipe)
-    cell = math.sqrt(2 * recipe.length_mm * 2 * math.pi * recipe.radius_mm / TRIANGLES)
-    rows, columns = round(recipe.length_mm / cell), round(2 * math.pi * recipe.radius_mm / cell)
+    area = recipe.length_mm * 2 * math.pi * recipe.radius_mm
+    cell = math.sqrt(2 * area / TRIANGLES) if edge_mm is None else edge_mm
+    if (count := 2 * area / cell**2) > MAX_TRIANGLES:
+        raise InputError(f"edge_mm = {cell:g}: gives {count:.0f} triangles; at most {MAX_TRIANGLES} are allowed")
+    rows = max(1, round(recipe.length_mm / cell))
+    columns = max(8, round(2 * math.pi * recipe.radius_mm / cell))
     u, v = np.linspace(0, recipe.length_mm, rows + 1), 2 * math.pi / columns * np.arange(columns + 1)
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
     # Two triangles a cell, counter-clockwise seen from the lumen as P_u x P_v points there.
     di, dj = np.array([[0, 1, 1], [0, 1, 0]]), np.array([[0, 0, 1], [0, 1, 1]])
     row, column = i[:, None, None] + di, j[:, None, None] + dj
-    # A corner beyond the seam keeps v = 2 pi while its vertex is that of v = 0.
-    corners = np.stack([u[row], v[column]], axis=-1).reshape(-1, 3, 2)
     faces = (row * columns + column % columns).reshape(-1, 3)
-    grid_u, grid_v = (g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij"))
-    vertices, along, around = tube.tangents(grid_u, grid_v)
-    normals = np.cross(along, around)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    digest = blake2b(recipe.model_dump_json().encode(), digest_size=12).hexdigest()
+    places = np.stack([g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij")], axis=1)
+    for _ in range(_SPLITS if edge_mm is None else 0):
+        places, faces = _split(tube, places, faces)
+    corners = places[faces]
+    # A corner beyond the seam has v = 2 pi, or a little more, while its vertex is that of v = 0.
+    around = corners[:, :, 1]
+    corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
+    vertices, normals = _positions(tube, places)
+    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
     return _Build(tube, TriangleMesh(vertices, faces, normals), corners, f"colon-{digest}")
+
+
+def _positions(tube: Tube, places: Array) -> tuple[Array, Array]:
+    """Give positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
+    positions, along, around = tube.tangents(places[:, 0], places[:, 1])
+    normals = np.cross(along, around)
+    return positions, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _split(tube: Tube, places: Array, faces: IntArray) -> tuple[Array, IntArray]:
+    """Halve the edges at whose middle the mean of the end normals is off: a sharp polyp; the shipped colon has none."""
+    edges, index = face_edges(faces)
+
+    def middles(chosen: IntArray) -> Array:
+        (u0, v0), (u1, v1) = places[edges[chosen]].transpose(1, 2, 0)
+        # The short way around, across the seam too.
+        turn = np.remainder(v1 - v0 + math.pi, 2 * math.pi) - math.pi
+        return np.stack([(u0 + u1) / 2, np.remainder(v0 + turn / 2, 2 * math.pi)], axis=1)
+
+    def normals(chosen: IntArray) -> Array:
+        return _positions(tube, middles(chosen))[1]
+
+    rough = rough_edges(_positions(tube, places)[1], edges, normals, MAX_NORMAL_ERROR_DEG)
+    return np.vstack([places, middles(rough)]), halve(faces, index, rough, len(places), len(edges))
 
 
 class Colon(SurfaceModel):
@@ -114,9 +169,7 @@ class Colon(SurfaceModel):
 
     def vertex_shape_operators(self) -> Array:
         """Give S at the mesh's vertices by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
-        mesh, places = self._build.mesh, np.empty((len(self._build.mesh.vertices), 2))
-        places[mesh.faces.ravel()] = self._build.corners.reshape(-1, 2)
-        return self._build.tube.normal_and_shape_operator(places[:, 0], places[:, 1])[1]
+        return self._build.shape_operators()
 
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), model frame, to the wall, mm; positive in the lumen."""

@@ -5,7 +5,9 @@ F = smoothmax(B, V) + waves, with B the smooth union of ellipsoids and V the vis
     B_i = (a_i / 2) ((x - c_i)^T A_i (x - c_i) - 1),  a_i the geometric mean of the half extents
     B   = -h log sum_i exp(-B_i / h)
     V   = n . x - offset - |x - offset n|^2 / (2 R)          a hollow of radius R
-    F   = e log(exp(B / e) + exp(V / e)) + sum_j a cos(q_j . x + phi_j)
+    D   = e log(exp(B / e) + exp(V / e))
+    G   = g log(exp(D / g) + exp(-E / g)),  E like B_i: the fossa, an ellipsoid taken out; G = D without it
+    F   = G + sum_j a cos(q_j . x + phi_j)
 
 All are lengths in mm; F < 0 in the tissue.
 """
@@ -28,13 +30,17 @@ from simtest.anatomy.base import (
     implicit_shape_operator,
     pack_points,
 )
-from simtest.anatomy.recipe import LiverLobe, LiverRecipe
+from simtest.anatomy.cutting import face_edges, halve, rough_edges
+from simtest.anatomy.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.anatomy.viewpoints import MeshProbe, organ_pose
 from simtest.errors import InputError
 from simtest.seeds import Stage, generator
 
 GRID_MM = 1.15
 """Spacing of the marching cubes: about 150,000 triangles at the default sizes."""
+
+MAX_NORMAL_ERROR_DEG = 0.1
+"""Largest error of the interpolated normal at an edge's middle that is left as it is, as far as `_SPLITS` go."""
 
 MAX_CELLS = 12_000_000
 NEWTON_STEPS = 12
@@ -44,11 +50,12 @@ MAX_SHIFT_MM = 2.0
 
 _WAVES = 5
 _EVENING_STEPS = 8
+_SPLITS = 3
 
 
 @dataclass(frozen=True)
 class _Value:
-    """A function with its gradient and Hessian: shapes (N,), (N, 3), (N, 3, 3)."""
+    """A function with its gradient and Hessian: shapes (N,), (N, 3), (N, 3, 3), or (0, 3, 3) where it is not wanted."""
 
     f: Array
     gradient: Array
@@ -63,10 +70,15 @@ def _soft_max(parts: list[_Value], width: float) -> _Value:
     total = weights.sum(axis=0)
     weights /= total
     gradient = sum((w[:, None] * part.gradient for w, part in zip(weights, parts, strict=True)), np.zeros(()))
+    if not len(parts[0].hessian):
+        return _Value(width * (top + np.log(total)), gradient, _UNWANTED)
     hessian = -_outer(gradient) / width
     for w, part in zip(weights, parts, strict=True):
         hessian = hessian + w[:, None, None] * (part.hessian + _outer(part.gradient) / width)
     return _Value(width * (top + np.log(total)), gradient, hessian)
+
+
+_UNWANTED = np.empty((0, 3, 3))
 
 
 def _outer(vectors: Array) -> Array:
@@ -84,6 +96,7 @@ class Body:
     def __init__(self, recipe: LiverRecipe) -> None:
         self.recipe = recipe
         self._lobes = [_lobe(lobe) for lobe in recipe.lobes]
+        self._fossa = _lobe(recipe.fossa) if recipe.fossa else None
         normal = np.array(recipe.visceral_normal)
         self._normal = normal / np.linalg.norm(normal)
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
@@ -101,6 +114,11 @@ class Body:
         margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * _WAVES * self.recipe.relief_mm
         return (centres - reach).min(axis=0) - margin, (centres + reach).max(axis=0) + margin
 
+    def normals(self, points: Array) -> Array:
+        """Give the unit outward normals of the level sets through points, shape (N, 3)."""
+        gradient = self.evaluate(points, second=False).gradient
+        return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+
     def values(self, points: Array) -> Array:
         """Give F, mm, at points of shape (N, 3): the formula alone, for large grids."""
         blend, edge = self.recipe.blend_mm, self.recipe.edge_mm
@@ -110,26 +128,36 @@ class Body:
             union = np.logaddexp(union, -0.5 * scale * (((d @ A) * d).sum(axis=1) - 1) / blend)
         face, _ = self._face(points)
         f = edge * np.logaddexp(-blend * union / edge, face / edge)
+        if self._fossa and self.recipe.fossa:
+            centre, A, scale = self._fossa
+            d = points - centre
+            bed = 0.5 * scale * (((d @ A) * d).sum(axis=1) - 1)
+            f = self.recipe.fossa.edge_mm * np.logaddexp(*(part / self.recipe.fossa.edge_mm for part in (f, -bed)))
         return f + self.recipe.relief_mm * np.cos(points @ self._waves.T + self._phases).sum(axis=1)
 
-    def evaluate(self, points: Array) -> _Value:
-        """Give F, mm, its gradient, and its Hessian, 1/mm, at points of shape (N, 3)."""
-        lobes = []
-        for centre, A, scale in self._lobes:
-            d = points - centre
+    def evaluate(self, points: Array, second: bool = True) -> _Value:
+        """Give F, mm, its gradient, and its Hessian, 1/mm, at points of shape (N, 3); without `second` no Hessian."""
+        count = len(points) if second else 0
+
+        def same(matrix: Array) -> Array:
+            return np.broadcast_to(matrix, (count, 3, 3))
+
+        def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> _Value:
+            centre, A, scale = part
+            d, scale = points - centre, sign * scale
             Ad = d @ A
-            hessian = np.broadcast_to(scale * A, (len(points), 3, 3))
-            lobes.append(_Value(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, hessian))
+            return _Value(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, same(scale * A))
+
         face, gradient = self._face(points)
-        flat = np.broadcast_to(-np.eye(3) / self.recipe.visceral_radius_mm, (len(points), 3, 3))
-        body = _soft_max([_soft_max(lobes, -self.recipe.blend_mm), _Value(face, gradient, flat)], self.recipe.edge_mm)
+        lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
+        visceral = _Value(face, gradient, same(-np.eye(3) / self.recipe.visceral_radius_mm))
+        body = _soft_max([lobes, visceral], self.recipe.edge_mm)
+        if self._fossa and self.recipe.fossa:
+            body = _soft_max([body, ellipsoid(self._fossa, -1.0)], self.recipe.fossa.edge_mm)
         angle = points @ self._waves.T + self._phases
         sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
-        return _Value(
-            body.f + cosine.sum(axis=1),
-            body.gradient - sine @ self._waves,
-            body.hessian - np.einsum("nw,wi,wj->nij", cosine, self._waves, self._waves),
-        )
+        hessian = body.hessian - (cosine[:count, :, None] * self._waves).transpose(0, 2, 1) @ self._waves
+        return _Value(body.f + cosine.sum(axis=1), body.gradient - sine @ self._waves, hessian)
 
     def _face(self, points: Array) -> tuple[Array, Array]:
         """Give V, mm, and its gradient at points of shape (N, 3)."""
@@ -155,7 +183,7 @@ class Body:
         t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
-            at = self.evaluate(origins[active] + t[active, None] * directions[active])
+            at = self.evaluate(origins[active] + t[active, None] * directions[active], second=False)
             slope = np.einsum("ni,ni->n", at.gradient, directions[active])
             # A grazing ray has a nearly flat F: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
@@ -169,7 +197,7 @@ class Body:
         return np.where(found, t, np.nan)
 
 
-def _lobe(lobe: LiverLobe) -> tuple[Array, Array, float]:
+def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
     """Give centre, matrix A of the unit level set, 1/mm^2, and scale, mm, of a lobe."""
     angle, axes = math.radians(lobe.turn_deg), np.array(lobe.semi_axes_mm)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
@@ -190,14 +218,23 @@ class _Build:
         """Give the distance of points, shape (N, 3), to the mesh, mm, with the exact sign of F."""
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
+    def shape_operators(self) -> Array:
+        """Give S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
+        at = self.body.evaluate(self.mesh.vertices)
+        return implicit_shape_operator(at.gradient, at.hessian)[1]
+
 
 @lru_cache(maxsize=4)
-def build(recipe: LiverRecipe) -> _Build:
+def build(recipe: LiverRecipe, edge_mm: float | None = None) -> _Build:
     """Make the level set and the mesh of a recipe.
 
     Parameters
     ----------
     recipe : LiverRecipe
+    edge_mm : float, optional
+        Spacing of the marching cubes and about the length of the edges, mm; default `GRID_MM`. Where the surface bends
+        so sharply that normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`, the default
+        mesh has shorter ones.
 
     Returns
     -------
@@ -210,30 +247,34 @@ def build(recipe: LiverRecipe) -> _Build:
         If the recipe gives no body, or one too large for the grid.
     """
     body = Body(recipe)
-    vertices, faces = _march(body)
+    vertices, faces = _march(body, GRID_MM if edge_mm is None else edge_mm)
     vertices = _even(body, vertices, faces)
-    gradient = body.evaluate(vertices).gradient
-    normals = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    digest = blake2b(recipe.model_dump_json().encode(), digest_size=12).hexdigest()
+    for _ in range(_SPLITS if edge_mm is None else 0):
+        vertices, faces = _split(body, vertices, faces)
+    normals = body.normals(vertices)
+    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
     return _Build(body, TriangleMesh(vertices, faces, normals), f"liver-{digest}")
 
 
-def _march(body: Body) -> tuple[Array, IntArray]:
+def _march(body: Body, spacing: float) -> tuple[Array, IntArray]:
     """Give vertices, shape (V, 3), and faces, shape (F, 3), outward, of the level set on a grid."""
     from skimage.measure import marching_cubes  # slow to import
 
     low, high = body.box()
-    axes = [np.arange(a, b + GRID_MM, GRID_MM) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
     cells = math.prod(len(axis) for axis in axes)
     if cells > MAX_CELLS:
-        raise InputError(f"liver recipe: a grid of {cells} cells; at most {MAX_CELLS} allowed: make the lobes smaller")
+        raise InputError(
+            f"liver recipe: a grid of {cells} cells of {spacing:g} mm; at most {MAX_CELLS} allowed: make the lobes "
+            "smaller or the edges longer"
+        )
     slab = np.stack(np.meshgrid(axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 2)
     grid = np.empty([len(axis) for axis in axes])
     for row, x in zip(grid, axes[0], strict=True):  # slab by slab: little memory
         row[:] = body.values(np.column_stack([np.full(len(slab), x), slab])).reshape(row.shape)
     if not grid.min() < 0 < grid.max():
         raise InputError("liver recipe: the visceral face leaves nothing of the lobes: raise visceral_offset_mm")
-    vertices, faces, _, _ = marching_cubes(grid, 0.0, spacing=(GRID_MM,) * 3, gradient_direction="descent")
+    vertices, faces, _, _ = marching_cubes(grid, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
     return vertices.astype(np.float64) + low, faces.astype(np.int64)
 
 
@@ -249,9 +290,20 @@ def _even(body: Body, vertices: Array, faces: IntArray) -> Array:
     return _project(body, vertices, 6)
 
 
+def _split(body: Body, vertices: Array, faces: IntArray) -> tuple[Array, IntArray]:
+    """Halve the edges at whose middle the mean of the end normals is off, and cut the triangles that have such."""
+    edges, index = face_edges(faces)
+
+    def middles(chosen: IntArray) -> Array:
+        return _project(body, vertices[edges[chosen]].mean(axis=1), 3)
+
+    rough = rough_edges(body.normals(vertices), edges, lambda e: body.normals(middles(e)), MAX_NORMAL_ERROR_DEG)
+    return np.vstack([vertices, middles(rough)]), halve(faces, index, rough, len(vertices), len(edges))
+
+
 def _project(body: Body, points: Array, steps: int) -> Array:
     for _ in range(steps):
-        at = body.evaluate(points)
+        at = body.evaluate(points, second=False)
         points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
     return points
 
@@ -283,8 +335,7 @@ class Liver(SurfaceModel):
 
     def vertex_shape_operators(self) -> Array:
         """Give S at the mesh's vertices by the level set (see `SurfaceModel.vertex_shape_operators`)."""
-        at = self._build.body.evaluate(self._build.mesh.vertices)
-        return implicit_shape_operator(at.gradient, at.hessian)[1]
+        return self._build.shape_operators()
 
     def clearance(self, points: Array) -> Array:
         """Give the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive outside."""

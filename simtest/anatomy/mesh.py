@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from pathlib import Path
+from typing import Literal
 
-import igl
 import numpy as np
 
 from simtest.anatomy.base import (
@@ -18,14 +18,34 @@ from simtest.anatomy.base import (
     SurfacePoints,
     TriangleMesh,
     pack_points,
+    principal_curvatures,
 )
-from simtest.anatomy.mesh_file import MESH_SUFFIXES, read_mesh
-from simtest.anatomy.viewpoints import MeshProbe, lumen_pose, organ_pose
+from simtest.anatomy.fineness import DEFAULT_EXPONENT, needed_edge, phong_concentration
+from simtest.anatomy.mesh_file import MESH_SUFFIXES, other_unit, read_mesh
+from simtest.anatomy.refine import (
+    allowed_smoothing,
+    allowed_subdivisions,
+    edge_lengths,
+    halvings,
+    refine,
+    shape_operators,
+    vertex_normals,
+)
+from simtest.anatomy.repair import examine
+from simtest.anatomy.viewpoints import AXIS_RANGE_MM, ORGAN_RANGE_MM, MeshProbe, lumen_pose, organ_pose
 from simtest.errors import InputError
 from simtest.resources import find
 from simtest.spec.surface import AnatomySurface
 
-__all__ = ["LUMEN_QUOTIENT", "MeshSurface", "PreparedMesh", "isoperimetric_quotient", "prepare", "read_mesh"]
+__all__ = [
+    "LUMEN_QUOTIENT",
+    "MeshSurface",
+    "PreparedMesh",
+    "Refinement",
+    "isoperimetric_quotient",
+    "prepare",
+    "read_mesh",
+]
 
 LUMEN_QUOTIENT = 0.1
 """Below this isoperimetric quotient a mesh is taken for a lumen.
@@ -35,14 +55,17 @@ The quotient is 1 for a sphere and falls as a body gets long or folded. A tube o
 A short piece of gut is taken for an organ, and a shallow open patch for a lumen: the scene's ``kind`` says it then.
 """
 
-MAX_SUBDIVIDED_FACES = 1_600_000
+AUTO_CONCENTRATION = phong_concentration(DEFAULT_EXPONENT)
+"""Lobe for which ``edge_mm = "auto"`` makes the mesh fine enough: that of the shipped anatomy scene."""
 
-CURVATURE_RINGS = 2
-"""Rings of neighbours to which the quadric is fitted for the curvature.
+EDGE_QUANTILE = 0.05
+"""``edge_mm = "auto"`` is what all but this share of the surface needs."""
 
-Few, so that the curvature is that of the normals which make the highlights: compared with the change of the vertex
-normals along the edges of a colon from CT, subdivided once, 2 rings give 0.85 of the curvature, 5 give 0.55.
-"""
+SMOOTHING_EDGES = 2.0
+"""With ``edge_mm``, relief shorter than this many median edges of the file is smoothed: it is the mesh's own."""
+
+MAX_CROSSING_FACES = 250_000
+"""Up to this many faces self-intersections are looked for before a mesh is used (about a second)."""
 
 
 @dataclass(frozen=True)
@@ -96,15 +119,27 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     return float(36 * np.pi * volume**2 / area**3)
 
 
-def prepare(path: str | Path, subdivisions: int = 1, kind: str = "auto") -> PreparedMesh:
+@dataclass(frozen=True)
+class Refinement:
+    """How a mesh is made smooth and fine; see `AnatomySurface` for the fields."""
+
+    subdivisions: int = 1
+    edge_mm: float | Literal["auto"] | None = None
+    smoothing_mm: float | None = None
+
+
+def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "auto") -> PreparedMesh:
     """Read a mesh and make it ready; the last few are kept as long as their file does not change.
+
+    Each repair is said in a warning, and so are self-intersections, since the truth around them is none.
 
     Parameters
     ----------
     path : str or Path
         A mesh file (see `read_mesh`).
-    subdivisions : int
-        Loop subdivisions; fewer, with a warning, where they would exceed `MAX_SUBDIVIDED_FACES`.
+    refinement : Refinement or int
+        How to refine it; a number: so many Loop subdivisions. Fewer, with a warning, where the faces would exceed
+        `MAX_SUBDIVIDED_FACES`.
     kind : {"auto", "lumen", "organ"}
         "auto": a lumen if the isoperimetric quotient is below `LUMEN_QUOTIENT`.
 
@@ -122,67 +157,87 @@ def prepare(path: str | Path, subdivisions: int = 1, kind: str = "auto") -> Prep
         state = path.stat()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    return _prepare(str(path), state.st_mtime_ns, state.st_size, subdivisions, kind)
+    how = Refinement(refinement) if isinstance(refinement, int) else refinement
+    return _prepare(str(path), state.st_mtime_ns, state.st_size, how, kind)
 
 
 @lru_cache(maxsize=4)
-def _prepare(path: str, mtime_ns: int, size: int, subdivisions: int, kind: str) -> PreparedMesh:
-    loaded = read_mesh(path)
-    vertices = np.ascontiguousarray(loaded.vertices, dtype=np.float64)
-    faces = _outward(vertices, np.ascontiguousarray(loaded.faces, dtype=np.int64))
-    lumen = kind == "lumen" or (kind == "auto" and isoperimetric_quotient(vertices, faces) < LUMEN_QUOTIENT)
-    times = _allowed_subdivisions(path, faces, subdivisions)
-    if times:
-        vertices, faces = igl.loop(vertices, faces, times)
-    normals = _vertex_normals(vertices, faces)
-    # libigl counts a surface convex towards its normals positive, as we do (checked on a sphere by the tests).
-    first, second, k1, k2, *_ = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
-    operators = k1[:, None, None] * first[:, :, None] * first[:, None, :]
-    operators += k2[:, None, None] * second[:, :, None] * second[:, None, :]
+def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
+    vertices, faces, repairs = read_mesh(path)
+    lumen = is_lumen(vertices, faces, kind)
+    _say(path, vertices, faces, list(repairs.sentences(lumen)))
+    times, smoothing = _plan(path, vertices, faces, how, lumen)
+    vertices, faces = refine(vertices, faces, times, smoothing)
+    normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
-    digest = blake2b(repr((path, mtime_ns, size, times, lumen)).encode(), digest_size=12).hexdigest()
+    digest = blake2b(repr((path, mtime_ns, size, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
     return PreparedMesh(TriangleMesh(vertices, faces, normals), operators, lumen, times, f"mesh-{digest}")
 
 
-def _outward(vertices: Array, faces: IntArray) -> IntArray:
-    """Make the winding consistent within each connected piece, and each piece's normals point outward."""
-    faces, piece = igl.bfs_orient(faces)
-    piece = np.asarray(piece).ravel()
-    count = int(piece.max()) + 1
-    corners = vertices[faces]
-    # About each piece's own centroid, so that an open piece has a meaningful sign.
-    size = np.maximum(np.bincount(piece, minlength=count), 1)
-    middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
-    a, b, c = (corners[:, i] - middle[piece] for i in range(3))
-    volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
-    return np.ascontiguousarray(np.where((volume[piece] < 0)[:, None], faces[:, ::-1], faces), dtype=np.int64)
+def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
+    """Say whether the camera belongs inside a mesh with outward faces; `kind` as in `prepare`."""
+    return kind == "lumen" or (kind == "auto" and isoperimetric_quotient(vertices, faces) < LUMEN_QUOTIENT)
 
 
-def _allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
-    allowed = wanted
-    while allowed and len(faces) * 4**allowed > MAX_SUBDIVIDED_FACES:
-        allowed -= 1
-    if allowed < wanted:
+def _say(path: str, vertices: Array, faces: IntArray, repairs: list[str]) -> None:
+    if repairs:
+        warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=4)
+    if unit := other_unit(float(np.ptp(vertices, axis=0).max())):
+        warnings.warn(f"{path}: lengths are taken as mm; by its extent the file may be in {unit}", stacklevel=4)
+    if len(faces) <= MAX_CROSSING_FACES and (crossing := examine(vertices, faces).crossing_faces):
         warnings.warn(
-            f"{path}: {wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {allowed}",
+            f"{path}: {crossing} faces cut through others; normals and curvatures around them mean nothing",
             stacklevel=4,
         )
-    if allowed:
-        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        uses = np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)[1]
-        if (bad := int((uses > 2).sum())) > 0:
-            warnings.warn(
-                f"{path}: {bad} edges belong to more than two faces; Loop subdivision needs a manifold, using 0",
-                stacklevel=4,
-            )
-            return 0
-    return allowed
 
 
-def _vertex_normals(vertices: Array, faces: IntArray) -> Array:
-    normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float]:
+    """Give how often to subdivide, and the wavelength to smooth, mm."""
+    smoothing, wanted = how.smoothing_mm or 0.0, how.subdivisions
+    if how.edge_mm is not None and how.smoothing_mm is None:
+        smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
+    smoothing = allowed_smoothing(path, faces, smoothing)
+    if how.edge_mm is not None:
+        edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
+        wanted = halvings(vertices, faces, edge)
+    return allowed_subdivisions(path, faces, wanted), smoothing
+
+
+def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
+    """Give the edge length, mm, for highlights of `AUTO_CONCENTRATION` seen from as near as a camera comes.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+        Outward.
+    lumen : bool
+        Whether the camera is inside.
+    smoothing_mm : float
+        Smoothing that the mesh will undergo; the curvatures are taken after it.
+
+    Returns
+    -------
+    float
+    """
+    vertices, faces = refine(vertices, faces, 0, smoothing_mm)
+    distance = (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
+    k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
+    needed = needed_edge(distance, AUTO_CONCENTRATION, k_min, k_max)
+    return area_quantile(needed, vertices, faces, EDGE_QUANTILE)
+
+
+def area_quantile(values: Array, vertices: Array, faces: IntArray, share: float) -> float:
+    """Give the value below which this share of the surface lies; values at the vertices, shape (V,), NaN ignored."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    known = np.isfinite(values)
+    order = np.argsort(values[known])
+    filled = np.cumsum(weight[known][order])
+    return float(values[known][order][np.searchsorted(filled, share * filled[-1])])
 
 
 class MeshSurface(SurfaceModel):
@@ -200,7 +255,8 @@ class MeshSurface(SurfaceModel):
     """
 
     def __init__(self, spec: AnatomySurface) -> None:
-        self._prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), spec.subdivisions, spec.kind)
+        how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)
+        self._prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), how, spec.kind)
         probe = self._prepared.probe
         if self._prepared.lumen:
             pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)

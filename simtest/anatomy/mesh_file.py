@@ -6,31 +6,36 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from simtest.anatomy.base import Array, IntArray
+from simtest.anatomy.repair import Repairs, repair
 from simtest.errors import InputError
 
-if TYPE_CHECKING:
-    import trimesh
+__all__ = ["MESH_SUFFIXES", "read_mesh"]
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
 
 MAX_FACES = 5_000_000
-MAX_BYTES = 2_000_000_000
+MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
+"""What `MAX_FACES` faces take at most as text, about; reading takes some ten times as much memory."""
+
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
 
+ORGAN_RANGE_MM = (60.0, 2000.0)
+"""Largest extent of a liver, a colon or a good piece of one: for a guess at another unit."""
 
-def read_mesh(path: str | Path) -> "trimesh.Trimesh":
-    """Read a triangle mesh.
 
-    Equal vertices are merged; faces without area and vertices without a face are left out; polygons are cut into
-    triangles. The orientation is left as it is.
+def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
+    """Read a triangle mesh and mend what is safely mended.
+
+    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons
+    are cut into triangles; the winding is made consistent within each piece, normals outward.
 
     Parameters
     ----------
@@ -39,8 +44,11 @@ def read_mesh(path: str | Path) -> "trimesh.Trimesh":
 
     Returns
     -------
-    trimesh.Trimesh
-        Vertices, shape (V, 3), mm; faces, shape (F, 3).
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+    repairs : Repairs
+        What was mended.
 
     Raises
     ------
@@ -61,7 +69,34 @@ def read_mesh(path: str | Path) -> "trimesh.Trimesh":
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
         raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_first_line(error)})") from error
     _check_arrays(path, vertices, faces)
-    return _cleaned(path, vertices, faces)
+    count = len(faces)
+    with _quiet():
+        vertices, faces, repairs = repair(vertices, faces, soup=suffix == ".stl")
+    if len(faces) < MIN_FACES:
+        raise InputError(f"{path}: {len(faces)} of {count} faces have an area; at least {MIN_FACES} needed")
+    return vertices, faces, repairs
+
+
+def other_unit(extent: float) -> str:
+    """Guess the unit of a mesh whose largest extent is hardly that of an organ in mm.
+
+    Parameters
+    ----------
+    extent : float
+        Largest extent, in the file's unit.
+
+    Returns
+    -------
+    str
+        Such as "metres, 214 mm"; empty where mm are as likely as anything.
+    """
+    low, high = ORGAN_RANGE_MM
+    if extent >= 10.0 and extent <= high:
+        return ""
+    for unit, factor in (("centimetres", 10.0), ("metres", 1e3), ("micrometres", 1e-3)):
+        if low <= factor * extent <= high:
+            return f"{unit}, {factor * extent:.3g} mm"
+    return ""
 
 
 def _check_file(path: Path, suffix: str) -> None:
@@ -75,15 +110,15 @@ def _check_file(path: Path, suffix: str) -> None:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if size == 0:
         raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES} are allowed")
+    if size > MAX_BYTES[suffix]:
+        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
     declared = 0
     if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
         declared = int(match[1])
     elif suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
         declared = count
     if declared > MAX_FACES:  # before any memory is asked for
-        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed")
+        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed: decimate the mesh")
 
 
 @contextmanager
@@ -160,22 +195,11 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         raise InputError(f"{path}: vertex {row} is ({place}); finite coordinates are needed")
     extent, (low, high) = float(np.ptp(vertices, axis=0).max()), EXTENT_RANGE_MM
     if not low <= extent <= high:
-        raise InputError(f"{path}: largest extent {extent:g} mm; allowed: {low:g} to {high:g} mm (lengths are in mm)")
-
-
-def _cleaned(path: Path, vertices: Array, faces: IntArray) -> "trimesh.Trimesh":
-    import trimesh
-
-    with _quiet():
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        # Relative to the extent: a sliver below rounding has no direction.
-        mesh.update_faces(mesh.area_faces > 1e-14 * float(np.ptp(vertices, axis=0).max()) ** 2)
-        mesh.update_faces(mesh.unique_faces())
-        mesh.remove_unreferenced_vertices()
-    if len(mesh.faces) < MIN_FACES:
-        raise InputError(f"{path}: {len(mesh.faces)} of {len(faces)} faces have an area; at least {MIN_FACES} needed")
-    return mesh
+        unit = other_unit(extent)
+        guess = f"; if the file is in {unit}, scale it" if unit else ""
+        raise InputError(
+            f"{path}: largest extent {extent:g} mm; allowed: {low:g} to {high:g} mm (lengths are in mm{guess})"
+        )
 
 
 def _first_line(error: Exception) -> str:

@@ -1,7 +1,8 @@
 """Recipes of the generated anatomies: the sizes a colon or a liver is made from."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -10,7 +11,17 @@ from simtest.spec.reading import Spec, read_toml, validate
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
+FossaExtent = Annotated[float, Field(ge=3, le=100)]
 HalfExtent = Annotated[float, Field(ge=10, le=200)]
+
+
+class Polyp(Spec):
+    """A sessile polyp: a round bump of Gaussian profile on the wall, at its place whatever folds are there."""
+
+    along_mm: float = Field(ge=0, le=500, description="place along the centreline, mm")
+    around_deg: float = Field(ge=-360, le=360, description="place around the tube, deg")
+    height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
+    width_mm: float = Field(8.0, ge=1, le=40, description="width at half height, mm")
 
 
 class ColonRecipe(Spec):
@@ -33,14 +44,23 @@ class ColonRecipe(Spec):
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
     irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and place")
+    polyps: tuple[Polyp, ...] = Field((), max_length=20, description="sessile polyps")
+    relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
+    relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the irregularities")
 
     @model_validator(mode="after")
     def _embedded(self) -> "ColonRecipe":
+        for i, polyp in enumerate(self.polyps):
+            if polyp.along_mm > self.length_mm:
+                raise ValueError(
+                    f"polyps.{i}.along_mm = {polyp.along_mm:g}: must be at most length_mm = {self.length_mm:g}"
+                )
         deepest = self.taenia_mm + self.fold_depth_mm * (1 + self.irregularity)
+        deepest += max((polyp.height_mm for polyp in self.polyps), default=0.0)
         if deepest > 0.8 * self.radius_mm:
             raise ValueError(
-                f"folds and taeniae reach {deepest:g} mm into the lumen; at most 0.8 radius_mm = "
+                f"folds, taeniae and polyps reach {deepest:g} mm into the lumen; at most 0.8 radius_mm = "
                 f"{0.8 * self.radius_mm:g} mm is allowed"
             )
         return self
@@ -54,8 +74,17 @@ class LiverLobe(Spec):
     turn_deg: float = Field(0.0, ge=-180, le=180, description="turn about z, deg from x to y")
 
 
+class LiverFossa(Spec):
+    """The bed of the gallbladder: an ellipsoid taken out of the visceral face."""
+
+    centre_mm: Vector = Field(description="centre, mm")
+    semi_axes_mm: tuple[FossaExtent, FossaExtent, FossaExtent] = Field(description="half extents, mm")
+    turn_deg: float = Field(0.0, ge=-180, le=180, description="turn about z, deg from x to y")
+    edge_mm: float = Field(2.5, ge=0.5, le=20, description="length over which its rim is rounded, mm")
+
+
 class LiverRecipe(Spec):
-    """Lobes joined smoothly, cut from below by a smooth concave visceral face, with a faint relief."""
+    """Lobes joined smoothly, cut from below by a smooth concave visceral face, with a fossa and a faint relief."""
 
     type: Literal["liver"] = "liver"
     lobes: tuple[LiverLobe, ...] = Field(min_length=1, max_length=6)
@@ -64,6 +93,7 @@ class LiverRecipe(Spec):
     visceral_offset_mm: float = Field(28.0, ge=-100, le=200, description="distance of the face from the origin, mm")
     visceral_radius_mm: float = Field(260.0, ge=60, le=1e4, description="radius of the organs' hollow in it, mm")
     edge_mm: float = Field(2.5, ge=0.5, le=20, description="length over which the inferior edge is rounded, mm")
+    fossa: LiverFossa | None = Field(None, description="bed of the gallbladder")
     relief_mm: float = Field(0.35, ge=0, le=3, description="amplitude of each wave of the surface's relief, mm")
     relief_length_mm: float = Field(48.0, ge=15, le=300, description="mean wavelength of the relief, mm")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the relief")
@@ -92,11 +122,15 @@ def load_recipe(path: str | Path) -> ColonRecipe | LiverRecipe:
     InputError
         If the file is missing or malformed.
     """
-    data = read_toml(Path(path))
+    return recipe_from_dict(read_toml(Path(path)), str(path))
+
+
+def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | LiverRecipe:
+    """Validate a recipe given as nested tables, `where` from, for messages; raises `InputError` if it is malformed."""
     kind = data.get("type")
     if kind == "colon":
-        return validate(ColonRecipe, data, str(path))
+        return validate(ColonRecipe, data, where)
     if kind == "liver":
-        return validate(LiverRecipe, data, str(path))
+        return validate(LiverRecipe, data, where)
     got = f"type = {kind!r}" if "type" in data else "type: missing"
-    raise InputError(f"{path}: {got}; allowed: colon, liver")
+    raise InputError(f"{where}: {got}; allowed: colon, liver")

@@ -13,6 +13,7 @@ P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ MAX_SHIFT_MM = 3.0
 """A solution farther from the mesh's hit than this is another part of the surface: no solution."""
 
 _PANEL_MM = 4.0
+_RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
@@ -73,7 +75,8 @@ class Tube:
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
         rng = generator(recipe.seed, "anatomy", "colon", 0, Stage.SWEEP)
         self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
-        self._folds = self._draw_folds(rng)
+        self._folds = (*self._draw_folds(rng), *self._polyps())
+        self._relief = self._draw_relief(rng)
         self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
         steps = self._integrate(self._knots[:-1], self._knots[1:])
         self._knot_places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -95,6 +98,25 @@ class Tube:
                 width = math.sqrt(max(depth, 1e-6) * edge * recipe.fold_edge_mm)
                 folds.append(_Fold((ring + 0.5 + place - 1) * pitch, centre, depth, width, slant, kappa))
         return tuple(folds)
+
+    def _polyps(self) -> Iterator[_Fold]:
+        """Give the polyps: folds that are as wide around the tube as along it, and not slanted."""
+        for polyp in self.recipe.polyps:
+            width = polyp.width_mm / math.sqrt(8 * math.log(2))
+            kappa = (self.recipe.radius_mm / width) ** 2
+            yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
+
+    def _draw_relief(self, rng: np.random.Generator) -> tuple[tuple[float, int, float], ...]:
+        """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is whole, so that they close."""
+        recipe = self.recipe
+        if not recipe.relief_mm:
+            return ()
+        waves = []
+        for _ in range(_RELIEF_WAVES):
+            heading, phase = rng.uniform(0, 2 * math.pi, size=2)
+            number = 2 * math.pi / (recipe.relief_length_mm * rng.uniform(0.8, 1.25))
+            waves.append((number * math.cos(heading), round(recipe.radius_mm * number * math.sin(heading)), phase))
+        return tuple(waves)
 
     def _check(self) -> None:
         u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
@@ -170,6 +192,15 @@ class Tube:
             fuu -= bump * (eu * eu - 1 / w2)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
+        for q, m, phase in self._relief:
+            angle = q * u + m * v + phase
+            sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
+            f += cosine
+            fu -= q * sine
+            fv -= m * sine
+            fuu -= q * q * cosine
+            fuv -= q * m * cosine
+            fvv -= m * m * cosine
         return _Jet(f, fu, fv, fuu, fuv, fvv)
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:

@@ -27,6 +27,7 @@ _COMMANDS = {
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",
     "validate": "Run an experiment and write its report.",
+    "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
 }
 for _name, _help in _COMMANDS.items():
     APP.command(f"simtest.cli.{_name}:{_name}", help=_help)

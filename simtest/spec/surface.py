@@ -10,6 +10,8 @@ from simtest.resources import find
 from simtest.spec.quantities import Curvature, Millimetres
 from simtest.spec.reading import Spec
 
+EdgeLength = Annotated[float, Field(ge=0.01, le=100)]
+
 
 class _Placed(Spec):
     """An analytic surface whose anchor point lies on the optical axis, its normal tilted away from the camera's axis.
@@ -92,6 +94,26 @@ class AnatomySurface(Spec):
     kind: Literal["auto", "lumen", "organ"] = Field("auto", description="lumen: camera inside; organ: camera outside")
     viewpoint: int = Field(0, ge=0, le=10**6, description="number of the automatically chosen camera pose")
     subdivisions: int = Field(1, ge=0, le=3, description="Loop subdivisions of a user's mesh")
+    edge_mm: EdgeLength | Literal["auto"] | None = Field(
+        None,
+        description="in place of subdivisions: a user's mesh is subdivided until 95 % of its edges are at most so "
+        "long, mm; auto: as highlights of exponent 200 need from the nearest viewpoints",
+    )
+    smoothing_mm: float | None = Field(
+        None,
+        ge=0,
+        le=100,
+        description="wavelength of which fair smoothing leaves half the height, mm; default twice the median edge "
+        "with edge_mm, else 0",
+    )
+
+    @model_validator(mode="after")
+    def _one_fineness(self) -> "AnatomySurface":
+        if self.edge_mm is not None and "subdivisions" in self.model_fields_set:
+            raise ValueError(
+                f"subdivisions = {self.subdivisions} and edge_mm = {self.edge_mm}: only one of them may be given"
+            )
+        return self
 
     @property
     def label(self) -> str:

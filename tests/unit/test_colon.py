@@ -7,7 +7,7 @@ import pytest
 
 from simtest.anatomy.base import RayHits
 from simtest.anatomy.colon import Colon, build
-from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, load_recipe
+from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
 from simtest.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -15,11 +15,18 @@ LOBE = "[[lobes]]\ncentre_mm = [0, 0, 0]\nsemi_axes_mm = [50, 40, %d]"
 STEP = 2e-3  # of the finite differences: truncation ~ h^4, rounding ~ eps / h^2
 
 
-@pytest.fixture(scope="module")
-def recipe() -> ColonRecipe:
+POLYPS = (
+    Polyp(along_mm=40, around_deg=80, height_mm=5, width_mm=9),
+    Polyp(along_mm=70, around_deg=-100, height_mm=3, width_mm=5),
+)
+
+
+@pytest.fixture(scope="module", params=["shipped", "polyps and relief"])
+def recipe(request) -> ColonRecipe:
     recipe = load_recipe(ROOT / "meshes" / "colon.toml")
     assert isinstance(recipe, ColonRecipe)
-    return recipe
+    more = {"polyps": POLYPS, "relief_mm": 0.01, "relief_length_mm": 5.0}
+    return recipe.model_copy(update=more) if request.param != "shipped" else recipe
 
 
 def chosen_hits(recipe, count=4000, seed=0):
@@ -149,7 +156,43 @@ def test_folds_are_convex_and_walls_concave_towards_the_camera(recipe):
     origins, directions, hits, _ = chosen_hits(recipe)
     points = Colon(recipe, 0).points(origins, directions, hits)
     assert np.nanmedian(points.k_min) < -1 / 40
-    assert 1 / 5 < np.nanmax(points.k_max) < 1 / 2  # fold edges of 2 to 5 mm
+    if not recipe.polyps:
+        assert 1 / 5 < np.nanmax(points.k_max) < 1 / 2  # fold edges of 2 to 5 mm
+
+
+def test_interpolated_normals_are_those_of_the_surface(recipe):
+    built, rng = build(recipe), np.random.default_rng(0)
+    corners = built.mesh.vertices[built.mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face, weights = rng.choice(len(area), 100_000, p=area / area.sum()), rng.dirichlet([1, 1, 1], 100_000)
+    shown = np.einsum("nc,nci->ni", weights, built.mesh.normals[built.mesh.faces[face]])
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    exact = built.tube.normal_and_shape_operator(*np.einsum("nc,nck->kn", weights, built.corners[face]))[0]
+    error = np.degrees(np.arcsin(np.linalg.norm(np.cross(shown, exact), axis=1).clip(max=1)))
+    assert error.mean() < 0.05
+    assert np.quantile(error, 0.999) < 0.3
+
+
+def test_polyps_and_relief_are_where_they_are_wanted():
+    bare = ColonRecipe(fold_depth_mm=0.0, taenia_mm=0.0)
+    tube, plain = build(bare.model_copy(update={"polyps": POLYPS})).tube, build(bare).tube
+    for polyp in POLYPS:
+        u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
+        assert plain.radius(u, v).f - tube.radius(u, v).f == pytest.approx(polyp.height_mm, abs=1e-3)
+        half = polyp.width_mm / 2
+        for du, dv in ((half, 0), (-half, 0), (0, half / 22), (0, -half / 22)):
+            rise = plain.radius(u + du, v + dv).f - tube.radius(u + du, v + dv).f
+            assert rise == pytest.approx(polyp.height_mm / 2, rel=0.01)
+        assert np.linalg.eigvalsh(tube.normal_and_shape_operator(u, v)[1][0])[1:].min() > 0.1  # convex
+    rough = build(bare.model_copy(update={"relief_mm": 0.02})).tube
+    u, v = np.random.default_rng(0).uniform([0, 0], [115, 2 * np.pi], size=(5000, 2)).T
+    assert np.std(rough.radius(u, v).f) == pytest.approx(0.02 * np.sqrt(6 / 2), rel=0.1)
+    np.testing.assert_allclose(rough.radius(u, v + 2 * np.pi).f, rough.radius(u, v).f, atol=1e-12)
+
+
+def test_polyps_beyond_the_segment_are_refused():
+    with pytest.raises(ValueError, match=r"polyps.0.along_mm = 300"):
+        ColonRecipe(polyps=(Polyp(along_mm=300, around_deg=0),))
 
 
 def test_centreline_has_unit_speed_and_is_exact(recipe):

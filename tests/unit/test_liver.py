@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.anatomy.base import RayHits
-from simtest.anatomy.liver import Liver, build
+from simtest.anatomy.liver import Liver, _project, build
 from simtest.anatomy.recipe import LiverRecipe, load_recipe
 from simtest.errors import InputError
 
@@ -109,9 +109,15 @@ def test_mesh_is_closed_even_and_on_the_surface(recipe):
     assert 80_000 < len(mesh.faces) < 200_000
     assert 0.9e6 < mesh.volume < 1.9e6
     np.testing.assert_allclose(mesh.extents, [200, 150, 110], rtol=0.1)
-    assert mesh.area_faces.min() > 0.1 * np.median(mesh.area_faces)
+    edges = np.linalg.norm(np.diff(mesh.triangles[:, [0, 1, 2, 0]], axis=1), axis=2)
+    quality = 4 * np.sqrt(3) * mesh.area_faces / (edges**2).sum(axis=1)  # 1: equilateral
+    assert quality.min() > 0.05
+    assert np.median(quality) > 0.8
     assert np.abs(build(recipe).body.values(mesh.vertices)).max() < 1e-10
-    assert (np.einsum("ni,ni->n", mesh.vertex_normals, shape.mesh.normals) > 0.99).all()
+    agreement = np.einsum("ni,ni->n", mesh.vertex_normals, shape.mesh.normals)
+    # The mean of the faces is off where triangles of unequal size meet, at the border of a finer region.
+    assert agreement.min() > 0.9
+    assert (agreement > 0.99).mean() > 0.999
 
 
 def test_outside_is_convex_and_the_inferior_edge_sharp(recipe):
@@ -134,3 +140,28 @@ def test_impossible_bodies_are_refused(recipe):
     lobe = recipe.lobes[0].model_copy(update={"semi_axes_mm": (200.0, 200.0, 200.0)})
     with pytest.raises(InputError, match="cells"):
         Liver(recipe.model_copy(update={"lobes": (lobe,)}), 0)
+
+
+def test_interpolated_normals_are_those_of_the_surface(recipe):
+    body, mesh = build(recipe).body, build(recipe).mesh
+    rng = np.random.default_rng(0)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face, weights = rng.choice(len(area), 100_000, p=area / area.sum()), rng.dirichlet([1, 1, 1], 100_000)
+    shown = np.einsum("nc,nci->ni", weights, mesh.normals[mesh.faces[face]])
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    exact = body.normals(_project(body, np.einsum("nc,nci->ni", weights, corners[face]), 4))
+    error = np.degrees(np.arcsin(np.linalg.norm(np.cross(shown, exact), axis=1).clip(max=1)))
+    assert error.mean() < 0.05
+    assert np.quantile(error, 0.999) < 0.3
+
+
+def test_the_fossa_is_a_hollow_and_the_size_is_that_of_a_liver(recipe):
+    mesh = build(recipe).mesh
+    assert (np.ptp(mesh.vertices, axis=0) <= [220, 210, 190]).all()
+    without = build(recipe.model_copy(update={"fossa": None})).body
+    deep = without.values(mesh.vertices).min()
+    assert -20 < deep < -5  # mm into the liver that has none
+    centre = np.array(recipe.fossa.centre_mm)
+    hollow = mesh.vertices[without.values(mesh.vertices) < -2]
+    assert np.linalg.norm(hollow - centre, axis=1).max() < 40

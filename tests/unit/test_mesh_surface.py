@@ -62,10 +62,11 @@ def test_every_format_reads_alike(tmp_path, suffix):
         pyvista.wrap(sphere(level=2)).save(path)
     else:
         save(sphere(level=2), path)
-    mesh = read_mesh(path)
-    assert mesh.faces.shape == (320, 3)
-    assert mesh.vertices.shape == (162, 3)  # STL's soup is merged
-    assert mesh.is_watertight
+    vertices, faces, repairs = read_mesh(path)
+    assert faces.shape == (320, 3)
+    assert vertices.shape == (162, 3)  # STL's soup is merged
+    assert not list(repairs.sentences())
+    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
 
 
 def test_polygons_are_cut_into_triangles(tmp_path):
@@ -74,7 +75,7 @@ def test_polygons_are_cut_into_triangles(tmp_path):
         VTK + "UNSTRUCTURED_GRID\nPOINTS 8 float\n0 0 0 9 0 0 9 9 0 0 9 0 0 0 9 9 0 9 9 9 9 0 9 9\n"
         "CELLS 1 9\n8 0 1 2 3 4 5 6 7\nCELL_TYPES 1\n12\n"
     )
-    assert read_mesh(path).faces.shape == (12, 3)
+    assert read_mesh(path)[1].shape == (12, 3)
 
 
 MALFORMED = {
@@ -173,16 +174,20 @@ def test_orientation_is_mended(tmp_path):
     ball = sphere(level=3)
     flip = np.random.default_rng(0).random(len(ball.faces)) < 0.5
     faces = np.where(flip[:, None], ball.faces[:, ::-1], ball.faces)
-    for name, wrong in (("mixed", faces), ("inside_out", ball.faces[:, ::-1])):
+    for name, wrong, said in (
+        ("mixed", faces, "reversed"),
+        ("out", ball.faces[:, ::-1], "turned 1 piece that was ins"),
+    ):
         path = save(trimesh.Trimesh(ball.vertices, wrong, process=False), tmp_path / f"{name}.ply")
-        mesh = prepare(path, 0).mesh
+        with pytest.warns(UserWarning, match=said):
+            mesh = prepare(path, 0).mesh
         assert (np.einsum("ni,ni->n", mesh.normals, mesh.vertices) > 0).all()
 
 
 def test_subdivision_is_reduced_with_a_warning(tmp_path, monkeypatch):
     path = save(sphere(level=3), tmp_path / "ball.ply")
     assert len(prepare(path, 1).mesh.faces) == 4 * 1280
-    monkeypatch.setattr("simtest.anatomy.mesh.MAX_SUBDIVIDED_FACES", 10_000)
+    monkeypatch.setattr("simtest.anatomy.refine.MAX_SUBDIVIDED_FACES", 10_000)
     with pytest.warns(UserWarning, match="3 subdivisions of 1280 faces would exceed 10000; using 1"):
         prepared = prepare(path, 3)
     assert prepared.subdivisions == 1
