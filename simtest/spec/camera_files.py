@@ -22,8 +22,8 @@ from simtest.resources import shown
 from simtest.spec.plain_yaml import parse_yaml
 from simtest.spec.reading import read_text
 
-MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k")
-LENS_NAMES = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D", "d")
+MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "mtx", "K", "k")
+LENS_NAMES = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "dist", "D", "d")
 WIDTH_NAMES = ("image_width", "image_Width", "imageWidth", "width")
 HEIGHT_NAMES = ("image_height", "image_Height", "imageHeight", "height")
 SIZE_NAMES = ("image_size", "imageSize", "image_resolution")
@@ -168,6 +168,8 @@ def _check_whole(data: Mapping[str, Any], where: str) -> None:
 def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
     name, value = _one_of(data, LENS_NAMES, where)
     fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
+    if name is None:
+        _check_no_other_lens(data, where)
     if name is None or value in (None, []) or (isinstance(value, Mapping) and not value.get("data")):
         if fisheye:
             raise InputError(f"{where}: {LENS_NAMES[0]}: missing; a fisheye has 4 coefficients")
@@ -186,6 +188,16 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
     if not any(values):
         return None
     return {"type": "brown_conrady", **dict(zip(BROWN_ORDER, values, strict=False))}
+
+
+def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
+    """Refuse a file that speaks of a lens but whose coefficients stand under no name that is read."""
+    told = [key for key in data if key.lower().startswith("dist") and (key != "distortion_model" or data[key])]
+    if told:
+        raise InputError(
+            f"{where}: {told[0]} = {shown(repr(data[told[0]]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"allowed names: {', '.join(LENS_NAMES)}"
+        )
 
 
 def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:

@@ -10,6 +10,12 @@ from simtest.errors import InputError
 MAX_WORKERS = 256
 
 
+def check_workers(workers: int) -> None:
+    """Raise `InputError` where a number of workers is out of range."""
+    if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
+        raise InputError(f"workers = {workers!r}: must be 1 to {MAX_WORKERS}")
+
+
 class Pool:
     """Runs a function over tasks.
 
@@ -25,8 +31,7 @@ class Pool:
     """
 
     def __init__(self, workers: int) -> None:
-        if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
-            raise InputError(f"workers = {workers!r}: must be 1 to {MAX_WORKERS}")
+        check_workers(workers)
         self._workers = workers
         self._executor: ProcessPoolExecutor | None = None
 

@@ -31,7 +31,7 @@ from simtest.validation.metrics import completed, table
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.item import save_realisation
 from simtest.validation.paper.rows import paper_rows
-from simtest.validation.pool import Pool
+from simtest.validation.pool import Pool, check_workers
 from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
 
@@ -105,6 +105,8 @@ def run_experiment(
         If the rendering backend cannot be used.
     """
     started, clock = datetime.now(UTC), time.monotonic()
+    # All that may be refused is refused before the folder is touched.
+    check_workers(workers)
     cases = expand(experiment)
     estimators = load_estimators(experiment.estimators)
     digest = _fingerprint(experiment, cases, backend.requested_variant(variant))

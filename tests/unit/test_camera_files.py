@@ -1,5 +1,6 @@
 """Camera files of others: what they mean, where their pixels begin, and what is refused."""
 
+import json
 import struct
 
 import cv2
@@ -441,3 +442,23 @@ def test_what_cannot_be_saved(tmp_path):
             save_camera(camera, tmp_path / name, kind)
         assert fragment in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "lines",
+    ["distortion_coeffs: {rows: 1, cols: 5, data: [-0.15, 0, 0, 0, 0]}", "distortion_model: plumb_bob", "Dist: [0.1]"],
+)
+def test_a_lens_under_a_name_that_is_not_read_is_refused(tmp_path, lines):
+    """Taken for a pinhole without a word, the angles would be off by a degree."""
+    path = tmp_path / "lens.yaml"
+    matrix = "camera_matrix: {rows: 3, cols: 3, data: [400, 0, 200, 0, 400, 150, 0, 0, 1]}"
+    path.write_text(f"image_width: 400\nimage_height: 300\n{matrix}\n{lines}\n")
+    with pytest.raises(InputError, match="speaks of a lens whose coefficients are missing; allowed names: dist"):
+        load_camera(path)
+
+
+def test_names_of_the_calibration_tutorials_are_read(tmp_path):
+    path = tmp_path / "tutorial.json"
+    described = {"image_width": 400, "image_height": 300, "mtx": [[400, 0, 200], [0, 400, 150], [0, 0, 1]]}
+    path.write_text(json.dumps({**described, "dist": [[-0.15, 0.01, 0, 0, 0]]}))
+    assert load_camera(path).distortion.k1 == -0.15

@@ -216,3 +216,13 @@ def test_a_finished_run_is_given_back_and_another_is_replaced_aloud(tmp_path):
     with pytest.warns(UserWarning, match="holds another run"):
         other = run_experiment(experiment.model_copy(update={"seed": 9}), tmp_path)
     assert not other.results.equals(first.results)
+
+
+def test_a_refused_number_of_workers_touches_no_folder(tmp_path):
+    """A stopped run's parts stay for the command that goes on with it."""
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    (parts / "case-00000.parquet").write_bytes(b"half of a run")
+    with pytest.raises(InputError, match="workers = 0"):
+        run_experiment(load_experiment("overview"), tmp_path, workers=0)
+    assert (parts / "case-00000.parquet").read_bytes() == b"half of a run"

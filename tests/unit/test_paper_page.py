@@ -174,6 +174,17 @@ def test_statements_need_the_articles_settings_and_method(tmp_path):
     assert judged(tmp_path / "wider", wider)["the mean error grows with the noise"].verdict == AGREES
 
 
+def test_equal_errors_whose_mean_is_rounded_are_drawn(tmp_path):
+    """The mean of 100 times 0.51286693750636 is not quite that: a bar of negative length would be refused."""
+    rows = rows_of("quiet", "smoothing_px", {2.0: 0.2, 3.0: 0.5}, {"sigma": 0.0}, count=100, spread=0)
+    for row in rows:
+        row["error_oracle_deg"] = 0.51286693750636 if row["paper.smoothing_px"] == 3.0 else 0.2357
+    (figure,) = (f for f in sweep_figures(run_of(tmp_path, rows)) if f.parameter.name == "smoothing_px")
+    (sweep,) = figure.sweeps
+    assert (sweep.least <= sweep.mean).all()
+    assert (sweep.mean <= sweep.largest).all()
+
+
 def test_one_realisation_is_too_few_to_judge_by(tmp_path):
     rows = judged(tmp_path, planted(count=1, spread=0))
     for claim in ("the mean error grows with the noise", "about linear, slope about 10⁻² degrees per unit"):

@@ -84,7 +84,7 @@ def _stages_part(data: Stages | None, colours: Mapping[str, str], folder: Path, 
 def _headline(rows: Sequence[Statement]) -> str:
     own = [row for row in rows if row.source == ARTICLE and row.verdict in (AGREES, DIFFERS)]
     if not own:
-        return "The run holds none of the article's own sweeps; its statements are not compared."
+        return "The run holds none of the article's own sweeps by circle_pose; its statements are not compared."
     differing = list(dict.fromkeys(row.sweep for row in own if row.verdict == DIFFERS))
     agreeing = sum(row.verdict == AGREES for row in own)
     text = f"Of the article's {len(own)} statements that the run can test, {agreeing} agree with it"

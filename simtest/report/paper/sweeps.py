@@ -198,6 +198,8 @@ def _sweep(rows: pl.DataFrame, column: str, estimator: str, label: str, fixed: M
         name: table[name].cast(pl.Float64).to_numpy().astype(float)
         for name in ("x", "mean", "std", "least", "largest", "bound", "law")
     }
+    # The mean of equal errors may lie a rounding outside of them.
+    values["mean"] = np.clip(values["mean"], values["least"], values["largest"])
     answered = table["answered"].to_numpy().astype(float)
     reasons = tuple(_counted(list(entry)) for entry in table["reasons"].to_list())
     failed = table["total"].to_numpy().astype(float) - answered
