@@ -2,5 +2,15 @@
 
 from simtest.detection.noise import estimate_noise
 from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
+from simtest.detection.shape import PeakShape, peak_shape
 
-__all__ = ["Component", "Region", "contrast", "detect", "estimate_noise", "half_height_component"]
+__all__ = [
+    "Component",
+    "PeakShape",
+    "Region",
+    "contrast",
+    "detect",
+    "estimate_noise",
+    "half_height_component",
+    "peak_shape",
+]
