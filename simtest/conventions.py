@@ -45,7 +45,7 @@ HIGHLIGHT_CONTRAST_SIGMA = 10.0
 HIGHLIGHT_MIN_GAIN = 0.25
 """Least abs(1 + d k) of an isolated highlight: below it the spot is a streak or a ring."""
 
-HIGHLIGHT_ELLIPSE_RESIDUAL = 0.05
+HIGHLIGHT_ELLIPSE_RESIDUAL = 0.045
 """Most that the isophote of an isolated highlight at t = 0.7 differs from an ellipse, RMS, as a share of its radius;
 noise is allowed for on top."""
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from simtest.calibration import Calibration, CorrectedFrame
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
-from simtest.detection import Region, detect, estimate_noise, peak_shape
+from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.checked import run
@@ -86,7 +86,8 @@ def reconstruct(
     """
     calibration = _calibration(camera)
     view = calibration.camera
-    corrected = calibration.correct(check_frame(frame, view))
+    image = check_frame(frame, view)
+    corrected = calibration.correct(image)
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
@@ -102,8 +103,8 @@ def reconstruct(
         regions = detect(smoothed, noise, isolated)
         found = [(region, Patch.cut(smoothed, region.box, region.peak, saturated=clipped)) for region in regions]
         if isolated:
-            left = _noise_left(smoothing_px)
-            found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak))]
+            left, flat = _noise_left(smoothing_px), flat_pixels(image)
+            found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
     return [
         Specularity(
             region,
@@ -133,9 +134,9 @@ def _noise_left(smoothing_px: float) -> float:
     return 1 / math.sqrt(1 + 4 * math.pi * smoothing_px**2)
 
 
-def _is_highlight(region: Region, patch: Patch | Failure, noise: float) -> bool:
+def _is_highlight(region: Region, patch: Patch | Failure, noise: float, flat: Mask | None) -> bool:
     """Tell whether nothing in a peak's shape speaks against one point highlight."""
-    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, noise)
+    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, noise, flat)
     return isinstance(shape, Failure) or shape.is_highlight
 
 

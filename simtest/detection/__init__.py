@@ -2,7 +2,7 @@
 
 from simtest.detection.noise import estimate_noise
 from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
-from simtest.detection.shape import PeakShape, peak_shape
+from simtest.detection.shape import PeakShape, flat_pixels, peak_shape
 
 __all__ = [
     "Component",
@@ -11,6 +11,7 @@ __all__ = [
     "contrast",
     "detect",
     "estimate_noise",
+    "flat_pixels",
     "half_height_component",
     "peak_shape",
 ]

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import (
     HIGHLIGHT_ELLIPSE_RESIDUAL,
@@ -21,12 +22,20 @@ from simtest.detection.regions import Region
 from simtest.errors import Failure
 from simtest.geometry import FittedConic, Patch, fit_ellipse
 
+Mask = npt.NDArray[np.bool_]
+
 RESIDUAL_ISOVALUE = 0.7
 """Where the isophote is compared with an ellipse: lower ones reach farther out, where curvature changes, and higher
 ones are noisier."""
 
 TOP_ISOVALUE = 0.8
 """The isophote whose width is compared with that at half height."""
+
+NOISE_FACTOR = 2.0
+"""How many standard deviations of its noise a measure of shape may be off."""
+
+MIN_FLAT_PX = 12
+"""As many pixels of the frame's very largest value are clipped ones."""
 
 LEAST_LEVEL = 0.05
 """Least share of a peak's height above its surroundings at which a width means anything."""
@@ -58,12 +67,27 @@ class PeakShape:
     @property
     def is_highlight(self) -> bool:
         """Whether the shape speaks against a point highlight by no more than the thresholds and the noise."""
-        bent = self.residual > math.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, self.residual_noise)
-        flat = self.width_excess > math.hypot(HIGHLIGHT_WIDTH_EXCESS, self.width_noise)
+        # The residual adds to the noise in squares. The excess adds to it as it is: a wide Phong lobe (n = 10 to 50) has
+        # 0.01 to 0.025 of its own.
+        bent = self.residual > math.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * self.residual_noise)
+        flat = self.width_excess > HIGHLIGHT_WIDTH_EXCESS + NOISE_FACTOR * self.width_noise
         return not (bent or flat)
 
 
-def peak_shape(patch: Patch, region: Region, noise: float) -> PeakShape | Failure:
+def flat_pixels(frame: npt.NDArray[np.floating]) -> Mask | None:
+    """Tell which pixels of a frame, shape (H, W) or (H, W, C), are clipped, whatever the calibration knows of it.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W), or None
+        Where a channel has the frame's largest value; None where these are too few to be more than an accident.
+    """
+    largest = frame >= frame.max()
+    mask = np.asarray(largest if largest.ndim == 2 else largest.any(axis=2))
+    return mask if np.count_nonzero(mask) >= MIN_FLAT_PX else None
+
+
+def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None = None) -> PeakShape | Failure:
     """Measure a peak's shape.
 
     Parameters
@@ -74,6 +98,8 @@ def peak_shape(patch: Patch, region: Region, noise: float) -> PeakShape | Failur
         For the peak's contrast.
     noise : float
         Standard deviation of the smoothed frame's noise at the peak, in the patch's units.
+    clipped : ndarray of bool, shape (H, W), optional
+        Where the frame is clipped (see `flat_pixels`), beside what the patch knows of it.
 
     Returns
     -------
@@ -92,7 +118,7 @@ def peak_shape(patch: Patch, region: Region, noise: float) -> PeakShape | Failur
     assert not isinstance(points, Failure)
     half, level, top = (_level(t, patch, region) for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE))
     excess = math.nan
-    if half >= LEAST_LEVEL and not _clipped(patch):
+    if half >= LEAST_LEVEL and not _clipped(patch, region, clipped):
         gaussian = math.sqrt(math.log(top) / math.log(half))
         excess = _largest_width_ratio(at_top, at_half) / gaussian - 1
     relative = noise / region.contrast
@@ -112,8 +138,10 @@ def _slope(level: float) -> float:
     return -2 * level * math.log(level)
 
 
-def _clipped(patch: Patch) -> bool:
-    return patch.saturated is not None and bool((patch.saturated & patch.inside(TOP_ISOVALUE)).any())
+def _clipped(patch: Patch, region: Region, clipped: Mask | None) -> bool:
+    x, y, width, height = region.box
+    masks = (patch.saturated, None if clipped is None else clipped[y : y + height, x : x + width])
+    return any(mask is not None and bool((mask & patch.inside(TOP_ISOVALUE)).any()) for mask in masks)
 
 
 def _quadratic(fitted: FittedConic) -> tuple[np.ndarray, np.ndarray]:
