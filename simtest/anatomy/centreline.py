@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import igl
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage, sparse
 
 from simtest.anatomy.base import Array, IntArray, SurfaceModel, TriangleMesh
@@ -207,7 +208,7 @@ def _without_ends(path: Array, room: Array) -> Array:
     return path[max(wide[0], cut) : min(wide[-1] + 1, len(path) - cut)]
 
 
-def _longest_run(flags: Array) -> slice:
+def _longest_run(flags: npt.NDArray[np.bool_]) -> slice:
     labels, count = ndimage.label(flags)
     if not count:
         return slice(0, 0)

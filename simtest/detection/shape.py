@@ -122,9 +122,7 @@ def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None 
         gaussian = math.sqrt(math.log(top) / math.log(half))
         excess = _largest_width_ratio(at_top, at_half) / gaussian - 1
     relative = noise / region.contrast
-    return PeakShape(
-        _residual(at_residual, points), relative / _slope(level), excess, relative / _slope(top)
-    )
+    return PeakShape(_residual(at_residual, points), relative / _slope(level), excess, relative / _slope(top))
 
 
 def _level(isovalue: float, patch: Patch, region: Region) -> float:

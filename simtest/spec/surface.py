@@ -101,9 +101,7 @@ class AnatomySurface(Spec):
     look_ahead_mm: float = Field(
         30.0, ge=1, le=200, description="how far on along the path the camera looks, mm; for path and off_axis"
     )
-    around_deg: float = Field(
-        0.0, ge=-360, le=360, description="direction across the path, deg; for off_axis and wall"
-    )
+    around_deg: float = Field(0.0, ge=-360, le=360, description="direction across the path, deg; for off_axis and wall")
     off_axis_share: float = Field(
         0.6, ge=0, le=1, description="how far beside the path, as a share of the room that there is; for off_axis"
     )

@@ -129,7 +129,9 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     return position[valid], faces, larger[valid]
 
 
-def _estimates(session: Session, frame: Array, calibration: Calibration) -> tuple[list[str], Array, Array]:
+def _estimates(
+    session: Session, frame: npt.NDArray[np.float32], calibration: Calibration
+) -> tuple[list[str], Array, Array]:
     """Give names, points looked at and normals of all estimates that look at the surface."""
     names, pixels, normals = [], [], []
     for specularity in reconstruct(frame, calibration):
@@ -141,5 +143,5 @@ def _estimates(session: Session, frame: Array, calibration: Calibration) -> tupl
     if not names:
         return [], np.empty((0, 3)), np.empty((0, 3))
     points = session.cast(np.array(pixels))[0].position
-    hit = np.isfinite(points).all(axis=1)
+    hit = np.asarray(np.isfinite(points).all(axis=1))
     return [name for name, kept in zip(names, hit, strict=True) if kept], points[hit], np.array(normals)[hit]
