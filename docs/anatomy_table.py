@@ -1,9 +1,9 @@
-"""Prints the table of docs/experiments.md, "Curved anatomy": found, missed and false highlights, and their errors.
+"""Prints the table of docs/experiments.md, "Curved anatomy": what was found, what was false, and the errors.
 
 python docs/anatomy_table.py colon 1000 1400 FOLDER
 
-runs the direct-light group of an experiment (or a mesh's file through the experiment `mesh`) over the viewpoints 1000 to
-1399 and keeps the run in FOLDER.
+runs the direct-light group of an experiment (or a mesh's file through the experiment `mesh`) over the viewpoints 1000
+to 1399 and keeps the run in FOLDER.
 """
 
 import sys

@@ -67,8 +67,8 @@ class PeakShape:
     @property
     def is_highlight(self) -> bool:
         """Whether the shape speaks against a point highlight by no more than the thresholds and the noise."""
-        # The residual adds to the noise in squares. The excess adds to it as it is: a wide Phong lobe (n = 10 to 50) has
-        # 0.01 to 0.025 of its own.
+        # The residual adds to the noise in squares. The excess adds to it as it is: a wide Phong lobe (n = 10 to 50)
+        # has 0.01 to 0.025 of its own.
         bent = self.residual > math.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * self.residual_noise)
         flat = self.width_excess > HIGHLIGHT_WIDTH_EXCESS + NOISE_FACTOR * self.width_noise
         return not (bent or flat)

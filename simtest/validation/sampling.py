@@ -1,4 +1,4 @@
-"""Picks the viewpoints of an anatomy from which isolated highlights are seen, and counts why the others are left out."""
+"""Picks the views of an anatomy that show isolated highlights, and counts why the others are left out."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable

@@ -3,7 +3,9 @@
 python -m simtest.viewer.window CONTENT.npz [SCREENSHOT.png]
 """
 
+import functools
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -45,8 +47,7 @@ def save_screenshot(content: Content, path: Path) -> None:
         for window in OFF_SCREEN:
             done, said = _draw([str(stored), str(picture)], {"VTK_DEFAULT_OPENGL_WINDOW": window}, TIMEOUT_S)
             if done and picture.is_file():
-                data = picture.read_bytes()
-                write_atomically(path, lambda part: part.write_bytes(data))
+                write_atomically(path, functools.partial(shutil.copyfile, picture))
                 return
     raise InputError(
         "--screenshot: nothing here draws without a display; install libegl1 (with libgl1-mesa-dri) or libosmesa6"
@@ -105,7 +106,8 @@ def _plot(content: Content, screenshot: str | None) -> None:
         ambient=0.8, diffuse=0.2,
         scalar_bar_args={"title": "curvature of larger size (1/mm), convex positive", "color": "black",
                          "vertical": False, "fmt": "%.3g", "n_labels": 5, "title_font_size": 18, "label_font_size": 15,
-                         "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25, "position_y": 0.02},
+                         "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25,
+                         "position_y": 0.02},
     )  # fmt: skip
     near = float(np.quantile(np.linalg.norm(content.vertices, axis=1), 0.05))
     reach = 0.35 * float(np.median(np.linalg.norm(content.vertices, axis=1)))
@@ -147,7 +149,8 @@ def _place_viewer(plotter: object, content: Content) -> None:
 
     middle = np.median(content.vertices, axis=0)
     size = float(np.linalg.norm(middle))
-    plotter.camera_position = [(1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist(), (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
+    place, target = (1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist()
+    plotter.camera_position = [place, target, (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
     plotter.reset_camera_clipping_range()  # type: ignore[attr-defined]
 
 
