@@ -5,11 +5,19 @@ from pathlib import Path
 from typing import Any
 
 from simtest.dataset.frame import LabelledFrame, make_frame
+from simtest.errors import InputError
+from simtest.files import make_folder, write_json
 from simtest.reconstruction import reconstruct
 from simtest.spec import Experiment, Scene, load_experiment, load_scene
 from simtest.validation.runner import Progress
+from simtest.validation.sampling import SampledViews
 
-__all__ = ["LabelledFrame", "export", "reconstruct", "render", "validate"]
+__all__ = ["LabelledFrame", "export", "reconstruct", "render", "sample_views", "validate"]
+
+MAX_VIEWS = 1000
+
+TRIES = 10
+"""Places that are tried for each view wanted."""
 
 
 def render(
@@ -81,6 +89,56 @@ def export(
 
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
     return export_scene(described, Path(out), variant)
+
+
+def sample_views(
+    scene: Scene | str | Path,
+    out: str | Path,
+    count: int = 50,
+    settings: Mapping[str, Any] | None = None,
+    variant: str | None = None,
+    progress: Progress | None = None,
+) -> SampledViews:
+    """Pick viewpoints of an anatomy that show isolated highlights; write views.json, which says what was left out.
+
+    Tried are the viewpoints 0, 1, 2, ..., or, where ``surface.view`` is not auto, places spread evenly over the camera
+    path; ten for each view wanted at most.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        Of an anatomy.
+    out : str or Path
+        Folder, made if need be.
+    count : int
+        Views wanted, 1 to 1000.
+    settings : mapping, optional
+        Values that replace those of a scene file, by key path.
+    variant : str, optional
+        Mitsuba variant.
+    progress : callable, optional
+        Called with views found, views wanted, and what was tried.
+
+    Returns
+    -------
+    SampledViews
+
+    Raises
+    ------
+    InputError
+        If the scene is malformed or no anatomy's, or `count` is out of range.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    from simtest.validation.sampling import candidates, place_key, sample_views
+
+    if not 1 <= count <= MAX_VIEWS:
+        raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
+    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    make_folder(Path(out))
+    sampled = sample_views(described, count, candidates(described, TRIES * count), variant, progress)
+    write_json(Path(out) / "views.json", sampled.as_dict(place_key(described)))
+    return sampled
 
 
 def validate(

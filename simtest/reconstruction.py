@@ -1,5 +1,6 @@
 """From one frame and its camera to normals: detect the specularities, run the estimators on each."""
 
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy.typing as npt
 
 from simtest.calibration import Calibration, CorrectedFrame
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
-from simtest.detection import Region, detect, estimate_noise
+from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.checked import run
@@ -68,7 +69,8 @@ def reconstruct(
     smoothing_px : float
         Standard deviation of the Gaussian smoothing, px, in [0, 50].
     isolated : bool
-        Detect only specularities whose isophote at t = 0.5 closes inside the frame and the camera's view mask.
+        Detect only specularities whose isophote at t = 0.5 closes inside the frame and the camera's view mask, and
+        whose shape is that of one point highlight (`simtest.detection.peak_shape`).
 
     Returns
     -------
@@ -85,7 +87,8 @@ def reconstruct(
     """
     calibration = _calibration(camera)
     view = calibration.camera
-    corrected = calibration.correct(check_frame(frame, view))
+    image = check_frame(frame, view)
+    corrected = calibration.correct(image)
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
@@ -99,8 +102,12 @@ def reconstruct(
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
-        regions = detect(smoothed, _noise(corrected, calibration, smoothing_px), isolated, seen)
-        found = [(r, Patch.cut(smoothed, r.box, r.peak, **masks)) for r in regions]
+        noise = _noise(corrected, calibration, smoothing_px)
+        regions = detect(smoothed, noise, isolated, seen)
+        found = [(region, Patch.cut(smoothed, region.box, region.peak, **masks)) for region in regions]
+        if isolated:
+            left, flat = _noise_left(smoothing_px), flat_pixels(image)
+            found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
     return [
         Specularity(
             region,
@@ -120,6 +127,21 @@ def _noise(corrected: CorrectedFrame, calibration: Calibration, smoothing_px: fl
     known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)
     noise = np.maximum(white, known)
     return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
+
+
+def _at(noise: float | Image, pixel: tuple[int, int]) -> float:
+    return float(noise) if isinstance(noise, float) else float(noise[pixel[1], pixel[0]])
+
+
+def _noise_left(smoothing_px: float) -> float:
+    """Give the share of white noise that a Gaussian of this width leaves: 1 / (2 sqrt(pi) s) where it is wide."""
+    return 1 / math.sqrt(1 + 4 * math.pi * smoothing_px**2)
+
+
+def _is_highlight(region: Region, patch: Patch | Failure, noise: float, flat: Mask | None) -> bool:
+    """Tell whether nothing in a peak's shape speaks against one point highlight."""
+    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, noise, flat)
+    return isinstance(shape, Failure) or shape.is_highlight
 
 
 def _flagged(result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None) -> Estimate | Failure:

@@ -45,7 +45,13 @@ def make_surface(spec: Surface) -> SurfaceModel:
         case QuadricSurface():
             return Quadric(spec)
         case AnatomySurface():
-            return _make_anatomy(spec)
+            surface = _make_anatomy(spec)
+            if spec.view != "auto":
+                # Imported here, as the mesh libraries below.
+                from simtest.anatomy.centreline import path_pose
+
+                surface.model_from_camera = path_pose(spec, surface)
+            return surface
 
 
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:

@@ -24,6 +24,8 @@ _COMMANDS = {
     "doctor": "Check the rendering backend.",
     "schema": "Print the JSON schema of a scene, experiment, camera or calibration file.",
     "render": "Render a scene with its ground truth.",
+    "views": "Pick viewpoints of an anatomy that show isolated highlights.",
+    "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",
     "validate": "Run an experiment and write its report.",

@@ -8,6 +8,7 @@ from typing import Any
 
 from simtest.files import write_atomically
 from simtest.report import static, style, words
+from simtest.report.coverage import coverage
 from simtest.report.gallery import isophote_colour
 from simtest.report.paper.section import paper_section
 from simtest.report.run import Run, read_run
@@ -82,6 +83,7 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
         if surfaces.boxes:
             static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
             charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
+    sections["coverage"] = coverage(run)
     paths = static.draw_gallery(run.gallery, colours, folder)
     sections["gallery"] = _gallery_section(run, paths)
     view = surface_3d(run)
@@ -162,6 +164,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         paper=sections.get("paper"),
         heat=sections.get("heat", []),
         surfaces=sections.get("surfaces"),
+        coverage=sections["coverage"],
         gallery=sections["gallery"],
         gallery_total=run.gallery_total,
         first=_FIRST,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.report.coverage import is_anatomical
 from simtest.report.curves import prepared, scattered, varies
 from simtest.report.run import Run
 from simtest.report.style import Array, estimator_order, number
@@ -132,7 +133,7 @@ def surface_figure(run: Run, has_figures: bool) -> SurfaceFigure | None:
         None where there is nothing to show.
     """
     rows = run.results.with_columns(ok=(pl.col("status") == "ok").fill_null(False))
-    if rows.is_empty() or (has_figures and run.experiment != "anatomy"):
+    if rows.is_empty() or (has_figures and not is_anatomical(run)):
         return None
     surfaces = [str(s) for s in rows["surface"].unique(maintain_order=True)]
     names = estimator_order(rows["estimator"].to_list())

@@ -106,6 +106,19 @@ class AnatomySurface(Spec):
         description="wavelength of which fair smoothing leaves half the height, mm; default twice the median edge "
         "with edge_mm, else 0",
     )
+    view: Literal["auto", "path", "off_axis", "wall"] = Field(
+        "auto",
+        description="auto: the pose numbered by viewpoint; in a lumen also path: on the camera path, looking ahead; "
+        "off_axis: the same from beside it; wall: on it, looking across",
+    )
+    path_share: float = Field(0.5, ge=0, le=1, description="place along the camera path, from one end to the other")
+    look_ahead_mm: float = Field(
+        30.0, ge=1, le=200, description="how far on along the path the camera looks, mm; for path and off_axis"
+    )
+    around_deg: float = Field(0.0, ge=-360, le=360, description="direction across the path, deg; for off_axis and wall")
+    off_axis_share: float = Field(
+        0.6, ge=0, le=1, description="how far beside the path, as a share of the room that there is; for off_axis"
+    )
 
     @model_validator(mode="after")
     def _one_fineness(self) -> "AnatomySurface":

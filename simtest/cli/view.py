@@ -1,0 +1,36 @@
+"""`simtest view`."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from simtest.cli.options import Settings, Variant
+
+
+def view(
+    scene: str,
+    /,
+    *,
+    screenshot: Annotated[
+        Path | None, Parameter(help="PNG to draw to, without a display, instead of opening a window.")
+    ] = None,
+    settings: Settings = None,
+    variant: Variant = None,
+) -> None:
+    """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals.
+
+    Parameters
+    ----------
+    scene : str
+        A scene file, or the name of a shipped scene.
+    """
+    from simtest.spec import load_scene, parse_settings
+    from simtest.viewer import make_content, save_screenshot, show
+
+    content = make_content(load_scene(scene, parse_settings(settings or [])), variant)
+    if screenshot is None:
+        show(content)
+    else:
+        save_screenshot(content, screenshot)
+        print(screenshot)

@@ -1,0 +1,100 @@
+"""Camera paths through lumens: in the middle, smooth, and the poses on them and beside them."""
+
+import numpy as np
+import pytest
+
+from simtest.anatomy import make_surface
+from simtest.anatomy.base import RayHits, Shape, SurfaceModel, TriangleMesh
+from simtest.anatomy.centreline import camera_path
+from simtest.anatomy.viewpoints import MIN_CLEARANCE_MM
+from simtest.errors import InputError
+from simtest.spec.surface import AnatomySurface
+
+
+class Bent(SurfaceModel):
+    """A torus piece of 90 deg, open at both ends: radius 40 mm, lumen of 8 mm."""
+
+    solid = False
+
+    def __init__(self, sweep=np.pi / 2):
+        u, v = np.meshgrid(np.linspace(0, sweep, 60), np.linspace(0, 2 * np.pi, 32, endpoint=False), indexing="ij")
+        out = 40 + 8 * np.cos(v)
+        vertices = np.stack([out * np.cos(u), out * np.sin(u), 8 * np.sin(v)], axis=-1).reshape(-1, 3)
+        i, j = (a.ravel() for a in np.meshgrid(np.arange(59), np.arange(32), indexing="ij"))
+        a, b = i * 32 + j, i * 32 + (j + 1) % 32
+        faces = np.concatenate([np.stack([a, b, a + 32], 1), np.stack([b, b + 32, a + 32], 1)])
+        self._mesh = TriangleMesh(vertices, faces, np.zeros_like(vertices))
+        self._key = f"bent-{sweep}"
+        self.model_from_camera = np.eye(4)
+
+    def shape(self):
+        return Shape("mesh", False, {}, self._mesh, self._key)
+
+    def clearance(self, points):
+        return 8 - np.hypot(np.hypot(points[:, 0], points[:, 1]) - 40, points[:, 2])
+
+    def points(self, origins, directions, hits: RayHits):
+        raise NotImplementedError
+
+
+def test_the_path_keeps_to_the_middle_of_an_open_bent_tube():
+    surface = Bent()
+    path = camera_path(surface)
+    assert (surface.clearance(path.points) > 6.5).all()
+    assert path.length == pytest.approx(40 * np.pi / 2 - 16, abs=6)
+    # Its frame turns as a circle of 40 mm does, and does not roll.
+    turned = np.degrees(np.arccos(np.clip(np.sum(path.tangents[:-1] * path.tangents[1:], axis=1), -1, 1)))
+    assert turned.mean() == pytest.approx(np.degrees(1 / 40), rel=0.3)
+    assert turned.max() < 4
+    np.testing.assert_allclose(np.sum(path.tangents * path.sides, axis=1), 0, atol=1e-12)
+
+
+def test_a_place_on_the_path_is_continuous_and_goes_straight_on_beyond_its_ends():
+    path = camera_path(Bent())
+    places = np.linspace(0, path.length, 500)
+    points = np.array([path.at(place)[0] for place in places])
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert steps.max() < 1.2 * steps.mean()
+    point, tangent, _ = path.at(path.length)
+    np.testing.assert_allclose(path.at(path.length + 5)[0], point + 5 * tangent)
+
+
+def test_a_lumen_too_short_for_a_path_is_refused():
+    with pytest.raises(InputError, match="at least 20 mm"):
+        camera_path(Bent(sweep=0.4))
+
+
+def poses_of(path, **keys):
+    surfaces = [make_surface(AnatomySurface(path=str(path), path_share=float(s), **keys)) for s in np.linspace(0, 1, 9)]
+    return surfaces[0], np.stack([surface.model_from_camera for surface in surfaces])
+
+
+@pytest.mark.parametrize("name", ["colon", "colon_edingca_00090.ply"])
+@pytest.mark.parametrize("view", ["path", "off_axis", "wall"])
+def test_poses_are_rigid_smooth_and_never_in_tissue(request, name, view):
+    path = name if name == "colon" else request.getfixturevalue("shared_data") / "meshes" / name
+    keys = {"view": view, "subdivisions": 0}
+    surface, poses = poses_of(path, **keys)
+    rotations = poses[:, :3, :3]
+    np.testing.assert_allclose(rotations.transpose(0, 2, 1) @ rotations - np.eye(3), 0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1)
+    room = surface.clearance(poses[:, :3, 3].copy())
+    # The CT colon has necks narrower than the clearance.
+    assert (room > (MIN_CLEARANCE_MM if name == "colon" else 1.0)).all()
+    near = AnatomySurface(path=str(path), path_share=0.5005, **keys)
+    there = AnatomySurface(path=str(path), path_share=0.5, **keys)
+    np.testing.assert_allclose(make_surface(near).model_from_camera, make_surface(there).model_from_camera, atol=1.2)
+
+
+def test_a_camera_on_the_path_looks_along_it_and_one_that_faces_the_wall_across_it():
+    surface, ahead = poses_of("colon", view="path")
+    across = poses_of("colon", view="wall")[1]
+    path = camera_path(surface)
+    tangents = np.array([path.at(share * path.length)[1] for share in np.linspace(0, 1, 9)])
+    assert (np.sum(ahead[:, :3, 2] * tangents, axis=1) > 0.5).all()
+    np.testing.assert_allclose(np.sum(across[:, :3, 2] * tangents, axis=1), 0, atol=1e-12)
+
+
+def test_an_organ_has_no_path():
+    with pytest.raises(InputError, match=r"surface\.view = wall: liver is an organ"):
+        make_surface(AnatomySurface(path="liver", view="wall"))

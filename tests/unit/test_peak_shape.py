@@ -1,0 +1,95 @@
+"""Which peaks of synthetic frames have the shape of a point highlight."""
+
+import numpy as np
+import pytest
+
+from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCESS
+from simtest.detection import detect, flat_pixels, peak_shape
+from simtest.errors import Failure
+from simtest.geometry import Camera, Patch, smooth
+from simtest.reconstruction import reconstruct
+
+SIZE = 160
+CAMERA = Camera(SIZE, SIZE, 160.0, 160.0, 80.0, 80.0)
+
+
+def frame_of(height, pedestal=0.05):
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5 - 80.0
+    return (height(x, y) + pedestal).astype(np.float32)
+
+
+def gaussian(x, y):
+    return np.exp(-(x**2) / (2 * 15**2) - y**2 / (2 * 8**2))
+
+
+def near_miss(x, y):
+    """The lobe where the misfit (x^2 + delta, y) comes closest to 0 without reaching it: theory.md section 3."""
+    return np.exp(-((x**2 / 300 + 0.05) ** 2) / 0.3 - y**2 / (2 * 8**2))
+
+
+def ridge(x, y):
+    """A Gaussian bent into an arc."""
+    return gaussian(x, y - x**2 / 60)
+
+
+def shape_of(frame, noise=0.0):
+    smoothed = smooth(frame, 2.0)
+    (region,) = detect(smoothed, noise, isolated=False)
+    shape = peak_shape(Patch.cut(smoothed, region.box, region.peak), region, noise / 7.1, flat_pixels(frame))
+    assert not isinstance(shape, Failure)
+    return shape
+
+
+@pytest.mark.parametrize("pedestal", [0.0, 0.3, 0.7])
+def test_a_gaussian_highlight_has_neither_residual_nor_excess_over_any_ground(pedestal):
+    shape = shape_of(frame_of(gaussian, pedestal))
+    assert shape.residual < 0.002
+    assert shape.width_excess == pytest.approx(0.0, abs=0.01)
+    assert shape.is_highlight
+
+
+def test_a_heavy_tail_is_sharper_than_a_gaussian():
+    shape = shape_of(frame_of(lambda x, y: 1 / (1 + x**2 / 200 + y**2 / 100) ** 2))
+    assert shape.width_excess < 0
+    assert shape.is_highlight
+
+
+def test_a_near_miss_of_the_bisector_is_flat_topped():
+    shape = shape_of(frame_of(near_miss))
+    assert shape.width_excess > 2 * HIGHLIGHT_WIDTH_EXCESS
+    assert not shape.is_highlight
+
+
+def test_a_bent_ridge_is_no_ellipse():
+    shape = shape_of(frame_of(ridge))
+    assert shape.residual > 1.5 * HIGHLIGHT_ELLIPSE_RESIDUAL
+    assert not shape.is_highlight
+
+
+@pytest.mark.parametrize("level", [0.4, 0.7])
+def test_a_clipped_peak_is_not_taken_for_a_flat_one(level):
+    frame = np.minimum(frame_of(gaussian), level).astype(np.float32)
+    assert np.isnan(shape_of(frame).width_excess)
+    assert len(reconstruct(frame, CAMERA)) == 1
+    assert flat_pixels(frame_of(gaussian)) is None
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.03, 0.06])
+def test_noise_is_allowed_for(sigma):
+    """Down to 15 sigma a highlight keeps its place; the predicted noise is that of the residuals."""
+    rng, found, residuals, predicted = np.random.default_rng(5), 0, [], []
+    for _ in range(40):
+        noisy = frame_of(gaussian) + rng.normal(0, sigma, (SIZE, SIZE)).astype(np.float32)
+        found += len(reconstruct(noisy, CAMERA, ["brightest_point"]))
+        shape = shape_of(noisy, sigma)
+        residuals.append(shape.residual)
+        predicted.append(shape.residual_noise)
+    assert found >= 39
+    assert 0.5 < np.mean(residuals) / np.mean(predicted) < 1.3
+
+
+@pytest.mark.parametrize("false", [near_miss, ridge])
+def test_only_isolated_highlights_are_asked_for_their_shape(false):
+    frame = frame_of(false)
+    assert reconstruct(frame, CAMERA) == []
+    assert len(reconstruct(frame, CAMERA, isolated=False)) == 1

@@ -1,0 +1,70 @@
+"""The 3D view: what it is made of, and a picture of it where this machine can draw without a display."""
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.errors import InputError
+from simtest.spec import load_scene
+from simtest.viewer import Content, make_content, save_screenshot, show, window
+
+SMALL = {"camera.width": 120, "camera.height": 120, "camera.fx": 120.0, "camera.fy": 120.0}
+
+
+@pytest.fixture(scope="module")
+def content():
+    return make_content(load_scene("sphere", {**SMALL, "surface.radius_mm": 5.0, "surface.tilt_deg": 0.0}))
+
+
+@pytest.mark.render
+def test_content_is_the_scene(content):
+    np.testing.assert_allclose(content.curvature, 0.2, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(content.vertices - [0, 0, 15.0], axis=1), 5.0, atol=1e-4)
+    assert content.faces.max() < len(content.vertices)
+    assert len(content.places) == 1
+    assert set(content.estimator) == {"circle_pose", "brightest_point", "cone_axis"}
+    cone = content.estimates[content.estimator == "cone_axis"]
+    assert float(cone[0] @ content.normals[0]) > 0.99999
+
+
+@pytest.mark.render
+def test_content_survives_its_file(content, tmp_path):
+    content.save(tmp_path / "content.npz")
+    again = Content.load(tmp_path / "content.npz")
+    np.testing.assert_array_equal(again.vertices, content.vertices)
+    assert list(again.estimator) == list(content.estimator)
+
+
+@pytest.mark.render
+def test_a_screenshot_needs_no_display(content, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    path = tmp_path / "view.png"
+    try:
+        save_screenshot(content, path)
+    except InputError as error:
+        pytest.skip(f"no off-screen rendering here: {error}")
+    picture = cv2.imread(str(path))
+    assert picture.shape[:2] == window.SIZE[::-1]
+    # Convex is red, BGR; the background is white.
+    red = (picture[..., 2].astype(int) - picture[..., 0] > 80).mean()
+    assert red > 0.003
+    assert list(picture[5, 5]) == [255, 255, 255]
+
+
+@pytest.mark.render
+def test_where_nothing_draws_it_says_what_to_install(content, tmp_path, monkeypatch):
+    monkeypatch.setattr(window, "_draw", lambda *_: (False, "exit code -11"))
+    with pytest.raises(InputError, match=r"libegl1 .* or libosmesa6"):
+        save_screenshot(content, tmp_path / "view.png")
+    with pytest.raises(InputError, match=r"must be \.png"):
+        save_screenshot(content, tmp_path / "view.jpg")
+
+
+@pytest.mark.render
+def test_a_window_without_a_display_is_refused(content, monkeypatch):
+    monkeypatch.setattr(window.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(InputError, match="--screenshot"):
+        show(content)
