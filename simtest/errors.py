@@ -31,6 +31,8 @@ class Reason(StrEnum):
     NOT_AN_ELLIPSE = "not_an_ellipse"
     DEGENERATE_CONIC = "degenerate_conic"
     NOT_FINITE = "not_finite"
+    STREAK = "streak"
+    NOT_KNOWN = "not_known"
     ESTIMATOR_ERROR = "estimator_error"
 
 

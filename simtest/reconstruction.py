@@ -3,6 +3,7 @@
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -92,18 +93,23 @@ def reconstruct(
     chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
     seen, clipped = view.seen, corrected.saturated
     smoothed = smooth(corrected.intensity, smoothing_px, seen)
+    noise = _noise(corrected, calibration, smoothing_px)
+    cut = partial(Patch.cut, smoothed, saturated=clipped, seen=seen, noise=noise, smoothing_px=smoothing_px)
     if roi is not None:
-        patch = Patch.cut(smoothed, roi, saturated=clipped, seen=seen)
+        patch = cut(roi)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
-        regions = detect(smoothed, _noise(corrected, calibration, smoothing_px), isolated, seen)
-        found = [(r, Patch.cut(smoothed, r.box, r.peak, saturated=clipped, seen=seen)) for r in regions]
+        regions = detect(smoothed, noise, isolated, seen)
+        found = [(r, cut(r.box, r.peak)) for r in regions]
     return [
         Specularity(
             region,
             patch,
-            {name: _flagged(run(made, patch, view), patch, corrected.limited) for name, made in chosen.items()},
+            {
+                name: _flagged(run(made, patch, view, calibration.known), patch, corrected.limited)
+                for name, made in chosen.items()
+            },
         )
         for region, patch in found
     ]

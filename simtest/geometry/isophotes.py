@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.level_sets import LevelSet, level_set_around
+from simtest.geometry.level_sets import LevelSet, Sensitivities, level_set_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -71,6 +71,10 @@ class Patch:
         Where the sensor is clipped; None where that is not known.
     seen : ndarray of bool, shape (h, w), optional
         The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
+    noise : float, or ndarray of float32, shape (h, w), optional
+        Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
+    smoothing_px : float
+        Standard deviation of the Gaussian that the frame was smoothed with, px.
     """
 
     values: Image | Array
@@ -80,6 +84,8 @@ class Patch:
     peak_pixel: tuple[int, int]
     saturated: Mask | None = None
     seen: Mask | None = None
+    noise: float | Image | None = None
+    smoothing_px: float = 0.0
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -91,6 +97,8 @@ class Patch:
         origin_px: tuple[int, int] = (0, 0),
         saturated: Mask | None = None,
         seen: Mask | None = None,
+        noise: float | Image | None = None,
+        smoothing_px: float = 0.0,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -108,6 +116,10 @@ class Patch:
             Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
         seen : ndarray of bool, shape (H, W), optional
             The frame's pixels inside the camera's view mask; default all.
+        noise : float, or ndarray of float32, shape (H, W), optional
+            Standard deviation of the frame's noise before smoothing; None: not known.
+        smoothing_px : float
+            Standard deviation of the Gaussian that it was smoothed with, px.
 
         Returns
         -------
@@ -149,7 +161,10 @@ class Patch:
             # Where falloff was divided away the plateau is slanted, and highest at its rim.
             column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
             value = float(values[row, column])
-        return cls(values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen)
+        if isinstance(noise, np.ndarray):
+            noise = noise[y : y + height, x : x + width]
+        pixel, place = (int(column), int(row)), place + PIXEL_CENTRE + corner
+        return cls(values, corner, place, value, pixel, clipped, seen, noise, smoothing_px)
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
@@ -174,6 +189,11 @@ class Patch:
         """
         found = self._level_set(isovalue)
         return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
+
+    def sensitivities(self, isovalue: float) -> Sensitivities | Failure:
+        """Tell how the points of `crossings` move with the patch's values, in the same order."""
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.sensitivities()
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end."""

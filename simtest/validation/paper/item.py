@@ -11,7 +11,7 @@ from simtest.seeds import from_integer
 from simtest.spec import camera_table
 from simtest.spec.paper import PaperSetting
 from simtest.validation.gallery import MAP_SIDE, drawn, write_item
-from simtest.validation.paper.pipeline import Stages
+from simtest.validation.paper.pipeline import Stages, frame_noise
 from simtest.validation.paper.protocol import Box, brightest_point, plane_from_image, texture, window_centre
 from simtest.validation.paper.rows import SURFACE, pipeline_with
 
@@ -46,7 +46,7 @@ def save_realisation(
     """
     pipeline = pipeline_with(setting, estimators)
     stages = pipeline.stages(from_integer(seed))
-    patch = pipeline.cut(stages.smoothed)
+    patch = pipeline.cut(stages.smoothed, frame_noise(stages.noisy))
     camera = setting.camera
     spot = _on_plane(setting, _bp(setting, stages))
     peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()

@@ -89,6 +89,7 @@ def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[s
         "isovalue": [t[0] if len(t) == 1 else None for t in isovalues],
         "isovalues": [",".join(f"{value:g}" for value in t) or None for t in isovalues],
         "axis_ratio": [e.axis_ratio for e in ok],
+        "choice_margin": [e.choice_margin for e in ok],
     }
     columns |= {f"normal_{axis}": [float(e.normal[i]) for e in ok] for i, axis in enumerate("xyz")}
     status = ["ok" if isinstance(r, Estimate) else str(r.reason) for r in results]
