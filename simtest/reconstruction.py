@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, CorrectedFrame
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region, detect, estimate_noise
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
@@ -101,7 +101,9 @@ def reconstruct(
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
         regions = detect(smoothed, noise, isolated, seen)
+        peaks = [(r.peak[0] + PIXEL_CENTRE, r.peak[1] + PIXEL_CENTRE) for r in regions]
         found = [(r, cut(r.box, r.peak)) for r in regions]
+        found = [(r, _beside(patch, (*peaks[:i], *peaks[i + 1 :]))) for i, (r, patch) in enumerate(found)]
     return [
         Specularity(
             region,
@@ -113,6 +115,10 @@ def reconstruct(
         )
         for region, patch in found
     ]
+
+
+def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:
+    return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
 
 
 def _noise(corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float) -> float | Image:

@@ -23,7 +23,7 @@ CLEAR_MARGIN = 3.0
 
 AMBIGUOUS_MARGIN = 2.0
 
-MIN_SEPARATION = 0.5
+MIN_SEPARATION = 0.35
 """A circle's peak lies at one centre, not half-way: less of the centres' distance between the gaps is no choice."""
 
 
@@ -55,7 +55,7 @@ class _Choice:
     def is_degenerate(self) -> Mask:
         """Whether the peak is at neither centre, or the centres are too near to each other to tell."""
         return np.asarray(
-            (np.abs(self.lead) < MIN_SEPARATION * self.apart) | (self.apart < AMBIGUOUS_MARGIN * self.deviation)
+            (np.abs(self.lead) < MIN_SEPARATION * self.apart) | (self.apart < CLEAR_MARGIN * self.deviation)
         )
 
 

@@ -1,20 +1,12 @@
 """Which of several lights made a highlight: told by where the others' highlights are beside it."""
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Known
-from simtest.conventions import PIXEL_CENTRE
 from simtest.estimators.spot import Spot
 
 Array = npt.NDArray[np.float64]
-
-OTHER_PEAK = 0.3
-"""Another highlight's peak stands at least this high, as a share of the patch's."""
-
-VALLEY = 0.9
-"""Between two highlights the intensity falls below this share of the lower peak."""
 
 LARGEST_MISFIT = 0.25
 """Of the offsets that the mirror geometry predicts, as a share of their length."""
@@ -33,7 +25,7 @@ def light_of_highlight(spot: Spot, known: Known) -> int | None:
     Parameters
     ----------
     spot : Spot
-        The highlight; other peaks are sought in its patch.
+        The highlight; its patch names the frame's others, of which the nearest are taken, one a light.
     known : Known
         Its lights are used.
 
@@ -44,7 +36,7 @@ def light_of_highlight(spot: Spot, known: Known) -> int | None:
     """
     if len(known.lights_mm) == 1:
         return 0
-    others = _other_peaks(spot)
+    others = _other_peaks(spot)[: len(known.lights_mm) - 1]
     values, vectors = np.linalg.eigh(spot.moments)
     if not len(others) or values[0] <= 0:
         return None
@@ -87,22 +79,7 @@ def _misfit(seen: Array, offsets: Array) -> float:
 
 
 def _other_peaks(spot: Spot) -> Array:
-    """Give where other highlights' peaks in the patch lie from the own one, tangents in the basis, shape (K, 2)."""
-    patch = spot.patch
-    values = np.asarray(patch.values, dtype=np.float32)
-    box = np.argwhere(patch.inside(spot.isophotes[-1].isovalue))
-    reach = max(3, int(np.ptp(box, axis=0).min()) // 4)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    high = (values >= cv2.dilate(values, kernel)) & (values > OTHER_PEAK * patch.peak_value)
-    # The patch's border may cut a highlight anywhere but at its peak.
-    high[[0, -1]] = high[:, [0, -1]] = False
-    column, row = patch.peak_pixel
-    found = []
-    for other_row, other_column in np.argwhere(high):
-        line = np.linspace([row, column], [other_row, other_column], 64).round().astype(int)
-        if values[line[:, 0], line[:, 1]].min() < VALLEY * values[other_row, other_column]:
-            found.append((other_column, other_row))
-    if not found:
-        return np.empty((0, 2))
-    pixels = np.array(found) + PIXEL_CENTRE + patch.origin_px
-    return np.asarray(spot.tangents(pixels) - spot.tangents(patch.peak_px[None]))
+    """Give where the nearest other highlights lie from the own one, tangents in the basis, shape (K, 2)."""
+    others = np.array(spot.patch.others_px).reshape(-1, 2)
+    gaps = np.linalg.norm(others - spot.patch.peak_px, axis=1)
+    return np.asarray(spot.tangents(others[np.argsort(gaps, kind="stable")]) - spot.tangents(spot.patch.peak_px[None]))

@@ -75,6 +75,8 @@ class Patch:
         Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
     smoothing_px : float
         Standard deviation of the Gaussian that the frame was smoothed with, px.
+    others_px : tuple of tuple of float
+        Peaks of the frame's other specularities, px.
     """
 
     values: Image | Array
@@ -86,6 +88,7 @@ class Patch:
     seen: Mask | None = None
     noise: float | Image | None = None
     smoothing_px: float = 0.0
+    others_px: tuple[tuple[float, float], ...] = ()
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod

@@ -30,7 +30,7 @@ KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
 
-NOISE_SIDE_PX = 64
+NOISE_SIDE_PX = 48
 """Side of the square that the noise is estimated in."""
 
 
