@@ -164,7 +164,7 @@ class Spot:
         noise = self.patch.noise
         if noise is None:
             return None
-        height, width = self.patch.values.shape
+        width = self.patch.values.shape[1]
         column, row = self.patch.peak_pixel
         # The levels move with the top that was fitted, and against the peak's pixel.
         step = 1e-4
@@ -180,11 +180,11 @@ class Spot:
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
         pixels += [self._top.pixels, np.array([row * width + column])]
         flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
-        weights = [np.bincount(flat, each, height * width).astype(float) for each in np.concatenate(moves, axis=1)]
+        images, box = _images(flat, np.concatenate(moves, axis=1), width)
         margin = int(np.ceil(KERNEL_SIGMAS * self.patch.smoothing_px))
-        images = [_transposed_smoothing(w.reshape(height, width), self.patch.smoothing_px, margin) for w in weights]
-        level = np.pad(noise, margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-        raw = np.stack([(image * level).ravel() for image in images])
+        level = np.pad(noise[box], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
+        smoothed = [_transposed_smoothing(image, self.patch.smoothing_px, margin) * level for image in images]
+        raw = np.stack(smoothed).reshape(len(smoothed), -1)
         return np.asarray(raw @ raw.T)
 
     @property
@@ -269,6 +269,15 @@ _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 def _to_peak(levels: Array) -> Array:
     """Give the weights of values at some levels in the value at level 0 of the straight line through them."""
     return np.asarray(np.linalg.pinv(np.stack([np.ones_like(levels), levels], axis=1))[0])
+
+
+def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:
+    """Sum weights, shape (7, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
+    rows, columns = np.divmod(flat, width)
+    top, left, high, wide = rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1
+    place = (rows - top) * wide + columns - left
+    images = np.array([np.bincount(place, each, high * wide).reshape(high, wide) for each in moves], dtype=float)
+    return images, (slice(top, top + high), slice(left, left + wide))
 
 
 def _transposed_smoothing(image: Array, sigma_px: float, margin: int) -> Array:
