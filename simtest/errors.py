@@ -32,6 +32,8 @@ class Reason(StrEnum):
     DEGENERATE_CONIC = "degenerate_conic"
     NOT_FINITE = "not_finite"
     NOT_CONVERGED = "not_converged"
+    STREAK = "streak"
+    NOT_KNOWN = "not_known"
     ESTIMATOR_ERROR = "estimator_error"
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from simtest import provenance
 from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, InputError
-from simtest.estimators.base import drawable
+from simtest.estimators.base import EstimatedCurvature, drawable
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction import DEFAULT_ESTIMATORS, Specularity, reconstruct
@@ -166,6 +166,7 @@ def describe(index: int, specularity: Specularity, camera: Camera) -> dict[str, 
             "axis_ratio": result.axis_ratio,
             "isovalues": [isophote.isovalue for isophote in result.isophotes],
             "covariance": None if result.covariance is None else result.covariance.tolist(),
+            "curvature": None if result.curvature is None else _curvature_entry(result.curvature),
             "flags": list(result.flags),
             "isophotes": [
                 {"t": t, "points": np.round(points, 3).tolist()} for t, points in result.contours(specularity.patch)
@@ -176,6 +177,14 @@ def describe(index: int, specularity: Specularity, camera: Camera) -> dict[str, 
         }
     peak = None if isinstance(specularity.patch, Failure) else specularity.patch.peak_px.tolist()
     return {"id": index, "box_px": list(specularity.region.box), "peak_px": peak, "estimates": results}
+
+
+def _curvature_entry(curvature: EstimatedCurvature) -> dict[str, Any]:
+    return {
+        "directions": curvature.directions.tolist(),
+        "axis_ratio": curvature.axis_ratio,
+        "gains": None if curvature.hypotheses is None else curvature.hypotheses.tolist(),
+    }
 
 
 def _write(out: Path, document: dict[str, Any], picture: npt.NDArray[np.float32], camera: Camera) -> list[Path]:

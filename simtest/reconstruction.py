@@ -4,13 +4,13 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, CorrectedFrame
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
@@ -95,27 +95,38 @@ def reconstruct(
     roi = None if roi is None else _check_roi(roi)
     chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
     seen = view.seen
-    masks: dict[str, Any] = {"saturated": corrected.saturated, "seen": seen, "raw": corrected.intensity}
     smoothed = smooth(corrected.intensity, smoothing_px, seen)
+    noise = _noise(corrected, calibration, smoothing_px)
+    cut = partial(
+        Patch.cut, smoothed, saturated=corrected.saturated, seen=seen, raw=corrected.intensity, noise=noise,
+        smoothing_px=smoothing_px,
+    )  # fmt: skip
     if roi is not None:
-        patch = Patch.cut(smoothed, roi, **masks)
+        patch = cut(roi)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
         found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
     else:
-        noise = _noise(corrected, calibration, smoothing_px)
-        regions = detect(smoothed, noise, isolated, seen)
-        found = [(region, Patch.cut(smoothed, region.box, region.peak, **masks)) for region in regions]
+        found = [(r, cut(r.box, r.peak)) for r in detect(smoothed, noise, isolated, seen)]
         if isolated:
             left, flat = _noise_left(smoothing_px), flat_pixels(image)
             found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
+        peaks = [(r.peak[0] + PIXEL_CENTRE, r.peak[1] + PIXEL_CENTRE) for r, _ in found]
+        found = [(r, _beside(patch, (*peaks[:i], *peaks[i + 1 :]))) for i, (r, patch) in enumerate(found)]
     return [
         Specularity(
             region,
             patch,
-            {name: _flagged(run(made, patch, view), patch, corrected.limited) for name, made in chosen.items()},
+            {
+                name: _flagged(run(made, patch, view, calibration.known), patch, corrected.limited)
+                for name, made in chosen.items()
+            },
         )
         for region, patch in found
     ]
+
+
+def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:
+    return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
 
 
 def _noise(corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float) -> float | Image:

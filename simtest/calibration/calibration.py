@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration.known import Known
 from simtest.calibration.noise import NoiseModel
 from simtest.calibration.response import Response
 from simtest.errors import InputError
@@ -66,6 +67,8 @@ class Calibration:
         What is known of the noise; white noise beyond it is estimated from each frame.
     saturation_level : float, optional
         Value, as encoded, at and above which a pixel is clipped; None: not known, no pixel counts as clipped.
+    known : Known
+        What is known of lights, distance and lobe: passed on to the estimators that ask for it.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class Calibration:
     emission: AngularProfile = field(default_factory=AngularProfile)
     noise: NoiseModel = field(default_factory=NoiseModel)
     saturation_level: float | None = None
+    known: Known = field(default_factory=Known)
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):

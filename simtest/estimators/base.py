@@ -56,6 +56,31 @@ class FittedIsophote:
 
 
 @dataclass(frozen=True)
+class EstimatedCurvature:
+    """The surface's curvature at a highlight.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (2, 3)
+        Principal directions, unit, camera frame: of the smaller and of the larger abs(1 + d k); of either sign.
+    axis_ratio : float
+        abs(1 + d k) of the first over that of the second, in (0, 1].
+    hypotheses : ndarray, shape (H, 2), optional
+        1 + d k along both directions: all that the data allow, the most plausible first; None where the lobe's width is
+        not known.
+    """
+
+    directions: Array
+    axis_ratio: float
+    hypotheses: Array | None = None
+
+    @property
+    def gains(self) -> Array | None:
+        """The most plausible 1 + d k along both directions, shape (2,)."""
+        return None if self.hypotheses is None else self.hypotheses[0]
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A reconstructed normal.
 
@@ -77,6 +102,8 @@ class Estimate:
         Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
     flags : tuple of str
         Warnings.
+    curvature : EstimatedCurvature, optional
+        What the estimator says of the surface's curvature.
     """
 
     normal: Array
@@ -87,6 +114,7 @@ class Estimate:
     choice_margin: float | None = None
     covariance: Array | None = None
     flags: tuple[str, ...] = field(default=())
+    curvature: EstimatedCurvature | None = None
 
     def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
         """Give the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
@@ -104,8 +132,11 @@ def drawable(curve: Array) -> list[list[float]]:
 BatchEstimator = Callable[[Sequence[Patch | Failure], Camera], list[Estimate | Failure]]
 """The same for several highlights seen by one camera; what is a Failure already stays one."""
 
-Estimator = Callable[[Patch, Camera], Estimate | Failure]
+Estimator = Callable[..., Estimate | Failure]
 """An estimator: a callable that takes the patch of a highlight and the camera.
+
+One that has a parameter `known` is also given what is known beside the picture, as `simtest.calibration.Known`, by that
+name.
 
 Other packages register theirs under the entry-point group ``simtest.estimators``.
 """

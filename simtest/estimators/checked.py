@@ -1,7 +1,10 @@
 """Running an estimator, of this package or another, so that whatever it does is an `Estimate` or a `Failure`."""
 
+import inspect
+
 import numpy as np
 
+from simtest.calibration import Known
 from simtest.errors import Failure, Reason
 from simtest.estimators.base import BatchEstimator, Estimate, Estimator
 from simtest.geometry import Camera, Patch
@@ -9,7 +12,12 @@ from simtest.geometry import Camera, Patch
 UNIT_TOLERANCE = 1e-6
 
 
-def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimate | Failure:
+NOTHING_KNOWN = Known()
+
+
+def run(
+    estimator: Estimator, patch: Patch | Failure, camera: Camera, known: Known = NOTHING_KNOWN
+) -> Estimate | Failure:
     """Run an estimator on a patch.
 
     Parameters
@@ -20,6 +28,8 @@ def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimat
         A Failure is passed on.
     camera : Camera
         Calibration.
+    known : Known
+        Passed on to an estimator that has a parameter of that name.
 
     Returns
     -------
@@ -30,7 +40,7 @@ def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimat
     if isinstance(patch, Failure):
         return patch
     try:
-        result = estimator(patch, camera)
+        result = estimator(patch, camera, known=known) if _asks(estimator) else estimator(patch, camera)
         if isinstance(result, Failure):
             return result
         if not isinstance(result, Estimate):
@@ -40,9 +50,17 @@ def run(estimator: Estimator, patch: Patch | Failure, camera: Camera) -> Estimat
         return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
 
 
-def one_by_one(estimator: Estimator) -> BatchEstimator:
+def one_by_one(estimator: Estimator, known: Known = NOTHING_KNOWN) -> BatchEstimator:
     """Give an estimator that takes several patches, each run as by `run`."""
-    return lambda patches, camera: [run(estimator, patch, camera) for patch in patches]
+    return lambda patches, camera: [run(estimator, patch, camera, known) for patch in patches]
+
+
+def _asks(estimator: Estimator) -> bool:
+    """Tell whether an estimator has a parameter `known`; one whose parameters cannot be told has none."""
+    try:
+        return "known" in inspect.signature(estimator).parameters
+    except (TypeError, ValueError):
+        return False
 
 
 def _problem(estimate: Estimate, patch: Patch, camera: Camera) -> Failure | None:

@@ -1,21 +1,70 @@
 """`circle_pose`: the published reconstruction [MB, section 2.3], one isovalue."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators.base import Estimate, FittedIsophote, fit_isophote_of_each
-from simtest.geometry import Camera, Patch
+from simtest.geometry import Camera, CirclePoses, Patch
 from simtest.geometry import circle_poses as poses_of_cones
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+POOLED_ISOVALUES = (0.1, 0.2, 0.3)
+"""Low ones: the circles' projected centres part with the square of the isophote's size."""
+
+CLEAR_MARGIN = 3.0
+"""Where the isovalue's own choice is as clear as this, in standard deviations, others are not asked."""
+
+AMBIGUOUS_MARGIN = 2.0
+
+MIN_SEPARATION = 0.35
+"""A circle's peak lies at one centre, not half-way: less of the centres' distance between the gaps is no choice."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Which candidate each of N highlights prefers.
+
+    Parameters
+    ----------
+    lead : ndarray, shape (N,)
+        How much nearer to the peak N+'s projected centre is than N-'s, px.
+    apart : ndarray, shape (N,)
+        Distance of the two centres, px.
+    deviation : ndarray, shape (N,)
+        Standard deviation of the lead, px; NaN where the noise is not known.
+    """
+
+    lead: Array
+    apart: Array
+    deviation: Array
+
+    @property
+    def margin(self) -> Array:
+        """How clear the choice is, in standard deviations; NaN where the noise is not known."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self.deviation > 0, np.abs(self.lead) / self.deviation, np.nan))
+
+    @property
+    def is_degenerate(self) -> Mask:
+        """Whether the peak is at neither centre, or the centres are too near to each other to tell."""
+        return np.asarray(
+            (np.abs(self.lead) < MIN_SEPARATION * self.apart) | (self.apart < CLEAR_MARGIN * self.deviation)
+        )
 
 
 def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOVALUE) -> Estimate | Failure:
     """Reconstruct the normal of a plane from one isophote taken as the image of a circle.
 
     The article leaves the choice between N+ and N- to a person. Both make the same angle with the cone's axis, so
-    the one is proposed whose projected circle centre (along C'^-1 N) is nearer to the sub-pixel peak.
+    the one is proposed whose projected circle centre (along C'^-1 N) is nearer to the sub-pixel peak. Where that is not
+    clear at the isovalue, lower ones are asked as well; the pose stays that of the isovalue.
 
     Parameters
     ----------
@@ -29,7 +78,10 @@ def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOV
     Returns
     -------
     Estimate or Failure
-        Two candidates; it looks at the projected circle centre.
+        Two candidates; it looks at the projected circle centre. `choice_margin` is the difference of the two distances
+        over its standard deviation, where the noise is known. Flags: ``ambiguous`` where that is below 2,
+        ``near_degenerate`` where the peak is nearer to the middle than to either centre, or noise hides the centres'
+        distance: as a rule the light is at the camera, and the two-fold model does not apply.
     """
     return circle_poses([patch], camera, isovalue)[0]
 
@@ -51,15 +103,89 @@ def circle_poses(
 def _pose(fitted: Sequence[tuple[Patch, FittedIsophote]], camera: Camera) -> list[Estimate | Failure]:
     if not fitted:
         return []
-    poses = poses_of_cones(
-        np.array([isophote.cone for _, isophote in fitted]), np.array([isophote.sightline for _, isophote in fitted])
-    )
+    poses = _poses([isophote for _, isophote in fitted])
     looks = camera.project(poses.centres)
-    gaps = np.linalg.norm(looks - np.array([patch.peak_px for patch, _ in fitted])[:, None], axis=2)
-    order = np.argsort(gaps, axis=1, kind="stable")[:, :, None]
-    normals, looks = np.take_along_axis(poses.normals, order, axis=1), np.take_along_axis(looks, order, axis=1)
-    return [
-        poses.failures.get(i)
-        or Estimate(normals[i, 0], normals[i], looks[i, 0], float(poses.axis_ratios[i]), isophotes=(isophote,))
-        for i, (_, isophote) in enumerate(fitted)
-    ]
+    patches = [patch for patch, _ in fitted]
+    noise = _peak_deviation(patches, [isophote for _, isophote in fitted], poses, camera)
+    choice = _choose(patches, looks, noise)
+    choice = _pooled(choice, patches, poses, camera, noise)
+    order = np.where(choice.lead >= 0, 0, 1)[:, None] ^ np.array([[0, 1]])
+    normals = np.take_along_axis(poses.normals, order[:, :, None], axis=1)
+    looks = np.take_along_axis(looks, order[:, :, None], axis=1)
+    margins, degenerate = choice.margin, choice.is_degenerate
+    made: list[Estimate | Failure] = []
+    for i, (_, isophote) in enumerate(fitted):
+        margin = float(margins[i]) if np.isfinite(margins[i]) else None
+        flags = ("ambiguous",) if margin is not None and margin < AMBIGUOUS_MARGIN else ()
+        estimate = Estimate(
+            normals[i, 0], normals[i], looks[i, 0], float(poses.axis_ratios[i]), (isophote,), margin,
+            flags=(*flags, "near_degenerate") if degenerate[i] else flags,
+        )  # fmt: skip
+        made.append(poses.failures.get(i) or estimate)
+    return made
+
+
+def _poses(isophotes: Sequence[FittedIsophote]) -> CirclePoses:
+    return poses_of_cones(np.array([i.cone for i in isophotes]), np.array([i.sightline for i in isophotes]))
+
+
+def _choose(patches: Sequence[Patch], looks: Array, deviation: Array) -> _Choice:
+    """Compare the distances of the projected centres, shape (N, 2, 2), px, from the peaks."""
+    gaps = np.linalg.norm(looks - np.array([patch.peak_px for patch in patches])[:, None], axis=2)
+    apart = np.linalg.norm(looks[:, 0] - looks[:, 1], axis=1)
+    return _Choice(gaps[:, 1] - gaps[:, 0], apart, deviation)
+
+
+def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camera: Camera, deviation: Array) -> _Choice:
+    """Ask lower isovalues where the choice is not clear; their leads are averaged, as their noise is the peak's."""
+    asked = np.flatnonzero(~(choice.margin >= CLEAR_MARGIN))
+    if not len(asked):
+        return choice
+    lead, apart, count = choice.lead.copy(), choice.apart.copy(), np.ones(len(patches))
+    for isovalue in POOLED_ISOVALUES:
+        fitted = fit_isophote_of_each([patches[i] for i in asked.tolist()], camera, isovalue)
+        sound = [(i, found) for i, found in zip(asked.tolist(), fitted, strict=True) if not isinstance(found, Failure)]
+        if not sound:
+            continue
+        own = _poses([found for _, found in sound])
+        here = np.array([i for i, _ in sound])
+        # The candidate that continues N+ is the nearer one of the two.
+        nearness = np.einsum("nkj,nj->nk", own.normals, poses.normals[here, 0])
+        order = np.where(nearness[:, 0] >= nearness[:, 1], 0, 1)[:, None] ^ np.array([[0, 1]])
+        looks = np.take_along_axis(camera.project(own.centres), order[:, :, None], axis=1)
+        lower = _choose([patches[i] for i in here.tolist()], looks, deviation[here])
+        usable = np.isfinite(lower.lead) & np.array([k not in own.failures for k in range(len(here))])
+        here = here[usable]
+        lead[here] += lower.lead[usable]
+        apart[here] += lower.apart[usable]
+        count[here] += 1
+    return _Choice(lead / count, apart / count, deviation)
+
+
+def _peak_deviation(
+    patches: Sequence[Patch], isophotes: Sequence[FittedIsophote], poses: CirclePoses, camera: Camera
+) -> Array:
+    """Give the standard deviation of the lead, px, shape (N,): twice that of the peak along the line of the centres.
+
+    The slope of noise sigma that was smoothed by s has the variance sigma^2 / (8 pi s^4); over the lobe's second
+    derivative at its peak, I0 (-2 ln t) / r^2, r the isophote's radius along the line, it is the peak's shift.
+    """
+    known = np.array([p.noise if isinstance(p.noise, float) else _at_peak(p) for p in patches])
+    smoothing = np.array([max(p.smoothing_px, LEAST_SMOOTHING_PX) for p in patches])
+    height = np.array([p.peak_value for p in patches])
+    level = -2 * np.log([isophote.isovalue for isophote in isophotes])
+    ends = camera.project(np.stack([poses.axes + poses.narrow, poses.axes - poses.narrow]))
+    radius = np.linalg.norm(ends[0] - ends[1], axis=1) / 2
+    return np.asarray(2 * known / (np.sqrt(8 * np.pi) * smoothing**2) * radius**2 / (height * level))
+
+
+LEAST_SMOOTHING_PX = 0.5
+"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
+
+
+def _at_peak(patch: Patch) -> float:
+    """Give the noise at a patch's peak; NaN where it is not known."""
+    if patch.noise is None:
+        return float("nan")
+    column, row = patch.peak_pixel
+    return float(np.asarray(patch.noise)[row, column]) if isinstance(patch.noise, np.ndarray) else float(patch.noise)

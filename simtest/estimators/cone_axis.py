@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.base import Estimate, fit_isophotes
+from simtest.estimators.base import Estimate
+from simtest.estimators.flags import spot_flags
+from simtest.estimators.spot import fit_spot
 from simtest.geometry import Camera, Patch
-
-MIN_ISOPHOTES = 2
-"""One isophote alone may be an accident of the background."""
 
 
 def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AXIS_ISOVALUES) -> Estimate | Failure:
@@ -29,25 +26,18 @@ def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AX
     -------
     Estimate or Failure
         One candidate; it looks along the axis. Isovalues without a closed isophote are left out and flagged
-        ``missing_isovalues``; with fewer than 2 left it fails for the first one's reason.
+        ``missing_isovalues``; with fewer than 2 left it fails for the first one's reason. The covariance is that of
+        the noise, and of the axis' drift with the isovalue where that is more than noise.
     """
-    fitted, failures = fit_isophotes(patch, camera, isovalues)
-    poses = []
-    for isophote in fitted:
-        pose = isophote.pose()
-        if isinstance(pose, Failure):
-            failures.append(pose)
-        else:
-            poses.append(pose)
-    if len(poses) < min(MIN_ISOPHOTES, len(isovalues)):
-        return failures[0]
-    axis = np.mean([pose.axis for pose in poses], axis=0)
-    axis /= np.linalg.norm(axis)
+    spot = fit_spot(patch, camera, isovalues)
+    if isinstance(spot, Failure):
+        return spot
     return Estimate(
-        normal=-axis,
-        candidates=-axis[None],
-        look_px=camera.project(axis),
-        axis_ratio=float(np.mean([pose.axis_ratio for pose in poses])),
-        isophotes=tuple(fitted),
-        flags=("missing_isovalues",) if failures else (),
+        normal=-spot.axis,
+        candidates=-spot.axis[None],
+        look_px=camera.project(spot.axis),
+        axis_ratio=spot.axis_ratio,
+        isophotes=spot.isophotes,
+        covariance=spot.axis_covariance,
+        flags=spot_flags(spot),
     )

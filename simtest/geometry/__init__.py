@@ -1,7 +1,7 @@
 """NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
 
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.circle_pose import CirclePose, circle_pose, circle_poses, cone_axes
+from simtest.geometry.circle_pose import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
 from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
@@ -11,6 +11,7 @@ __all__ = [
     "BrownConrady",
     "Camera",
     "CirclePose",
+    "CirclePoses",
     "Distortion",
     "Ellipse",
     "FittedConic",

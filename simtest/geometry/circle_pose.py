@@ -46,6 +46,8 @@ class CirclePoses:
     centres : ndarray, shape (N, 2, 3)
     failures : mapping
         Failure by the cone's number; the other entries of such a cone mean nothing.
+    narrow : ndarray, shape (N, 3)
+        Unit e1, times the tangent of the half-angle along it: the narrower one, along which the centres lie.
     """
 
     normals: Array
@@ -53,6 +55,7 @@ class CirclePoses:
     axis_ratios: Array
     centres: Array
     failures: Mapping[int, Failure]
+    narrow: Array
 
     def __len__(self) -> int:
         return len(self.normals)
@@ -141,7 +144,8 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
     normals = _pair(e1 * g[:, None], e3 * h[:, None])
     # C'^-1 N in the eigenbasis; the centre lies in front of the camera, on the axis' side.
     centres = _pair(e1 * (g / l1)[:, None], e3 * (h / l3)[:, None])
-    return CirclePoses(normals, e3, np.sqrt(l2 / l1), centres, failures)
+    narrow = e1 * np.sqrt(-l3 / l1)[:, None]
+    return CirclePoses(normals, e3, np.sqrt(l2 / l1), centres, failures, narrow)
 
 
 _ROUND = np.diag([1.0, 1.0, -1.0])

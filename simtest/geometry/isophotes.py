@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.level_sets import LevelSet, level_set_around
+from simtest.geometry.level_sets import LevelSet, Sensitivities, level_set_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -73,6 +73,12 @@ class Patch:
         The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
     raw : ndarray, shape (h, w), optional
         Intensities before smoothing, whose noise is independent from pixel to pixel.
+    noise : float, or ndarray of float32, shape (h, w), optional
+        Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
+    smoothing_px : float
+        Standard deviation of the Gaussian that the frame was smoothed with, px.
+    others_px : tuple of tuple of float
+        Peaks of the frame's other specularities, px.
     """
 
     values: Image | Array
@@ -83,6 +89,9 @@ class Patch:
     saturated: Mask | None = None
     seen: Mask | None = None
     raw: Image | Array | None = None
+    noise: float | Image | None = None
+    smoothing_px: float = 0.0
+    others_px: tuple[tuple[float, float], ...] = ()
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
@@ -95,6 +104,8 @@ class Patch:
         saturated: Mask | None = None,
         seen: Mask | None = None,
         raw: Image | Array | None = None,
+        noise: float | Image | None = None,
+        smoothing_px: float = 0.0,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame.
 
@@ -114,6 +125,10 @@ class Patch:
             The frame's pixels inside the camera's view mask; default all.
         raw : ndarray, shape (H, W), optional
             The frame before smoothing.
+        noise : float, or ndarray of float32, shape (H, W), optional
+            Standard deviation of the frame's noise before smoothing; None: not known.
+        smoothing_px : float
+            Standard deviation of the Gaussian that it was smoothed with, px.
 
         Returns
         -------
@@ -155,9 +170,10 @@ class Patch:
         value = float(values[row, column])
         if value <= 0 or value <= lowest:
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
-        return cls(
-            values, corner, place + PIXEL_CENTRE + corner, value, (int(column), int(row)), clipped, seen, unsmoothed
-        )
+        if isinstance(noise, np.ndarray):
+            noise = noise[y : y + height, x : x + width]
+        pixel, place = (int(column), int(row)), place + PIXEL_CENTRE + corner
+        return cls(values, corner, place, value, pixel, clipped, seen, unsmoothed, noise, smoothing_px)
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
@@ -182,6 +198,11 @@ class Patch:
         """
         found = self._level_set(isovalue)
         return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
+
+    def sensitivities(self, isovalue: float) -> Sensitivities | Failure:
+        """Tell how the points of `crossings` move with the patch's values, in the same order."""
+        found = self._level_set(isovalue)
+        return found if isinstance(found, Failure) else found.sensitivities()
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.

@@ -146,6 +146,8 @@ class TrueHighlight:
         Whether the light reaches the point.
     radiance : float
         Radiance at the nearest pixel.
+    direction_min : ndarray, shape (3,), optional
+        Unit principal direction of the smaller curvature, camera frame.
     """
 
     light: int
@@ -157,6 +159,7 @@ class TrueHighlight:
     kd_max: float
     lit: bool
     radiance: float
+    direction_min: Array | None = None
 
     @property
     def min_gain(self) -> float:

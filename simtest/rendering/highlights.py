@@ -176,6 +176,7 @@ def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int)
             kd_max=float(points.distance[i] * points.k_max[i]),
             lit=bool(lit[i]),
             radiance=float(total[rows[i], columns[i]]),
+            direction_min=points.direction_min[i],
         )
         for i in np.flatnonzero(points.valid)
     ]

@@ -5,10 +5,12 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.calibration import Calibration, Known, NoiseModel, Response
 from simtest.spec.camera import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.profile import CosineProfile, Profile
+from simtest.spec.quantities import Coordinate, Millimetres
 from simtest.spec.reading import Spec, read_toml, validate
+from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
 
 
@@ -28,6 +30,30 @@ class SensorCalibration(Spec):
         return self
 
 
+class RigCalibration(Spec):
+    """What is known of the lights and of the working distance."""
+
+    lights_mm: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(
+        (), max_length=32, description="places of the lights, camera frame, mm; default not known"
+    )
+    distance_mm: Millimetres | None = Field(
+        None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
+    )
+    distance_sd_mm: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the true distance, mm")
+
+    @model_validator(mode="after")
+    def _about_a_distance(self) -> "RigCalibration":
+        if self.distance_sd_mm > 0 and self.distance_mm is None:
+            raise ValueError(f"distance_sd_mm = {self.distance_sd_mm:g}: needs distance_mm")
+        return self
+
+
+class SurfaceCalibration(Spec):
+    """What is known of the surface's lobe."""
+
+    phong_exponent: float | None = Field(None, gt=0, le=1e5, description="roughness exponent n; default not known")
+
+
 class CalibrationSpec(Spec):
     """A calibration file; all tables but the camera may be left out."""
 
@@ -40,6 +66,14 @@ class CalibrationSpec(Spec):
         CosineProfile(), description="of a light at the camera, shining along the optical axis, over the same angle"
     )
     sensor: SensorCalibration = SensorCalibration()
+    rig: RigCalibration = RigCalibration()
+    surface: SurfaceCalibration = SurfaceCalibration()
+
+    def known(self) -> Known:
+        """Give what estimators are told of lights, distance and lobe."""
+        exponent = self.surface.phong_exponent
+        lobe = None if exponent is None else PhongReflectance(exponent=exponent).lobe_curvature
+        return Known(self.rig.lights_mm, self.rig.distance_mm, self.rig.distance_sd_mm, lobe)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -72,4 +106,5 @@ def load_calibration(path: str | Path) -> Calibration:
     response = spec.response.model() if spec.response is not None else None
     sensor = spec.sensor
     noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
-    return Calibration(camera, response, spec.vignetting.model(), spec.emission.model(), noise, sensor.saturation_level)
+    falloff = (spec.vignetting.model(), spec.emission.model())
+    return Calibration(camera, response, *falloff, noise, sensor.saturation_level, spec.known())

@@ -17,7 +17,7 @@ from simtest.spec.writing import toml_tables, toml_value
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor"})
+NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface"})
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration` reads them."""
 
 OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")

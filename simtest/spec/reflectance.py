@@ -38,6 +38,11 @@ class PhongReflectance(_Reflectance):
             )
         return self
 
+    @property
+    def lobe_curvature(self) -> float:
+        """Curvature -(log f)''(0) of the lobe: 4 n as published, one more with the cosine of the normalised form."""
+        return 4 * self.exponent + (1.0 if self.normalised else 0.0)
+
 
 class RoughPlasticReflectance(_Reflectance):
     """Mitsuba's rough plastic, GGX."""

@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.calibration import Calibration, Known, NoiseModel, Response
 from simtest.geometry.profile import AngularProfile
 from simtest.resources import find
 from simtest.spec.camera import CameraSpec
+from simtest.spec.quantities import Millimetres
 from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
 from simtest.spec.reflectance import PhongReflectance, Reflectance
 from simtest.spec.rig import Rig
@@ -25,6 +26,30 @@ class Effort(Spec):
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the samples")
 
 
+class KnownSpec(Spec):
+    """What estimators are told beside the picture and the camera's calibration."""
+
+    lights: bool = Field(True, description="whether they are told the lights' nominal places")
+    lobe: bool = Field(True, description="whether they are told the exponent of a Phong lobe")
+    distance_mm: Millimetres | None = Field(None, description="working distance that they are told, mm")
+    distance_error: float | None = Field(
+        None,
+        gt=-1,
+        le=10,
+        description="they are told the distance of the brightest true highlight, off by this share of it; "
+        "default not told",
+    )
+    distance_sd: float = Field(
+        0.0, ge=0, le=10, description="standard deviation that they are told, share of the told distance"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "KnownSpec":
+        if self.distance_mm is not None and self.distance_error is not None:
+            raise ValueError("distance_mm and distance_error exclude each other; give one of them")
+        return self
+
+
 class Scene(Spec):
     """Everything that determines a rendered frame."""
 
@@ -35,11 +60,18 @@ class Scene(Spec):
     camera: CameraSpec = CameraSpec()
     sensor: Sensor = Sensor()
     render: Effort = Effort()
+    known: KnownSpec = KnownSpec()
 
-    def calibration(self) -> Calibration:
-        """Give what reconstruction is told of the scene's camera, sensor and light.
+    def calibration(self, distance_mm: float | None = None) -> Calibration:
+        """Give what reconstruction is told of the scene's camera, sensor, light and surface.
 
-        See the keys ``sensor.*_known`` and ``rig.emission_known``. White noise is not told: each frame shows it.
+        See the keys ``sensor.*_known``, ``rig.emission_known`` and ``known``. White noise is not told: each frame shows
+        it.
+
+        Parameters
+        ----------
+        distance_mm : float, optional
+            True distance of the brightest highlight, mm, to which ``known.distance_error`` is relative.
         """
         sensor, emission = self.sensor, self.rig.known_emission()
         response = sensor.response.model() if sensor.response_known else Response()
@@ -50,6 +82,21 @@ class Scene(Spec):
             emission=emission.model() if emission else AngularProfile(),
             noise=NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response),
             saturation_level=1.0 if sensor.clips else None,
+            known=self._known(distance_mm),
+        )
+
+    def _known(self, distance_mm: float | None) -> Known:
+        told = self.known.distance_mm
+        if self.known.distance_error is not None and distance_mm is not None:
+            told = distance_mm * (1 + self.known.distance_error)
+        lobe = None
+        if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
+            lobe = self.reflectance.lobe_curvature
+        return Known(
+            tuple(light.place_mm for light in self.rig.lights) if self.known.lights else (),
+            told,
+            0.0 if told is None else told * self.known.distance_sd,
+            lobe,
         )
 
 

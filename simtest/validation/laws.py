@@ -169,3 +169,62 @@ def vignetting_shift(
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(across > 0, k * tangent / (across + k * tangent**2), np.nan)
         return np.asarray(shift / (1 - 2 * np.log(np.asarray(isovalue, float)) / across))
+
+
+def branch_point_error(ratio_error: npt.ArrayLike) -> Array:
+    """Give the tilt that circle pose makes of a small relative error of a round cone's axes (section 4): sqrt(2 delta).
+
+    Parameters
+    ----------
+    ratio_error : array_like
+        delta = 1 - b/a of a cone that should be right-circular.
+
+    Returns
+    -------
+    ndarray
+        Angle, rad.
+    """
+    return np.asarray(np.sqrt(2 * np.asarray(ratio_error, float)))
+
+
+def bisector_residual(position: npt.ArrayLike, light: npt.ArrayLike, distance_error: npt.ArrayLike) -> Array:
+    """Give the error of the bisector of light and camera where the distance is off (section 4).
+
+    Parameters
+    ----------
+    position : array_like, shape (..., 3)
+        Surface point in the camera frame, mm.
+    light : array_like, shape (..., 3)
+        Light in the camera frame, mm.
+    distance_error : array_like, shape (...)
+        Error of the distance, share of it, > -1.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Angle, rad: the difference of the angles between bisector and sightline, which all lie in one plane.
+    """
+    P = np.asarray(position, float)
+    moved = P * (1 + np.asarray(distance_error, float))[..., None]
+    return np.asarray(np.abs(bisector_angle(moved, light) - bisector_angle(P, light)))
+
+
+def look_error(miss: npt.ArrayLike, kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:
+    """Give what a miss in the image costs against the normal where the estimate looks (section 4): abs((I + d S) w).
+
+    Against the normal at the BP it costs abs(w).
+
+    Parameters
+    ----------
+    miss : array_like, shape (..., 2)
+        w along the principal directions of k_min and k_max, rad.
+    kd_min, kd_max : array_like, shape (...)
+        d times the principal curvatures.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Angle, rad.
+    """
+    w = np.asarray(miss, float)
+    return np.hypot((1 + np.asarray(kd_min, float)) * w[..., 0], (1 + np.asarray(kd_max, float)) * w[..., 1])

@@ -11,7 +11,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction import Specularity
-from simtest.rendering import Session
+from simtest.rendering import Session, TrueHighlight
 from simtest.rendering.frames import Array
 from simtest.spec.profile import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
@@ -33,11 +33,15 @@ SCHEMA: dict[str, pl.DataType] = {
     "mahalanobis2": pl.Float64(), "distance_mm": pl.Float64(), "kd_min": pl.Float64(), "kd_max": pl.Float64(),
     "eps_over_d": pl.Float64(), "noise_sigma": pl.Float64(), "peak_snr": pl.Float64(), "isovalue": pl.Float64(),
     "isovalues": pl.String(), "axis_ratio": pl.Float64(), "axis_ratio_law": pl.Float64(), "path_depth": pl.Int64(),
-    "n_lights": pl.Int64(), "saturated_share": pl.Float64(),
+    "n_lights": pl.Int64(), "saturated_share": pl.Float64(), "gain_1": pl.Float64(), "gain_2": pl.Float64(),
+    "gain_error": pl.Float64(), "gain_oracle_error": pl.Float64(), "direction_error_deg": pl.Float64(),
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
 
 MISSED = "missed"
+
+SAME_DEG = 1e-4
+"""Directions that differ by less are the same but for rounding."""
 
 EQUAL_KD = 1e-3
 """Principal curvatures times distance that differ by less are those of a plane or a sphere."""
@@ -161,6 +165,9 @@ def _result(
     row |= dict(zip(("normal_x", "normal_y", "normal_z"), result.normal.tolist(), strict=True))
     if result.covariance is not None:
         row |= {"cov_11": result.covariance[0, 0], "cov_12": result.covariance[0, 1], "cov_22": result.covariance[1, 1]}
+    gains = None if result.curvature is None else result.curvature.gains
+    if gains is not None:
+        row |= {"gain_1": float(gains[0]), "gain_2": float(gains[1])}
     return row if truth is None else row | _errors(context, result, truth)
 
 
@@ -175,7 +182,42 @@ def _errors(context: RowContext, estimate: Estimate, truth: JudgedHighlight) -> 
         "error_law_deg": law_deg(context.scene, estimate, truth),
         "rank_correct": int(to_truth.argmin()),
         "mahalanobis2": mahalanobis2(estimate, truth.highlight.normal),
+        **curvature_errors(estimate, truth.highlight),
     }
+
+
+def curvature_errors(estimate: Estimate, true: TrueHighlight) -> dict[str, float | None]:
+    """Give the errors of an estimate's curvature; None where it gives none.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Its `curvature` is judged.
+    true : TrueHighlight
+        The truth.
+
+    Returns
+    -------
+    dict
+        `gain_error`: the larger error of 1 + d k over its true value, of the proposed hypothesis; `gain_oracle_error`:
+        of the best one; `direction_error_deg`: angle between the estimated and the true direction of the smaller
+        abs(1 + d k), in [0, 90], None where the true ones are equal.
+    """
+    found = estimate.curvature
+    errors: dict[str, float | None] = dict.fromkeys(("gain_error", "gain_oracle_error", "direction_error_deg"))
+    if found is None:
+        return errors
+    gains = np.array([1 + true.kd_min, 1 + true.kd_max])
+    along_min_first = bool(abs(gains[0]) <= abs(gains[1]))
+    gains = gains if along_min_first else gains[::-1]
+    if found.hypotheses is not None and np.all(gains != 0):
+        off = np.abs(found.hypotheses / gains - 1).max(axis=1)
+        errors |= {"gain_error": float(off[0]), "gain_oracle_error": float(off.min())}
+    if true.direction_min is not None and abs(true.kd_max - true.kd_min) > EQUAL_KD:
+        first = true.direction_min if along_min_first else np.cross(true.normal, true.direction_min)
+        angle = float(angle_deg(found.directions[0], first))
+        errors["direction_error_deg"] = min(angle, 180 - angle)
+    return errors
 
 
 def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
@@ -191,7 +233,7 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
 
     With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
     vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
-    camera for those.
+    camera for those that take the reversed sightline for the normal.
     """
     highlight = truth.highlight
     light = scene.rig.true_mm()[highlight.light]
@@ -200,6 +242,8 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
         return None
     if len(estimate.candidates) == 1:
         if offset:
+            if not _reverses_sightline(scene, estimate):
+                return None
             return float(np.degrees(laws.bisector_angle(highlight.position, light)))
         return _vignetting_law_deg(scene, estimate, truth, power) if power > 0 else None
     if offset or power > 0 or len(estimate.isophotes) != 1:
@@ -223,6 +267,14 @@ def unknown_falloff(scene: Scene, light: int) -> float | None:
     return None if None in powers else float(sum(power for power in powers if power))
 
 
+def _reverses_sightline(scene: Scene, estimate: Estimate) -> bool:
+    """Tell whether the proposed normal is the reversed sightline that the estimate looks along."""
+    if not np.isfinite(estimate.look_px).all():
+        return False
+    sightline = scene.camera.model().unproject(estimate.look_px)
+    return bool(angle_deg(estimate.normal, -sightline) < SAME_DEG)
+
+
 def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight, power: float) -> float | None:
     """Give the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
     highlight = truth.highlight
@@ -235,13 +287,10 @@ def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight
 
 
 def lobe_curvature(scene: Scene) -> float:
-    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form.
-
-    4 n for Phong as published, one more with the cosine of the normalised form.
-    """
+    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form."""
     reflectance = scene.reflectance
     if isinstance(reflectance, PhongReflectance):
-        return 4 * reflectance.exponent + (1.0 if reflectance.normalised else 0.0)
+        return reflectance.lobe_curvature
     return 1e6
 
 

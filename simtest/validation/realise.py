@@ -109,7 +109,9 @@ def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> Vi
     full_scale = _full_scale(scene, mean, highlights, seen)
     # Noise is independent in each channel; estimators see the channels' mean.
     truths = judge(highlights, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
-    return View(scene, radiance, light, truths, full_scale, scene.calibration())
+    nearest = max((t.highlight for t in truths if t.highlight.lit), key=lambda h: h.radiance, default=None)
+    told = scene.calibration(None if nearest is None else nearest.distance)
+    return View(scene, radiance, light, truths, full_scale, told)
 
 
 def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], seen: Mask | None) -> float:

@@ -46,7 +46,7 @@ def save_realisation(
     """
     pipeline = pipeline_with(setting, estimators)
     stages = pipeline.stages(from_integer(seed))
-    patch = pipeline.cut(stages.smoothed, stages.noisy)
+    patch = pipeline.cut(stages)
     camera = setting.camera
     spot = _on_plane(setting, _bp(setting, stages))
     # Behind the imaging camera the BP is nowhere in the picture.

@@ -6,18 +6,12 @@ import numpy.typing as npt
 from simtest.errors import Failure
 from simtest.geometry.circle_pose import circle_pose
 from simtest.geometry.isocurves import isophote_radius
+from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.protocol import plane_from_image
 
 Array = npt.NDArray[np.float64]
-
-LINEAR_INTERPOLATION_PX2 = 1 / 6
-"""Variance that linear interpolation between two pixels adds along their axis, px^2, averaged over the place between.
-
-Between neighbours a distance 1 apart it overestimates I by f (1 - f) I'' / 2, on average I'' / 12, as a convolution of
-variance 1/6 would.
-"""
 
 MARGIN_WIDTHS = 2.0
 """The texture's window must go on for this many smoothing widths beyond the isophote for the law to hold."""

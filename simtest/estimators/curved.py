@@ -1,0 +1,129 @@
+"""`curved`: the isophotes' centre carries the normal, their shape the curvature (theory.md section 3)."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.calibration import Known
+from simtest.conventions import CONE_AXIS_ISOVALUES
+from simtest.errors import Failure, Reason
+from simtest.estimators.base import Estimate, EstimatedCurvature
+from simtest.estimators.flags import spot_flags
+from simtest.estimators.spot import Spot, fit_spot
+from simtest.geometry import Camera, Patch
+
+Array = npt.NDArray[np.float64]
+
+STREAK_GAIN = 0.1
+"""Below this abs(1 + d k), or this axis ratio where the lobe is not known, the spot is a streak."""
+
+NOTHING_KNOWN = Known()
+
+
+def curved(
+    patch: Patch,
+    camera: Camera,
+    known: Known = NOTHING_KNOWN,
+    isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
+) -> Estimate | Failure:
+    """Give normal and curvature of a surface lit from the camera's place.
+
+    The normal is the cones' mean axis as in `cone_axis`, followed to t -> 1 where the axis drifts by more than the
+    noise explains. The lobe's second moments at the peak, 1/H, give the rest: with m = 1 + d k and c the curvature of
+    the lobe, H = c m^2 + 2 m along each principal direction. Where c is not known, m is known up to scale, and the 2 m
+    of the falloff is neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
+
+    Parameters
+    ----------
+    patch : Patch
+        Region of interest.
+    camera : Camera
+        Calibration.
+    known : Known
+        Its `lobe_curvature` is used.
+    isovalues : sequence of float
+        Each t in (0, 1).
+
+    Returns
+    -------
+    Estimate or Failure
+        One candidate, with `curvature`. Fails as `cone_axis` does; with ``degenerate_conic`` where the moments at the
+        peak are not those of a lobe, and with ``streak`` where 1 + d k is near 0. Flags as of `cone_axis`, and
+        ``round`` where the principal directions are not told from noise.
+    """
+    spot = fit_spot(patch, camera, isovalues)
+    if isinstance(spot, Failure):
+        return spot
+    found = _curvature(spot, known.lobe_curvature)
+    if isinstance(found, Failure):
+        return found
+    curvature, is_round = found
+    axis, covariance = spot.axis, spot.axis_covariance
+    if spot.drift_is_real:
+        axis, covariance = spot.peak_axis, spot.peak_covariance
+    return Estimate(
+        normal=-axis,
+        candidates=-axis[None],
+        look_px=camera.project(axis),
+        axis_ratio=curvature.axis_ratio,
+        isophotes=spot.isophotes,
+        covariance=covariance,
+        flags=(*spot_flags(spot), "round") if is_round else spot_flags(spot),
+        curvature=curvature,
+    )
+
+
+def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
+    """Give the positive 1 + d k of H = c m^2 + 2 m; the negative one is -2/c less it."""
+    c = lobe_curvature
+    return np.asarray(stiffness / (1 + np.sqrt(1 + c * stiffness)))
+
+
+def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
+    """Give the curvature, and whether the spot is round within the noise."""
+    values, vectors = np.linalg.eigh(spot.moments)
+    if values[0] <= 0:
+        return Failure(Reason.DEGENERATE_CONIC, f"moments at the peak {values[0]:.3g}, {values[1]:.3g} rad^2")
+    shrunk, is_round = _without_noise(values, spot.covariance)
+    # The longer axis lies along the smaller gain.
+    stiffness = 1 / shrunk[::-1]
+    directions = vectors.T[::-1] @ spot.basis
+    if lobe is None:
+        ratio = float(np.sqrt(stiffness[0] / stiffness[1]))
+        hypotheses, smallest = None, ratio
+    else:
+        hypotheses = _hypotheses(stiffness, lobe)
+        smallest, larger = np.sort(np.abs(hypotheses[0]))
+        ratio = float(smallest / larger)
+    if smallest < STREAK_GAIN:
+        of = "axis ratio" if lobe is None else "abs(1 + d k)"
+        return Failure(Reason.STREAK, f"{of} {smallest:.3g}, below {STREAK_GAIN:g}")
+    return EstimatedCurvature(directions, ratio, hypotheses), is_round
+
+
+def _without_noise(values: Array, covariance: Array | None) -> tuple[Array, bool]:
+    """Take from the difference of two second moments what noise adds to it, on average; shape (2,), rising.
+
+    Noise splits equal eigenvalues: the squared difference of a round spot's moments has the mean of its variance.
+    """
+    if covariance is None:
+        return values, False
+    (aa, _, ac), (_, bb, _), (_, _, cc) = covariance[4:, 4:]
+    noise = float(aa + cc - 2 * ac + 4 * bb)
+    mean, difference = float(values.mean()), float(values[1] - values[0])
+    kept = max(difference - noise / difference, 0.0) if difference > 0 else 0.0
+    return np.array([mean - kept / 2, mean + kept / 2]), difference**2 < ROUND_SHARE * noise
+
+
+ROUND_SHARE = 3.0
+"""Squared difference of the moments over its noise: -ln 0.05, which 5 % of round spots exceed."""
+
+
+def _hypotheses(stiffness: Array, lobe: float) -> Array:
+    """List (1 + d k) along both directions for all signs, the least curved surface first, shape (4, 2)."""
+    positive = gain_of_stiffness(stiffness, lobe)
+    pairs = [(m, -2 / lobe - m) for m in positive]
+    listed = np.array(list(itertools.product(*pairs)))
+    return listed[np.argsort(np.sum((listed - 1) ** 2, axis=1), kind="stable")]

@@ -1,0 +1,67 @@
+"""The top of a lobe: its peak value from all pixels around the peak, not from the highest one alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.geometry import Patch
+
+Array = npt.NDArray[np.float64]
+
+TOP_ISOVALUE = 0.8
+"""Above it a glossy lobe is quadratic in the logarithm to a part in a thousand."""
+
+MIN_PIXELS = 12
+"""Twice the parabola's coefficients."""
+
+
+@dataclass(frozen=True)
+class Top:
+    """The peak value of a lobe and how it moves with the patch's pixels.
+
+    Parameters
+    ----------
+    value : float
+        Intensity.
+    pixels : ndarray of int, shape (N,)
+        Places in the flattened patch.
+    weights : ndarray, shape (N,)
+        Change of log(value) per unit of intensity of each.
+    """
+
+    value: float
+    pixels: npt.NDArray[np.intp]
+    weights: Array
+
+
+def fit_top(patch: Patch) -> Top:
+    """Fit a paraboloid to the logarithm of a patch above t = 0.8 and give its apex.
+
+    The peak's own pixel stands in where that region does not close, is small, is clipped, or is no dome.
+    """
+    column, row = patch.peak_pixel
+    own = np.array([row * patch.values.shape[1] + column])
+    fallback = Top(patch.peak_value, own, np.array([1 / patch.peak_value]))
+    inside = patch.inside(TOP_ISOVALUE)
+    pixels = np.flatnonzero(inside)
+    clipped = patch.saturated is not None and bool((patch.saturated & inside).any())
+    values = patch.values.ravel()[pixels].astype(float)
+    if clipped or len(pixels) < MIN_PIXELS or values.min() <= 0 or inside.all():
+        return fallback
+    rows, columns = np.divmod(pixels, patch.values.shape[1])
+    x, y = (columns - columns.mean()) / max(np.ptp(columns), 1), (rows - rows.mean()) / max(np.ptp(rows), 1)
+    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    normal = design.T @ design
+    if np.linalg.cond(normal) > 1e12:
+        return fallback
+    f, d, e, a, b, c = np.linalg.solve(normal, design.T @ np.log(values))
+    if not (a < 0 and 4 * a * c > b * b):
+        return fallback
+    u, v = np.linalg.solve(np.array([[2 * a, b], [b, 2 * c]]), [-d, -e])
+    apex = np.array([1.0, u, v, u * u, u * v, v * v])
+    value = float(np.exp(apex @ [f, d, e, a, b, c]))
+    if np.hypot(u, v) > 1:
+        return fallback
+    # At the apex the value does not move with the place.
+    return Top(value, pixels, design @ np.linalg.solve(normal, apex) / values)
