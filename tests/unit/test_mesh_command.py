@@ -137,16 +137,18 @@ def test_shipped_meshes_are_what_their_recipes_make(here, name, tmp_path):
 
 
 def test_a_segment_of_100_mm_takes_less_than_1_gb():
-    """In a child process, so that its own peak is measured; CPU time, since wall time is the machine's."""
+    """In a child process, so that its own peak is measured.
+
+    Not by getrusage, whose peak a child inherits from its parent. The time of generation is no test's business.
+    """
     code = (
-        "import resource\nfrom simtest.anatomy.generate import load_anatomy\nfrom simtest.anatomy.colon import build\n"
+        "from simtest.anatomy.generate import load_anatomy\nfrom simtest.anatomy.colon import build\n"
         "recipe = load_anatomy('colon', settings={'length_mm': 100.0})\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_utime\nfaces = len(build(recipe).mesh.faces)\n"
-        "after = resource.getrusage(resource.RUSAGE_SELF)\n"
-        "print(faces, after.ru_maxrss * 1024, after.ru_utime - before)"
+        "faces = len(build(recipe).mesh.faces)\n"
+        "peak = next(line for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
+        "print(faces, 1024 * int(peak.split()[1]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    faces, peak, seconds = map(float, done.stdout.split())
+    faces, peak = map(float, done.stdout.split())
     assert faces > 190_000
     assert peak < 1e9
-    assert seconds < 3.0
