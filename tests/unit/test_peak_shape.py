@@ -1,5 +1,6 @@
 """Which peaks of synthetic frames have the shape of a point highlight."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCE
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
+from simtest.picture import reconstruct_picture
 from simtest.reconstruction import reconstruct
 
 SIZE = 160
@@ -93,3 +95,12 @@ def test_only_isolated_highlights_are_asked_for_their_shape(false):
     frame = frame_of(false)
     assert reconstruct(frame, CAMERA) == []
     assert len(reconstruct(frame, CAMERA, isolated=False)) == 1
+
+
+def test_the_command_takes_every_peak_where_it_is_asked_to(tmp_path):
+    picture = tmp_path / "ridge.png"
+    cv2.imwrite(str(picture), np.rint(230 * frame_of(ridge) / frame_of(ridge).max()).astype(np.uint8))
+    for every, expected in ((False, 0), (True, 1)):
+        with pytest.warns(UserWarning, match="no calibration|no specularity"):
+            count, _ = reconstruct_picture(picture, tmp_path / "out", fov_deg=50.0, encoding="linear", every=every)
+        assert count == expected
