@@ -31,7 +31,7 @@ def near_miss(x, y):
 
 def ridge(x, y):
     """A Gaussian bent into an arc."""
-    return gaussian(x, y - x**2 / 60)
+    return gaussian(x, y - x**2 / 45)
 
 
 def shape_of(frame, noise=0.0):
@@ -78,7 +78,7 @@ def test_a_clipped_peak_is_not_taken_for_a_flat_one(level):
 
 @pytest.mark.parametrize("sigma", [0.01, 0.03, 0.06])
 def test_noise_is_allowed_for(sigma):
-    """Down to 15 sigma a highlight keeps its place; the predicted noise is that of the residuals."""
+    """Down to 15 sigma a highlight keeps its place; the predicted noise bounds the residuals."""
     rng, found, residuals, predicted = np.random.default_rng(5), 0, [], []
     for _ in range(40):
         noisy = frame_of(gaussian) + rng.normal(0, sigma, (SIZE, SIZE)).astype(np.float32)
@@ -87,7 +87,8 @@ def test_noise_is_allowed_for(sigma):
         residuals.append(shape.residual)
         predicted.append(shape.residual_noise)
     assert found >= 39
-    assert 0.5 < np.mean(residuals) / np.mean(predicted) < 1.3
+    # The fit takes part of it up: the contour of a spot smoothed at its own scale has few independent points.
+    assert 0.3 < np.mean(residuals) / np.mean(predicted) < 1.0
 
 
 @pytest.mark.parametrize("false", [near_miss, ridge])
