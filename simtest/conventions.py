@@ -49,6 +49,6 @@ HIGHLIGHT_ELLIPSE_RESIDUAL = 0.045
 """Most that the isophote of an isolated highlight at t = 0.7 differs from an ellipse, RMS, as a share of its radius;
 noise is allowed for on top."""
 
-HIGHLIGHT_WIDTH_EXCESS = 0.025
+HIGHLIGHT_WIDTH_EXCESS = 0.03
 """Most that the isophote of an isolated highlight at t = 0.8 is wider than a Gaussian's of the same width at t = 0.5,
 as a share; noise is allowed for on top."""
