@@ -71,6 +71,7 @@ def reconstruct_picture(
     estimators: Sequence[str] | None = None,
     roi: str | None = None,
     encoding: str | None = None,
+    every: bool = False,
 ) -> tuple[int, list[Path]]:
     """Reconstruct the normals of a picture and write them.
 
@@ -91,6 +92,8 @@ def reconstruct_picture(
     encoding : {"srgb", "linear"}, optional
         How the picture's values are encoded, where the calibration does not state the response; default sRGB.
         Isophotes are those of linear values.
+    every : bool
+        Take peaks too that the border cuts or whose shape is not that of one point highlight.
 
     Returns
     -------
@@ -118,9 +121,13 @@ def reconstruct_picture(
         warnings.warn(cautions[-1], stacklevel=2)
     calibration, camera = _completed(calibration, encoding), calibration.camera
     names = list(estimators or DEFAULT_ESTIMATORS)
-    found = reconstruct(picture, calibration, names, roi=_parse_roi(roi) if roi is not None else None)
+    found = reconstruct(
+        picture, calibration, names, roi=_parse_roi(roi) if roi is not None else None, isolated=not every
+    )
     if not found:
-        cautions.append("no specularity found that stands out of the noise and closes inside the frame; try --roi")
+        cautions.append(
+            "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
+        )
         warnings.warn(cautions[-1], stacklevel=2)
     document = {
         "image": str(image),

@@ -26,6 +26,14 @@ def reconstruct(
         Literal["srgb", "linear"] | None,
         Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
     ] = None,
+    every: Annotated[
+        bool,
+        Parameter(
+            name="--all",
+            negative="",
+            help="Take peaks too that the border cuts or whose shape is not that of one point highlight.",
+        ),
+    ] = False,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture: normals.json, normals.csv, normals.ply, overlay.png.
 
@@ -36,7 +44,7 @@ def reconstruct(
     """
     from simtest.picture import reconstruct_picture
 
-    count, files = reconstruct_picture(image, out, camera, fov, estimators, roi, encoding)
+    count, files = reconstruct_picture(image, out, camera, fov, estimators, roi, encoding, every)
     print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
     for file in files:
         print(file)

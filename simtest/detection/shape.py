@@ -14,13 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import (
+    DEFAULT_SMOOTHING_PX,
     HIGHLIGHT_ELLIPSE_RESIDUAL,
     HIGHLIGHT_ISOVALUE,
     HIGHLIGHT_WIDTH_EXCESS,
 )
 from simtest.detection.regions import Region
 from simtest.errors import Failure
-from simtest.geometry import FittedConic, Patch, fit_ellipse
+from simtest.geometry import FittedConic, Patch, fit_ellipse, smooth
 
 Mask = npt.NDArray[np.bool_]
 
@@ -31,8 +32,11 @@ ones are noisier."""
 TOP_ISOVALUE = 0.8
 """The isophote whose width is compared with that at half height."""
 
+SCALE = 0.2
+"""A peak is smoothed by this share of its radius at half height before its shape is judged."""
+
 NOISE_FACTOR = 2.0
-"""How many standard deviations of its noise a measure of shape may be off."""
+"""How many standard deviations of a contour's noise the residual may have on top, in squares."""
 
 MIN_FLAT_PX = 12
 """As many pixels of the frame's very largest value are clipped ones."""
@@ -70,7 +74,7 @@ class PeakShape:
         # The residual adds to the noise in squares. The excess adds to it as it is: a wide Phong lobe (n = 10 to 50)
         # has 0.01 to 0.025 of its own.
         bent = self.residual > math.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * self.residual_noise)
-        flat = self.width_excess > HIGHLIGHT_WIDTH_EXCESS + NOISE_FACTOR * self.width_noise
+        flat = self.width_excess > HIGHLIGHT_WIDTH_EXCESS + self.width_noise
         return not (bent or flat)
 
 
@@ -106,7 +110,8 @@ def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None 
     PeakShape or Failure
         A Failure where an isophote does not close or no ellipse fits.
     """
-    contours = [patch.crossings(t) for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE)]
+    clean, left = _at_own_scale(patch)
+    contours = [clean.crossings(t) for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE)]
     fits = []
     for contour in contours:
         fitted = contour if isinstance(contour, Failure) else fit_ellipse(contour)
@@ -116,18 +121,32 @@ def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None 
     at_half, at_residual, at_top = fits
     points = contours[1]
     assert not isinstance(points, Failure)
-    half, level, top = (_level(t, patch, region) for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE))
+    height = region.contrast - (patch.peak_value - clean.peak_value)
+    half, level, top = (
+        1 - (1 - t) * clean.peak_value / height for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE)
+    )
     excess = math.nan
     if half >= LEAST_LEVEL and not _clipped(patch, region, clipped):
         gaussian = math.sqrt(math.log(top) / math.log(half))
         excess = _largest_width_ratio(at_top, at_half) / gaussian - 1
-    relative = noise / region.contrast
+    relative = left * noise / height
     return PeakShape(_residual(at_residual, points), relative / _slope(level), excess, relative / _slope(top))
 
 
-def _level(isovalue: float, patch: Patch, region: Region) -> float:
-    """Give an isovalue as a share of the peak's height above its surroundings."""
-    return 1 - (1 - isovalue) * patch.peak_value / region.contrast
+def _at_own_scale(patch: Patch) -> tuple[Patch, float]:
+    """Smooth a peak by a share of its width, which leaves a Gaussian one; gives also the share of the noise left."""
+    width = math.sqrt(float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE))) / math.pi)
+    more = SCALE * width
+    if more <= DEFAULT_SMOOTHING_PX / 2:
+        return patch, 1.0
+    values = smooth(patch.values, more)
+    rows, columns = np.nonzero(patch.inside(TOP_ISOVALUE))
+    highest = int(np.argmax(values[rows, columns]))
+    height, wide = values.shape
+    found = Patch.cut(values, (0, 0, wide, height), (int(columns[highest]), int(rows[highest])), patch.origin_px)
+    if isinstance(found, Failure):
+        return patch, 1.0
+    return found, DEFAULT_SMOOTHING_PX / math.hypot(DEFAULT_SMOOTHING_PX, more)
 
 
 def _slope(level: float) -> float:

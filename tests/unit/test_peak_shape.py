@@ -1,5 +1,6 @@
 """Which peaks of synthetic frames have the shape of a point highlight."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCE
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
+from simtest.picture import reconstruct_picture
 from simtest.reconstruction import reconstruct
 
 SIZE = 160
@@ -29,7 +31,7 @@ def near_miss(x, y):
 
 def ridge(x, y):
     """A Gaussian bent into an arc."""
-    return gaussian(x, y - x**2 / 60)
+    return gaussian(x, y - x**2 / 45)
 
 
 def shape_of(frame, noise=0.0):
@@ -76,7 +78,7 @@ def test_a_clipped_peak_is_not_taken_for_a_flat_one(level):
 
 @pytest.mark.parametrize("sigma", [0.01, 0.03, 0.06])
 def test_noise_is_allowed_for(sigma):
-    """Down to 15 sigma a highlight keeps its place; the predicted noise is that of the residuals."""
+    """Down to 15 sigma a highlight keeps its place; the predicted noise bounds the residuals."""
     rng, found, residuals, predicted = np.random.default_rng(5), 0, [], []
     for _ in range(40):
         noisy = frame_of(gaussian) + rng.normal(0, sigma, (SIZE, SIZE)).astype(np.float32)
@@ -85,7 +87,8 @@ def test_noise_is_allowed_for(sigma):
         residuals.append(shape.residual)
         predicted.append(shape.residual_noise)
     assert found >= 39
-    assert 0.5 < np.mean(residuals) / np.mean(predicted) < 1.3
+    # The fit takes part of it up: the contour of a spot smoothed at its own scale has few independent points.
+    assert 0.3 < np.mean(residuals) / np.mean(predicted) < 1.0
 
 
 @pytest.mark.parametrize("false", [near_miss, ridge])
@@ -93,3 +96,12 @@ def test_only_isolated_highlights_are_asked_for_their_shape(false):
     frame = frame_of(false)
     assert reconstruct(frame, CAMERA) == []
     assert len(reconstruct(frame, CAMERA, isolated=False)) == 1
+
+
+def test_the_command_takes_every_peak_where_it_is_asked_to(tmp_path):
+    picture = tmp_path / "ridge.png"
+    cv2.imwrite(str(picture), np.rint(230 * frame_of(ridge) / frame_of(ridge).max()).astype(np.uint8))
+    for every, expected in ((False, 0), (True, 1)):
+        with pytest.warns(UserWarning, match="no calibration|no specularity"):
+            count, _ = reconstruct_picture(picture, tmp_path / "out", fov_deg=50.0, encoding="linear", every=every)
+        assert count == expected

@@ -74,7 +74,11 @@ def sweeps_of(kind):
     pairs = [(radius, eps) for radius in (100, 20, 10) for eps in (0.0, 0.05, 0.2)]
     grid = [("sphere", f"R = {radius}, offset {eps}", DISTANCE / radius, eps, {}) for radius, eps in pairs]
     noise = [("plane", f"noise {sigma}", 0.0, 0.0, {"sensor.noise_sigma": sigma}) for sigma in (0.0, 0.02, 0.05)]
-    anatomy = [(surface, f"view {view}", 0.0, 0.0, {}) for surface in ("colon", "liver") for view in range(2)]
+    anatomy = [
+        (surface, f"view {view}", 0.0, 0.0, {"surface.viewpoint": view})
+        for surface in ("colon", "liver")
+        for view in range(2)
+    ]
     return {"curvature": curvature, "light_offset": offset, "overview": curvature + offset, "grid": grid,
             "noise": noise, "anatomy": anatomy}[kind]  # fmt: skip
 
@@ -317,7 +321,7 @@ def test_anatomy_gives_surfaces_and_bins(tmp_path):
     path = make_run(tmp_path, "anatomy", realisations=3)
     run = read_run(path)
     page = read_page(write_report(path))
-    assert {"surfaces", "error_vs_curvature"} <= page.ids()
+    assert {"surfaces", "coverage", "error_vs_curvature"} <= page.ids()
     assert png_size(path / "figures" / "anatomy.png")[0] > 800
     figure = line_figures(run)[0]
     assert not any(curve.joined for curve in figure.curves)
