@@ -137,12 +137,12 @@ def _choose(patches: Sequence[Patch], looks: Array, deviation: Array) -> _Choice
 
 
 def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camera: Camera, deviation: Array) -> _Choice:
-    """Ask lower isovalues where the choice is not clear; their leads are averaged, as their noise is the peak's."""
-    asked = np.flatnonzero(~(choice.margin >= CLEAR_MARGIN))
-    if not len(asked):
-        return choice
+    """Ask lower isovalues one by one until the choice is clear; leads are averaged, as their noise is the peak's."""
     lead, apart, count = choice.lead.copy(), choice.apart.copy(), np.ones(len(patches))
     for isovalue in POOLED_ISOVALUES:
+        asked = np.flatnonzero(~(choice.margin >= CLEAR_MARGIN))
+        if not len(asked):
+            break
         fitted = fit_isophote_of_each([patches[i] for i in asked.tolist()], camera, isovalue)
         sound = [(i, found) for i, found in zip(asked.tolist(), fitted, strict=True) if not isinstance(found, Failure)]
         if not sound:
@@ -159,7 +159,8 @@ def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camer
         lead[here] += lower.lead[usable]
         apart[here] += lower.apart[usable]
         count[here] += 1
-    return _Choice(lead / count, apart / count, deviation)
+        choice = _Choice(lead / count, apart / count, deviation)
+    return choice
 
 
 def _peak_deviation(
