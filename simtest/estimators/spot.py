@@ -26,9 +26,9 @@ Array = npt.NDArray[np.float64]
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
-DRIFT_CHI2 = 9.21
+DRIFT_CHI2 = 13.82
 """Squared Mahalanobis distance beyond which the axis' drift is more than noise: 1 % of a normal pair lies beyond."""
-
+"""Squared Mahalanobis distance beyond which the axis' drift is more than noise: 0.1 % of a normal pair lies beyond."""
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
