@@ -65,7 +65,8 @@ class Bench:
             frame = image + SIGMA * rng.standard_normal(image.shape, dtype=np.float32)
             told = known(number, highlight) if callable(known) else known
             calibration = Calibration(self.session.camera, known=told)
-            (specularity,) = reconstruct(frame.astype(np.float32), calibration, estimators)
+            # Every peak: this is about estimators, not about which peaks are looked at.
+            (specularity,) = reconstruct(frame.astype(np.float32), calibration, estimators, isolated=False)
             made.append(specularity.estimates)
         return made, highlight
 
