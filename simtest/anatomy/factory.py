@@ -4,6 +4,7 @@ from pathlib import Path
 
 from simtest.anatomy.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.anatomy.base import SurfaceModel
+from simtest.anatomy.mesh_file import MESH_SUFFIXES
 from simtest.errors import InputError
 from simtest.resources import find
 from simtest.spec.surface import (
@@ -14,8 +15,6 @@ from simtest.spec.surface import (
     SphereSurface,
     Surface,
 )
-
-MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 
 
 def make_surface(spec: Surface) -> SurfaceModel:

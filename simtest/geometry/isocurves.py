@@ -180,3 +180,15 @@ def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[A
     # tan(acos(tau) / 2) = sqrt(kappa) / (1 + tau)
     ratio = np.sqrt(k) / (1 + np.sqrt(1 - k))
     return np.asarray(z * ratio), np.asarray(z / ratio)
+
+
+def brightest_point(light: Array, camera: Array) -> Array:
+    """Give the BP on the plane z = 0, shape (2,): where the mirrored light, the point and the camera are in line.
+
+    Parameters
+    ----------
+    light, camera : ndarray, shape (3,)
+        L and V, at z > 0.
+    """
+    share = camera[2] / (camera[2] + light[2])
+    return np.asarray(camera[:2] + share * (light[:2] - camera[:2]))

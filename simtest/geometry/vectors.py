@@ -6,6 +6,12 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 
+def angle_deg(first: Array, second: Array) -> Array:
+    """Give the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
+    cross = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
+
+
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
     """Give two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
 

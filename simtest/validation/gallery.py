@@ -12,10 +12,10 @@ from simtest.estimators import Estimate
 from simtest.estimators.base import drawable
 from simtest.files import write_atomically
 from simtest.geometry import Camera, Patch
+from simtest.geometry.vectors import angle_deg
 from simtest.rendering import Session
 from simtest.spec import camera_table
 from simtest.validation.cases import Case
-from simtest.validation.metrics import angle_deg
 from simtest.validation.realise import Realisation, View
 
 MAP_SIDE = 80

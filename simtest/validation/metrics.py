@@ -9,7 +9,7 @@ import polars as pl
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.geometry.vectors import tangent_coordinates
+from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session, TrueHighlight
 from simtest.rendering.frames import Array
@@ -66,12 +66,6 @@ class RowContext:
     def scene(self) -> Scene:
         """The scene."""
         return self.session.scene
-
-
-def angle_deg(first: Array, second: Array) -> Array:
-    """Give the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
-    cross = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
 
 
 def rows(

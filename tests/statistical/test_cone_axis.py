@@ -8,13 +8,13 @@ from scipy import ndimage, stats
 
 from simtest.detection import estimate_noise
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.seeds import Stage, generator
 from simtest.sensor import expose
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import angle_deg
 
 ALPHA = 0.01
 """Level of each test: with the seeds fixed, how surprising a pass or a rejection has to be."""

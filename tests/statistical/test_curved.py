@@ -8,12 +8,13 @@ from simtest.calibration import Calibration, Known
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.seeds import Stage, from_integer, generator
 from simtest.spec import scene_from_dict
 from simtest.spec.paper import PaperSetting
-from simtest.validation.metrics import angle_deg, curvature_errors, mahalanobis2
+from simtest.validation.metrics import curvature_errors, mahalanobis2
 from simtest.validation.paper.rows import pipeline_with
 
 ALPHA = 0.01

@@ -17,11 +17,11 @@ from simtest.estimators.curved import curved, gain_of_stiffness
 from simtest.estimators.spot import fit_spot
 from simtest.estimators.top import fit_top
 from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import angle_deg
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
 ISOVALUES = (0.3, 0.4, 0.5, 0.6, 0.7)

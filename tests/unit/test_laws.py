@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from simtest.geometry import circle_pose
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import angle_deg
 
 C_PHONG = 4 * 50.0
 D = 10.0

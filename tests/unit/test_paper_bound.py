@@ -5,11 +5,17 @@ import pytest
 from pydantic import ValidationError
 
 from simtest.errors import InputError
-from simtest.geometry.isocurves import cosine_beta, cosine_of_isovalue, isocurve_radii, isophote_radius, kappa
+from simtest.geometry.isocurves import (
+    brightest_point,
+    cosine_beta,
+    cosine_of_isovalue,
+    isocurve_radii,
+    isophote_radius,
+    kappa,
+)
 from simtest.spec.paper import PaperSetting, paper_from_dict
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.protocol import (
-    brightest_point,
     draw_light,
     picture,
     plane_from_image,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simtest.errors import Failure
+from simtest.geometry.vectors import angle_deg
 from simtest.spec.paper import PaperSetting
-from simtest.validation.metrics import angle_deg
 from simtest.validation.paper import smoothing
 from simtest.validation.paper.pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias

@@ -11,12 +11,13 @@ import pytest
 from simtest.api import render
 from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError, Reason
+from simtest.geometry.vectors import angle_deg
 from simtest.picture import reconstruct_picture
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import angle_deg, unknown_falloff
+from simtest.validation.metrics import unknown_falloff
 from simtest.validation.realise import view
 from simtest.validation.runner import run_experiment
 

@@ -11,6 +11,7 @@ from simtest.detection import Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.rendering.frames import TrueHighlight
@@ -18,7 +19,7 @@ from simtest.seeds import Stage, from_integer, generator, integer, key, sequence
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
-from simtest.validation.metrics import SCHEMA, RowContext, angle_deg, rows, table
+from simtest.validation.metrics import SCHEMA, RowContext, rows, table
 from simtest.validation.realise import realise, view
 from simtest.validation.runner import run_experiment
 from simtest.validation.statistics import figures, mean_interval, summarise

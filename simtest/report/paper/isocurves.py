@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from skimage.measure import find_contours
 
-from simtest.geometry.isocurves import isocurve_radii, on_isophote_branch, specular_isocurve
+from simtest.geometry.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 
 Array = npt.NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def isocurve_figure() -> IsocurveFigure:
     angle = np.linspace(0, 2 * np.pi, _POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     camera, light = np.array([0.0, 0.0, 1.0]), np.array(OFFSET_LIGHT)
-    bp = camera[:2] + camera[2] / (camera[2] + light[2]) * (light[:2] - camera[:2])
+    bp = brightest_point(light, camera)
     values = np.linspace(*_LIMITS, _CURVE)
     return IsocurveFigure(
         inner, outer, (Branch(inner * circle, True), Branch(outer * circle, False)),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from simtest.geometry.vectors import angle_deg
 from simtest.report.gallery import estimated_normals, vector
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.run import GalleryItem, Run
@@ -121,11 +122,7 @@ def _read(item: GalleryItem) -> Stages:
         ellipse=np.asarray(curves[0], dtype=float) if curves else None,
         truth=truth,
         candidates=candidates,
-        errors_deg=tuple(_angle_deg(candidate, truth) for candidate in candidates),
+        errors_deg=tuple(float(angle_deg(candidate, truth)) for candidate in candidates),
         status=str(estimate.get("status")),
         is_default=is_default,
     )
-
-
-def _angle_deg(first: Array, second: Array) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))

@@ -7,12 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
+from simtest.geometry.isocurves import brightest_point
 from simtest.seeds import from_integer
 from simtest.spec import camera_table
 from simtest.spec.paper import PaperSetting
 from simtest.validation.gallery import MAP_SIDE, drawn, write_item
 from simtest.validation.paper.pipeline import Stages
-from simtest.validation.paper.protocol import Box, brightest_point, plane_from_image, texture, window_centre
+from simtest.validation.paper.protocol import Box, plane_from_image, texture, window_centre
 from simtest.validation.paper.rows import SURFACE, pipeline_with
 
 Array = npt.NDArray[np.float64]

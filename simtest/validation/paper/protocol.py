@@ -10,21 +10,10 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from simtest.conventions import PIXEL_CENTRE
+from simtest.geometry.isocurves import brightest_point
 from simtest.spec.paper import PaperSetting
 
 Array = npt.NDArray[np.float64]
-
-
-def brightest_point(light: Array, camera: Array) -> Array:
-    """Give the BP on the plane z = 0, shape (2,): where the mirrored light, the point and the camera are in line.
-
-    Parameters
-    ----------
-    light, camera : ndarray, shape (3,)
-        L and V, at z > 0.
-    """
-    share = camera[2] / (camera[2] + light[2])
-    return np.asarray(camera[:2] + share * (light[:2] - camera[:2]))
 
 
 def draw_light(setting: PaperSetting, rng: np.random.Generator) -> Array:
