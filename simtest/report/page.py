@@ -90,7 +90,8 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
     if view:
         path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
         charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
-        sections["view"] = {"title": view.title, "unit": view.unit, "picture": picture(path, 120_000)}
+        curved = view.curvature is not None
+        sections["view"] = {"title": view.title, "unit": view.unit, "curved": curved, "picture": picture(path, 120_000)}
     return sections, charts
 
 

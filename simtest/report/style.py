@@ -25,6 +25,9 @@ _FURTHER = ("#A6761D", "#7A8B99", "#B2478F", "#4E9A9A", "#9A9A2E", "#C08A7A")
 NEUTRAL = "#7D828A"
 """Grey of laws and truth: readable on light and on dark."""
 
+LIGHT = "#F2C500"
+"""Yellow of lights in 3D views."""
+
 TRUTH = "#F5D90A"
 """Yellow of the truth on top of frames."""
 
