@@ -203,8 +203,10 @@ def main() -> None:
     axes[1, 0].set_ylabel("error of the axis ratio, % (90 %)")
     axes[0, 0].legend()
     figure.savefig(target, dpi=90)
-    content = {"edge_over_half_width": RATIOS, "distance_mm": DISTANCE_MM, "exponent": EXPONENT, "curves": curves}
-    data.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    content = {"edge_over_half_width": RATIOS, "distance_mm": DISTANCE_MM, "exponent": EXPONENT}
+    rows = ",\n".join("  " + json.dumps(curve) for curve in curves)
+    head = ",\n".join(f' "{name}": {json.dumps(value)}' for name, value in content.items())
+    data.write_text(f'{{\n{head},\n "curves": [\n{rows}\n ]\n}}\n', encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -88,8 +88,9 @@ def _build(item: GalleryItem) -> Surface3D | None:
         return None
     vertices = position[valid]
     reach = 0.12 * float(np.median(np.linalg.norm(vertices, axis=1)))
+    name, setting = item.meta.get("label") or item.meta.get("surface") or item.name, item.meta.get("setting", "")
     return Surface3D(
-        f"{item.meta.get('label') or item.meta.get('surface') or item.name}: {item.meta.get('setting', '')}",
+        setting if setting.startswith(name) else f"{name}: {setting}",
         vertices, triangles, _intensity(item, position.shape[:2], step)[valid],
         (_sparse(position, normal, valid, reach), *_highlights(item, 2.5 * reach)), item.length_unit, curvature,
         np.asarray(item.meta.get("lights") or [], dtype=float).reshape(-1, 3),
