@@ -1,8 +1,8 @@
 """Compares circle pose with its law at each highlight of an anatomy: python docs/anatomy_law.py FOLDER...
 
-FOLDER is what docs/anatomy_table.py wrote, or another run on the scene `anatomy`. The law (docs/theory.md, section 4) has
-the highlight's own exact curvatures; beside it stands the law of a picture that is smoothed before the ellipse is fitted,
-which adds s^2 to the ellipse's second moments (section 3).
+FOLDER is what docs/anatomy_table.py wrote, or another run on the scene `anatomy`. The law (docs/theory.md, section 4)
+has the highlight's own exact curvatures; beside it stands the law of a picture that is smoothed before the ellipse is
+fitted, which adds s^2 to the ellipse's second moments (section 3).
 """
 
 import sys
