@@ -108,13 +108,15 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> _Build:
     faces = (row * columns + column % columns).reshape(-1, 3)
     places = np.stack([g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij")], axis=1)
     vertices, normals = _positions(tube, places)
+    fresh = 0
     for _ in range(_SPLITS if edge_mm is None else 0):
         before = len(places)
-        places, faces = _split(tube, places, faces, (vertices, normals), MAX_STRETCH * cell)
-        added = _positions(tube, places[before:])
-        vertices, normals = np.vstack([vertices, added[0]]), np.vstack([normals, added[1]])
+        places, faces = _split(tube, places, faces, (vertices, normals), fresh, MAX_STRETCH * cell)
         if len(places) == before:
             break
+        added = _positions(tube, places[before:])
+        vertices, normals = np.vstack([vertices, added[0]]), np.vstack([normals, added[1]])
+        fresh = before
     corners = places[faces]
     # A corner beyond the seam has v = 2 pi, or a little more, while its vertex is that of v = 0.
     around = corners[:, :, 1]
@@ -131,12 +133,13 @@ def _positions(tube: Tube, places: Array) -> tuple[Array, Array]:
 
 
 def _split(
-    tube: Tube, places: Array, faces: IntArray, surface: tuple[Array, Array], longest: float
+    tube: Tube, places: Array, faces: IntArray, surface: tuple[Array, Array], fresh: int, longest: float
 ) -> tuple[Array, IntArray]:
     """Halve edges that are long, or between whose ends the mean of the end normals is off: on polyps.
 
-    The shipped colon has none. `surface` is position and normal at the places. A stretched edge may be bent both ways,
-    so that its middle alone says nothing, and a thin triangle may turn its back on the lumen.
+    The shipped colon has none. `surface` is position and normal at the places; edges between those before `fresh` have
+    been looked at already. A stretched edge may be bent both ways, so that its middle alone says nothing, and a thin
+    triangle may turn its back on the lumen.
     """
     edges, index = face_edges(faces)
     positions, at_ends = surface
@@ -151,9 +154,11 @@ def _split(
         return _positions(tube, between(chosen, share))[1]
 
     length = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
-    rough = [np.flatnonzero(length > longest), rough_edges(at_ends, edges, normals, MAX_NORMAL_ERROR_DEG)]
+    new = np.flatnonzero(edges[:, 1] >= fresh)  # the second end is the later one
+    bent = rough_edges(at_ends, edges[new], lambda chosen: normals(new[chosen]), MAX_NORMAL_ERROR_DEG)
+    rough = [np.flatnonzero(length > longest), new[bent]]
     if tube.has_stalks:
-        stretched = np.flatnonzero((length > QUARTERED * longest) & tube.drawn_out(positions)[edges].any(axis=1))
+        stretched = new[(length[new] > QUARTERED * longest) & tube.drawn_out(positions)[edges[new]].any(axis=1)]
         for share in (0.25, 0.75):
             off = off_between(at_ends[edges[stretched]], normals(stretched, share), share, MAX_NORMAL_ERROR_DEG)
             rough.append(stretched[off])
