@@ -143,9 +143,7 @@ def sample_views(
     places = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
     writer = ViewWriter(Path(out), film=along is not None)
-    sampled = sample_views(
-        described, count, places, variant, progress, lambda seen: {"picture": writer.add(seen)}, along is not None
-    )
+    sampled = sample_views(described, count, places, variant, progress, writer.add, along is not None)
     writer.close()
     write_json(Path(out) / "views.json", sampled.as_dict(place_key(described)))
     return sampled

@@ -40,9 +40,13 @@ class ViewWriter:
         for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / "film.avi"):
             old.unlink(missing_ok=True)
 
-    def add(self, seen: View) -> str:
-        """Write the frame of a view, with the noise of the scene's seed; gives the file's name."""
-        frame = seen.frame(seen.scene.sensor.seed)
+    def add(self, seen: View) -> dict[str, Any]:
+        """Write the frame of a view; gives what views.json says of it.
+
+        Each has noise of its own, of seeds that count on from the scene's: a film's noise must not stand still.
+        """
+        seed = seen.scene.sensor.seed + len(self._thumbnails)
+        frame = seen.frame(seed)
         name = f"view_{len(self._thumbnails):04d}.png"
         data = encoded_png(frame, seen.scene.sensor)
         write_atomically(self._folder / name, lambda part: part.write_bytes(data))
@@ -53,7 +57,7 @@ class ViewWriter:
         width = SHEET_WIDTH // SHEET_COLUMNS
         small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
         self._thumbnails.append(np.asarray(small, dtype=np.uint8))
-        return name
+        return {"picture": name, "sensor.seed": seed}
 
     def _write(self, picture: Picture) -> None:
         if self._film is None:

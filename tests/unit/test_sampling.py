@@ -68,6 +68,7 @@ def test_a_sequence_leaves_no_place_out_and_is_a_film(tmp_path):
     assert ((steps > 0.3) & (steps < 2)).all()
     for a, b in itertools.pairwise(poses[:, :3, 2]):
         assert a @ b > 0.99
+    assert [view["sensor.seed"] for view in written] == [0, 1, 2, 3]
     pictures = [cv2.imread(str(tmp_path / view["picture"])) for view in written]
     film = cv2.VideoCapture(str(tmp_path / "film.avi"))
     frames = []
