@@ -98,11 +98,13 @@ def sample_views(
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
     progress: Progress | None = None,
+    along: tuple[float, float] | None = None,
 ) -> SampledViews:
-    """Pick viewpoints of an anatomy that show isolated highlights; write views.json, which says what was left out.
+    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
 
     Tried are the viewpoints 0, 1, 2, ..., or, where ``surface.view`` is not auto, places spread evenly over the camera
-    path; ten for each view wanted at most.
+    path; ten for each view wanted at most. Written are views.json, with the poses and what was left out, a picture of
+    each view, and sheet.png, which shows all of them; of a sequence film.avi too.
 
     Parameters
     ----------
@@ -118,6 +120,8 @@ def sample_views(
         Mitsuba variant.
     progress : callable, optional
         Called with views found, views wanted, and what was tried.
+    along : tuple of float, optional
+        First and last share of the camera path: a sequence of views evenly spaced between them, none left out.
 
     Returns
     -------
@@ -130,13 +134,17 @@ def sample_views(
     BackendError
         If the rendering backend cannot be used.
     """
-    from simtest.validation.sampling import candidates, place_key, sample_views
+    from simtest.dataset.views import ViewWriter
+    from simtest.validation.sampling import along_path, candidates, place_key, sample_views
 
     if not 1 <= count <= MAX_VIEWS:
         raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    places = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
-    sampled = sample_views(described, count, candidates(described, TRIES * count), variant, progress)
+    writer = ViewWriter(Path(out), film=along is not None)
+    sampled = sample_views(described, count, places, variant, progress, writer.add, along is not None)
+    writer.close()
     write_json(Path(out) / "views.json", sampled.as_dict(place_key(described)))
     return sampled
 

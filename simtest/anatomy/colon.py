@@ -17,7 +17,7 @@ from simtest.anatomy.base import (
     TriangleMesh,
     pack_points,
 )
-from simtest.anatomy.cutting import face_edges, halve, rough_edges
+from simtest.anatomy.cutting import face_edges, halve, off_between, rough_edges
 from simtest.anatomy.recipe import ColonRecipe
 from simtest.anatomy.tube import Tube
 from simtest.anatomy.viewpoints import Generator, MeshProbe, lumen_pose
@@ -29,7 +29,17 @@ TRIANGLES = 200_000
 MAX_NORMAL_ERROR_DEG = 0.2
 """Largest error of the interpolated normal at an edge's middle that is left as it is, as far as `_SPLITS` go."""
 
-_SPLITS = 2
+MAX_STRETCH = 2.0
+"""Longest edge, over a cell's side: where a polyp stretches the wall, both ends of an edge may look one way and its
+middle another."""
+
+QUARTERED = 0.3
+"""Of a pedunculated polyp, edges longer than this share of the longest are looked at in their quarters too."""
+
+LEAST_FACING = 0.7
+"""Of a pedunculated polyp, triangles whose normal and a corner's have a smaller cosine are cut."""
+
+_SPLITS = 6
 MAX_TRIANGLES = 5_000_000
 
 
@@ -97,13 +107,20 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> _Build:
     row, column = i[:, None, None] + di, j[:, None, None] + dj
     faces = (row * columns + column % columns).reshape(-1, 3)
     places = np.stack([g.ravel() for g in np.meshgrid(u, v[:-1], indexing="ij")], axis=1)
+    vertices, normals = _positions(tube, places)
+    fresh = 0
     for _ in range(_SPLITS if edge_mm is None else 0):
-        places, faces = _split(tube, places, faces)
+        before = len(places)
+        places, faces = _split(tube, places, faces, (vertices, normals), fresh, MAX_STRETCH * cell)
+        if len(places) == before:
+            break
+        added = _positions(tube, places[before:])
+        vertices, normals = np.vstack([vertices, added[0]]), np.vstack([normals, added[1]])
+        fresh = before
     corners = places[faces]
     # A corner beyond the seam has v = 2 pi, or a little more, while its vertex is that of v = 0.
     around = corners[:, :, 1]
     corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
-    vertices, normals = _positions(tube, places)
     digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
     return _Build(tube, TriangleMesh(vertices, faces, normals), corners, f"colon-{digest}")
 
@@ -115,21 +132,48 @@ def _positions(tube: Tube, places: Array) -> tuple[Array, Array]:
     return positions, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def _split(tube: Tube, places: Array, faces: IntArray) -> tuple[Array, IntArray]:
-    """Halve the edges at whose middle the mean of the end normals is off: a sharp polyp; the shipped colon has none."""
-    edges, index = face_edges(faces)
+def _split(
+    tube: Tube, places: Array, faces: IntArray, surface: tuple[Array, Array], fresh: int, longest: float
+) -> tuple[Array, IntArray]:
+    """Halve edges that are long, or between whose ends the mean of the end normals is off: on polyps.
 
-    def middles(chosen: IntArray) -> Array:
+    The shipped colon has none. `surface` is position and normal at the places; edges between those before `fresh` have
+    been looked at already. A stretched edge may be bent both ways, so that its middle alone says nothing, and a thin
+    triangle may turn its back on the lumen.
+    """
+    edges, index = face_edges(faces)
+    positions, at_ends = surface
+
+    def between(chosen: IntArray, share: float = 0.5) -> Array:
         (u0, v0), (u1, v1) = places[edges[chosen]].transpose(1, 2, 0)
         # The short way around, across the seam too.
         turn = np.remainder(v1 - v0 + math.pi, 2 * math.pi) - math.pi
-        return np.stack([(u0 + u1) / 2, np.remainder(v0 + turn / 2, 2 * math.pi)], axis=1)
+        return np.stack([u0 + share * (u1 - u0), np.remainder(v0 + share * turn, 2 * math.pi)], axis=1)
 
-    def normals(chosen: IntArray) -> Array:
-        return _positions(tube, middles(chosen))[1]
+    def normals(chosen: IntArray, share: float = 0.5) -> Array:
+        return _positions(tube, between(chosen, share))[1]
 
-    rough = rough_edges(_positions(tube, places)[1], edges, normals, MAX_NORMAL_ERROR_DEG)
-    return np.vstack([places, middles(rough)]), halve(faces, index, rough, len(places), len(edges))
+    length = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
+    new = np.flatnonzero(edges[:, 1] >= fresh)  # the second end is the later one
+    bent = rough_edges(at_ends, edges[new], lambda chosen: normals(new[chosen]), MAX_NORMAL_ERROR_DEG)
+    rough = [np.flatnonzero(length > longest), new[bent]]
+    if tube.has_stalks:
+        stretched = new[(length[new] > QUARTERED * longest) & tube.drawn_out(positions)[edges[new]].any(axis=1)]
+        for share in (0.25, 0.75):
+            off = off_between(at_ends[edges[stretched]], normals(stretched, share), share, MAX_NORMAL_ERROR_DEG)
+            rough.append(stretched[off])
+        turned = np.flatnonzero(_facing(positions, at_ends, faces) < LEAST_FACING)
+        rough.append(index[turned, length[index[turned]].argmax(axis=1)])
+    chosen = np.unique(np.concatenate(rough))
+    return np.vstack([places, between(chosen)]), halve(faces, index, chosen, len(places), len(edges))
+
+
+def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
+    """Give the least cosine between a triangle's normal and those at its corners."""
+    corners = positions[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross /= np.linalg.norm(cross, axis=1, keepdims=True)
+    return np.asarray(np.einsum("ni,nci->nc", cross, normals[faces]).min(axis=1))
 
 
 class Colon(SurfaceModel):

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.anatomy.base import Array, IntArray
 
@@ -82,9 +83,30 @@ def rough_edges(
     limit, ends = math.radians(limit_deg), normals[edges]
     # Where the end normals nearly agree nothing between can be far off: most edges need no more.
     tried = np.flatnonzero(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 10 * limit)
-    between = ends[tried].sum(axis=1)
+    return np.asarray(tried[off_between(ends[tried], middle_normals(tried), 0.5, limit_deg)])
+
+
+def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> npt.NDArray[np.bool_]:
+    """Tell where the normal that is interpolated along an edge is off.
+
+    Parameters
+    ----------
+    ends : ndarray, shape (N, 2, 3)
+        Exact unit normals at the edges' ends.
+    normals : ndarray, shape (N, 3)
+        Those at a share of the way between.
+    share : float
+        From the first end, 0 to 1.
+    limit_deg : float
+        Error that is allowed.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+    """
+    between = (1 - share) * ends[:, 0] + share * ends[:, 1]
     between /= np.linalg.norm(between, axis=1, keepdims=True)
-    return np.asarray(tried[np.linalg.norm(np.cross(between, middle_normals(tried)), axis=1) > limit])
+    return np.asarray(np.linalg.norm(np.cross(between, normals), axis=1) > math.radians(limit_deg))
 
 
 def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:

@@ -12,16 +12,36 @@ from simtest.spec.reading import Spec, read_toml, validate
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 FossaExtent = Annotated[float, Field(ge=3, le=100)]
+NECK_SHARES = (0.3, 0.8)
+"""Width of a pedunculated polyp's neck over its head's: narrower ones bend too sharply to be meshed."""
+
 HalfExtent = Annotated[float, Field(ge=10, le=200)]
 
 
 class Polyp(Spec):
-    """A sessile polyp: a round bump of Gaussian profile on the wall, at its place whatever folds are there."""
+    """A polyp, at its place whatever folds are there.
+
+    Sessile: a round bump of Gaussian profile on the wall. With a neck it is pedunculated: a head on a stalk.
+    """
 
     along_mm: float = Field(ge=0, le=500, description="place along the centreline, mm")
     around_deg: float = Field(ge=-360, le=360, description="place around the tube, deg")
     height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
-    width_mm: float = Field(8.0, ge=1, le=40, description="width at half height, mm")
+    width_mm: float = Field(8.0, ge=1, le=40, description="width at half height; of a pedunculated one its head's, mm")
+    neck_mm: float | None = Field(None, ge=0.5, le=30, description="width of the neck, mm; none given: sessile")
+
+    @model_validator(mode="after")
+    def _shaped(self) -> "Polyp":
+        if self.neck_mm is None:
+            return self
+        low, high = (share * self.width_mm for share in NECK_SHARES)
+        if not low <= self.neck_mm <= high:
+            raise ValueError(f"neck_mm = {self.neck_mm:g}: must be {low:g} to {high:g}, of a head of {self.width_mm:g}")
+        if self.height_mm < self.width_mm:
+            raise ValueError(
+                f"height_mm = {self.height_mm:g}: must be at least width_mm, {self.width_mm:g}, with a neck"
+            )
+        return self
 
 
 class ColonRecipe(Spec):
@@ -44,7 +64,7 @@ class ColonRecipe(Spec):
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
     irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and place")
-    polyps: tuple[Polyp, ...] = Field((), max_length=20, description="sessile polyps")
+    polyps: tuple[Polyp, ...] = Field((), max_length=20, description="polyps")
     relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
     relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the irregularities")

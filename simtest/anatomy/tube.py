@@ -9,7 +9,8 @@ e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T
     P_uv = (psi' r sin v - psi' r_v cos v) T + r_uv rho + r_u tau
     P_vv = (r_vv - r) rho + 2 r_v tau
 
-P_u x P_v points into the lumen while 1 - psi' r cos v > 0.
+P_u x P_v points into the lumen while 1 - psi' r cos v > 0. Pedunculated polyps are maps of space applied to P
+(simtest.anatomy.stalk); they keep the sense of P_u x P_v.
 """
 
 import math
@@ -17,9 +18,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.anatomy.base import Array
+from simtest.anatomy.jets import Jet
 from simtest.anatomy.recipe import ColonRecipe
+from simtest.anatomy.stalk import Stalk
 from simtest.errors import InputError
 from simtest.seeds import Stage, generator
 
@@ -31,18 +35,6 @@ MAX_SHIFT_MM = 3.0
 _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
-
-
-@dataclass(frozen=True)
-class _Jet:
-    """A function of (u, v) with its first and second partial derivatives, each of shape (N,) or (N, 3)."""
-
-    f: Array
-    u: Array
-    v: Array
-    uu: Array
-    uv: Array
-    vv: Array
 
 
 @dataclass(frozen=True)
@@ -80,7 +72,9 @@ class Tube:
         self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
         steps = self._integrate(self._knots[:-1], self._knots[1:])
         self._knot_places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._stalks: tuple[Stalk, ...] = ()
         self._check()
+        self._stalks = tuple(self._draw_stalks())
 
     def _draw_folds(self, rng: np.random.Generator) -> tuple[_Fold, ...]:
         recipe, spread, folds = self.recipe, self.recipe.irregularity, []
@@ -100,11 +94,21 @@ class Tube:
         return tuple(folds)
 
     def _polyps(self) -> Iterator[_Fold]:
-        """Give the polyps: folds that are as wide around the tube as along it, and not slanted."""
+        """Give the sessile polyps: folds that are as wide around the tube as along it, and not slanted."""
         for polyp in self.recipe.polyps:
+            if polyp.neck_mm is not None:
+                continue
             width = polyp.width_mm / math.sqrt(8 * math.log(2))
             kappa = (self.recipe.radius_mm / width) ** 2
             yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
+
+    def _draw_stalks(self) -> Iterator[Stalk]:
+        """Give the pedunculated polyps, each on the wall as it is without any of them, towards the centreline."""
+        for polyp in self.recipe.polyps:
+            if polyp.neck_mm is not None:
+                u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
+                foot, axis = self.tangents(u, v)[0][0], -self.frame(u, v)[1][0]
+                yield Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
 
     def _draw_relief(self, rng: np.random.Generator) -> tuple[tuple[float, int, float], ...]:
         """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is whole, so that they close."""
@@ -155,8 +159,11 @@ class Tube:
     def slice_of(self, points: Array) -> tuple[Array, Array, Array]:
         """Give (u, v) and the distance from the centreline, mm, of points, shape (N, 3), near the tube.
 
-        u solves (x - C(u)) . T(u) = 0: started at the nearest of a row of centreline points, then by Newton's method.
+        Of a point that a pedunculated polyp has moved, those of where it came from. u solves (x - C(u)) . T(u) = 0:
+        started at the nearest of a row of centreline points, then by Newton's method.
         """
+        for stalk in reversed(self._stalks):
+            points = stalk.undo(points)
         row = np.linspace(0, self.recipe.length_mm, 129)
         gaps = points[:, None] - self.centreline(row)
         u = row[np.argmin(np.einsum("nki,nki->nk", gaps, gaps), axis=1)]
@@ -171,7 +178,7 @@ class Tube:
         across = x * np.cos(psi) - z * np.sin(psi)
         return u, np.arctan2(y, across), np.hypot(across, y)
 
-    def radius(self, u: Array, v: Array) -> _Jet:
+    def radius(self, u: Array, v: Array) -> Jet:
         """Give r(u, v), mm, and its derivatives; u, v of shape (N,)."""
         amplitude, angle = self.recipe.taenia_mm, 3 * (v - self._taenia_phase)
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -201,7 +208,7 @@ class Tube:
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
-        return _Jet(f, fu, fv, fuu, fuv, fvv)
+        return Jet(f, fu, fv, fuu, fuv, fvv)
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Give T, rho and tau, three arrays of shape (N, 3)."""
@@ -217,9 +224,14 @@ class Tube:
         T, rho, tau = self.frame(u, v)
         along = (1 - bend * r.f * np.cos(v))[:, None]
         position = self.centreline(u) + r.f[:, None] * rho
-        return position, along * T + r.u[:, None] * rho, r.v[:, None] * rho + r.f[:, None] * tau
+        first, second = along * T + r.u[:, None] * rho, r.v[:, None] * rho + r.f[:, None] * tau
+        if not self._stalks:
+            return position, first, second
+        none = np.zeros_like(position)
+        moved = self._draw_out(Jet(position, first, second, none, none, none))
+        return moved.f, moved.u, moved.v
 
-    def jet(self, u: Array, v: Array) -> _Jet:
+    def jet(self, u: Array, v: Array) -> Jet:
         """Give P, mm, and its derivatives by the formulas of this module's head; u, v of shape (N,)."""
         r = self.radius(u, v)
         _, bend, twist = self.heading(u)
@@ -230,7 +242,7 @@ class Tube:
             return t[:, None] * T + radial[:, None] * rho + around[:, None] * tau
 
         along, zero = 1 - bend * r.f * cv, np.zeros_like(u)
-        return _Jet(
+        wall = Jet(
             f=self.centreline(u) + r.f[:, None] * rho,
             u=combine(along, r.u, zero),
             v=combine(zero, r.v, r.f),
@@ -238,6 +250,25 @@ class Tube:
             uv=combine(bend * (r.f * sv - r.v * cv), r.uv, r.u),
             vv=combine(zero, r.vv - r.f, 2 * r.v),
         )
+        return self._draw_out(wall)
+
+    @property
+    def has_stalks(self) -> bool:
+        """Whether there are pedunculated polyps."""
+        return bool(self._stalks)
+
+    def drawn_out(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Tell which points, shape (N, 3), mm, are near enough to a pedunculated polyp to be moved by it."""
+        moved = np.zeros(len(points), dtype=bool)
+        for stalk in self._stalks:
+            moved |= stalk.moves(points)
+        return moved
+
+    def _draw_out(self, wall: Jet) -> Jet:
+        """Apply the pedunculated polyps."""
+        for stalk in self._stalks:
+            wall = stalk.apply(wall)
+        return wall
 
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Give the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""

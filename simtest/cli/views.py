@@ -5,6 +5,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from simtest.cli.options import Out, Settings, Variant, whole_number
+from simtest.errors import InputError
+from simtest.resources import shown
 
 
 def views(
@@ -13,10 +15,15 @@ def views(
     *,
     out: Out,
     count: Annotated[int, Parameter(help="Views wanted, 1 to 1000.", converter=whole_number)] = 50,
+    along: Annotated[
+        str | None, Parameter(help="First,last share of the camera path: a sequence of views in order, none left out.")
+    ] = None,
     settings: Settings = None,
     variant: Variant = None,
 ) -> None:
-    """Pick viewpoints of an anatomy that show isolated highlights: views.json, and a picture of each.
+    """Pick viewpoints of an anatomy that show isolated highlights: views.json, a picture of each, a sheet of all.
+
+    With --along, a film along the camera path instead.
 
     Parameters
     ----------
@@ -29,9 +36,19 @@ def views(
     from simtest.spec import parse_settings
 
     refuse_file(out)
+    ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
-        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move)
-    print(f"{len(sampled.places)} of {sampled.tried} views show an isolated highlight")
+        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends)
+    with_one = sum(number > 0 for number in sampled.highlights)
+    print(f"{with_one} of {sampled.tried} views show an isolated highlight")
     for reason, number in sampled.rejected.items():
         print(f"left out: {number} ({reason})")
     print(out / "views.json")
+
+
+def _ends(text: str) -> tuple[float, float]:
+    try:
+        first, last = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--along {shown(text)}: must be two shares of the path, such as 0.2,0.8") from None
+    return first, last

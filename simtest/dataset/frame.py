@@ -115,7 +115,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
     make_folder(out)
     try:
-        write_atomically(files[0], lambda part: part.write_bytes(_png(frame)))
+        write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
         write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
         write_atomically(files[2], lambda part: np.savez_compressed(part, **_truth(frame)))
         write_json(files[3], _description(frame))
@@ -158,14 +158,14 @@ def _calibration_file(scene: Scene) -> str:
     return "# What is known of frame.png; pixel centres at integer + 0.5.\n" + toml_tables(stated)
 
 
-def _png(frame: LabelledFrame) -> bytes:
-    """Give the picture: what the sensor itself encoded, or else the sRGB-encoded frame."""
-    sensor = frame.scene.sensor
+def encoded_png(image: npt.NDArray[np.float32], sensor: Sensor) -> bytes:
+    """Give the picture of a sensor's frame: what the sensor itself encoded, or else the sRGB-encoded frame."""
+    picture: npt.NDArray[Any]
     if sensor.encodes:
         kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
-        picture = np.rint(np.asarray(frame.image, dtype=float) * np.iinfo(kind).max).astype(kind)
+        picture = np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind)
     else:
-        picture = to_uint8(frame.image)
+        picture = to_uint8(image)
     ok, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[:, :, ::-1])
     assert ok
     return bytes(encoded)

@@ -125,6 +125,11 @@ class TruthMaps:
     direction_max: Array
     mask: npt.NDArray[np.bool_]
 
+    @property
+    def larger_curvature(self) -> Array:
+        """Principal curvature of larger size, 1/mm, shape (H, W)."""
+        return np.where(np.abs(self.k_max) >= np.abs(self.k_min), self.k_max, self.k_min)
+
 
 @dataclass(frozen=True)
 class TrueHighlight:

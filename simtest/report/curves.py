@@ -144,7 +144,9 @@ def gather(rows: pl.DataFrame, ask: Ask, axis: Axis) -> tuple[list[Curve], list[
         table = _aggregate(part, ask, is_scattered)
         for name in estimator_order(table["estimator"].to_list()):
             own = table.filter(pl.col("estimator") == name)
-            empty += [f"{name}, {group}" for group in own.filter(pl.col("n") == 0)["group"].to_list()]
+            without = own.filter(pl.col("n") == 0)
+            places = [f"bin around {x:.2g}" for x in without["x"]] if is_scattered else without["group"].to_list()
+            empty += [f"{name}, {place}" for place in places]
             law_x, law_y = _law_line(own, ask, name, axis, is_scattered)
             own = own.filter(pl.col("n") > 0)
             if own.is_empty():

@@ -11,7 +11,7 @@ from simtest.report import style
 from simtest.report.curves import Curve
 from simtest.report.series import LineFigure
 from simtest.report.static import has_law, heat_range, log_range, segment_colour, visible
-from simtest.report.style import NEUTRAL, Array
+from simtest.report.style import LIGHT, NEUTRAL, Array
 from simtest.report.surface3d import Segments, Surface3D
 from simtest.report.tables import HeatMap, SurfaceFigure
 
@@ -162,24 +162,37 @@ def surfaces(data: SurfaceFigure, colours: Mapping[str, str]) -> go.Figure:
 
 
 def surface_3d(data: Surface3D, colours: Mapping[str, str]) -> go.Figure:
-    """Draw the surface, shaded by the frame, with its normals; it can be turned and zoomed."""
+    """Draw the surface with its normals, coloured by curvature or shaded by the frame; it can be turned and zoomed."""
     x, y, z = data.vertices.T.astype(np.float32)
     i, j, k = data.triangles.T.astype(np.int32)
-    figure = go.Figure(
-        go.Mesh3d(
-            x=x, y=y, z=z, i=i, j=j, k=k, intensity=np.sqrt(data.intensity).astype(np.float32), cmin=-0.35, cmax=1,
-            colorscale="gray", showscale=False, flatshading=False, name="surface", hoverinfo="skip",
-            lighting={"ambient": 0.75, "diffuse": 0.35, "specular": 0.0, "roughness": 1.0},
-        )
-    )  # fmt: skip
+    surfaces = [
+        {
+            "intensity": np.sqrt(data.intensity).astype(np.float32), "cmin": -0.35, "cmax": 1, "colorscale": "gray",
+            "showscale": False, "lighting": {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0, "roughness": 1.0},
+        }
+    ]  # fmt: skip
+    if data.curvature is not None:
+        title = f"curvature of<br>larger size (1/{data.unit}),<br>convex positive"
+        bar = {"title": {"text": title, "font": {"size": 12}}, "thickness": 12, "len": 0.6, "x": 1.0}
+        limit = data.curvature_limit
+        surfaces.append(
+            {
+                "intensity": data.curvature.astype(np.float32), "cmin": -limit, "cmax": limit, "colorscale": "RdBu",
+                "reversescale": True, "colorbar": bar, "lighting": {"ambient": 0.9, "diffuse": 0.2, "specular": 0.0},
+            }
+        )  # fmt: skip
+    figure = go.Figure()
+    for number, more in enumerate(surfaces):
+        last = number == len(surfaces) - 1
+        figure.add_trace(
+            go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, flatshading=False, name="surface", hoverinfo="skip", visible=last)
+            .update(more)
+        )  # fmt: skip
     for part in data.segments:
         figure.add_trace(_segments(part, colours))
-    figure.add_trace(
-        go.Scatter3d(
-            x=[0], y=[0], z=[0], mode="markers", marker={"size": 4, "color": NEUTRAL, "symbol": "diamond"},
-            name="camera", hoverinfo="name",
-        )
-    )  # fmt: skip
+    figure.add_trace(_marks("camera", np.zeros((1, 3)), NEUTRAL, "diamond"))
+    if len(data.lights):
+        figure.add_trace(_marks("light", data.lights, LIGHT, "circle"))
     scene = {
         "aspectmode": "data",
         "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}},
@@ -187,7 +200,26 @@ def surface_3d(data: Surface3D, colours: Mapping[str, str]) -> go.Figure:
     }  # fmt: skip
     figure.update_layout(layout(560, scene=scene, dragmode="orbit"))
     figure.update_layout(margin={"l": 0, "r": 0, "t": 0, "b": 0}, legend={"y": 0})
+    if len(surfaces) > 1:
+        figure.update_layout(updatemenus=[_choice(["curvature", "picture"])])
     return figure
+
+
+def _choice(names: Sequence[str]) -> dict[str, Any]:
+    """Give the buttons that show one of the two surfaces, the traces 1 and 0."""
+    shown = ([False, True], [True, False])
+    buttons = [
+        {"label": name, "method": "restyle", "args": [{"visible": which}, [0, 1]]}
+        for name, which in zip(names, shown, strict=True)
+    ]
+    return {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1, "xanchor": "left",
+            "yanchor": "top", "showactive": True, "font": {"color": "#1b1f24"}}  # fmt: skip
+
+
+def _marks(name: str, places: Array, colour: str, symbol: str) -> go.Scatter3d:
+    x, y, z = places.T.astype(np.float32)
+    marker = {"size": 4, "color": colour, "symbol": symbol}
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, name=name, hoverinfo="name")
 
 
 def _segments(part: Segments, colours: Mapping[str, str]) -> go.Scatter3d:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.files import write_atomically
-from simtest.report import static, style, words
-from simtest.report.coverage import coverage
+from simtest.report import fineness, static, style, words
+from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.gallery import isophote_colour
 from simtest.report.paper.section import paper_section
 from simtest.report.run import Run, read_run
@@ -84,13 +84,16 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
             static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
             charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
     sections["coverage"] = coverage(run)
+    if is_anatomical(run):
+        sections["fineness"] = _fineness_section(folder, charts)
     paths = static.draw_gallery(run.gallery, colours, folder)
     sections["gallery"] = _gallery_section(run, paths)
     view = surface_3d(run)
     if view:
         path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
         charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
-        sections["view"] = {"title": view.title, "unit": view.unit, "picture": picture(path, 120_000)}
+        curved = view.curvature is not None
+        sections["view"] = {"title": view.title, "unit": view.unit, "curved": curved, "picture": picture(path, 120_000)}
     return sections, charts
 
 
@@ -104,6 +107,19 @@ def _line_section(figure: LineFigure) -> dict[str, Any]:
         "marks": [(marks[label].text, label) for label in figure.labels] if len(figure.labels) > 1 else [],
         "binned": any(not curve.joined for curve in figure.curves),
     }
+
+
+def _fineness_section(folder: Path, charts: dict[str, str]) -> dict[str, Any]:
+    from simtest.report import interactive
+
+    study = fineness.read_study()
+    static.save(fineness.draw(study), folder / "fineness.png")
+    charts["fineness"] = interactive.to_json(fineness.interactive(study))
+    marks = style.symbols(study.surfaces)
+    return {
+        "distance": study.distance_mm, "exponent": study.exponent, "sentence": study.sentence(),
+        "marks": [(marks[name].text, name) for name in study.surfaces],
+    }  # fmt: skip
 
 
 def _gallery_section(run: Run, paths: Sequence[Path]) -> list[dict[str, Any]]:
@@ -165,6 +181,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         heat=sections.get("heat", []),
         surfaces=sections.get("surfaces"),
         coverage=sections["coverage"],
+        fineness=sections.get("fineness"),
         gallery=sections["gallery"],
         gallery_total=run.gallery_total,
         first=_FIRST,

@@ -11,7 +11,7 @@ from simtest.report.curves import Curve, finite
 from simtest.report.gallery import draw_item
 from simtest.report.run import GalleryItem
 from simtest.report.series import LineFigure
-from simtest.report.style import NEUTRAL, Array, Axis
+from simtest.report.style import LIGHT, NEUTRAL, Array, Axis
 from simtest.report.surface3d import Surface3D
 from simtest.report.tables import HeatMap, SurfaceFigure
 
@@ -184,21 +184,32 @@ def draw_surfaces(data: SurfaceFigure, colours: Mapping[str, str]) -> "Figure":
 
 
 def draw_surface_3d(data: Surface3D, colours: Mapping[str, str]) -> "Figure":
-    """Draw the surface seen from beside the camera, shaded by the frame, with its normals."""
+    """Draw the surface seen from beside the camera, by curvature or shaded by the frame, with its normals."""
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(7.2, 6.2), layout="constrained")
     ax: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     x, y, z = _upright(data.vertices)
-    mesh = ax.plot_trisurf(x, y, z, triangles=data.triangles, cmap="gray", linewidth=0, antialiased=False, zorder=1)
-    mesh.set_array(data.intensity[data.triangles].mean(axis=1) ** (1 / 2.2))
-    mesh.set_clim(-0.35, 1)
+    colour_map = "gray" if data.curvature is None else "RdBu_r"
+    mesh = ax.plot_trisurf(x, y, z, triangles=data.triangles, cmap=colour_map, linewidth=0, antialiased=False, zorder=1)
+    if data.curvature is None:
+        mesh.set_array(data.intensity[data.triangles].mean(axis=1) ** (1 / 2.2))
+        mesh.set_clim(-0.35, 1)
+    else:
+        mesh.set_array(data.curvature[data.triangles].mean(axis=1))
+        mesh.set_clim(-data.curvature_limit, data.curvature_limit)
+        figure.colorbar(mesh, ax=ax, shrink=0.5, label=f"curvature of larger size (1/{data.unit}), convex positive")
     for part in data.segments:
         colour = colours[part.estimator] if part.estimator else segment_colour(part.name)
         for i, (start, end) in enumerate(zip(part.start, part.end, strict=True)):
             ends = _upright(np.stack([start, end]))
             width = 0.9 if part.name in ("true normals", "sightline from the camera") else 2.2
             ax.plot(*ends, color=colour, lw=width, label=part.name if i == 0 else None, zorder=2)
+    for name, places, marker, colour in (
+        ("camera", np.zeros((1, 3)), "D", NEUTRAL),
+        ("light", data.lights, "o", LIGHT),
+    ):
+        ax.scatter(*_upright(places), color=colour, marker=marker, s=18, label=name if len(places) else None, zorder=3)
     ax.set_aspect("equal")
     ax.set(xlabel=f"x ({data.unit})", ylabel=f"z, depth ({data.unit})", zlabel=f"−y, up ({data.unit})")
     ax.view_init(elev=28, azim=-65)

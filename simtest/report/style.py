@@ -25,6 +25,9 @@ _FURTHER = ("#A6761D", "#7A8B99", "#B2478F", "#4E9A9A", "#9A9A2E", "#C08A7A")
 NEUTRAL = "#7D828A"
 """Grey of laws and truth: readable on light and on dark."""
 
+LIGHT = "#F2C500"
+"""Yellow of lights in 3D views."""
+
 TRUTH = "#F5D90A"
 """Yellow of the truth on top of frames."""
 
@@ -145,10 +148,13 @@ class Axis:
 
 
 def curvature_axis(values: npt.ArrayLike, title: str) -> Axis:
-    """Choose the axis for curvature: stretched where the values span more than a factor of ten, else linear."""
+    """Choose the axis for curvature: stretched where the values span more than a factor of ten, else linear.
+
+    The smallest twentieth and the largest do not count: among the many highlights of anatomies there are always some.
+    """
     size = np.abs(np.asarray(values, dtype=float))
     size = size[np.isfinite(size) & (size > 1e-9)]
-    wide = size.size > 1 and size.max() / size.min() > 10
+    wide = size.size > 1 and np.quantile(size, 0.95) / np.quantile(size, 0.05) > 10
     return Axis(title, "stretched" if wide else "linear")
 
 

@@ -26,7 +26,11 @@ class Segments:
 
 @dataclass(frozen=True)
 class Surface3D:
-    """A triangle mesh in the camera frame with a grey value per vertex, and normals as segments."""
+    """A triangle mesh in the camera frame with a grey value per vertex, and normals as segments.
+
+    `curvature`, where the run kept it, is the principal curvature of larger size at the vertices; `lights` are places,
+    shape (L, 3).
+    """
 
     title: str
     vertices: Array
@@ -34,6 +38,15 @@ class Surface3D:
     intensity: Array
     segments: tuple[Segments, ...]
     unit: str
+    curvature: Array | None
+    lights: Array
+
+    @property
+    def curvature_limit(self) -> float:
+        """Curvature at which the colours end: a few sharp edges must not take them all."""
+        assert self.curvature is not None
+        finite = np.abs(self.curvature[np.isfinite(self.curvature)])
+        return max(float(np.quantile(finite, 0.97)), 1e-4) if finite.size else 1.0
 
 
 def surface_3d(run: Run) -> Surface3D | None:
@@ -67,16 +80,20 @@ def _build(item: GalleryItem) -> Surface3D | None:
     position = item.position[::step, ::step].astype(float)
     normal = item.normal[::step, ::step].astype(float)
     valid = np.isfinite(position).all(axis=-1)
+    kept = item.pictures.get("curvature")
+    curvature = None if kept is None else kept[::step, ::step].astype(float)[valid]
     index = np.cumsum(valid.ravel()).reshape(valid.shape) - 1
     triangles = _triangles(position, valid, index)
     if not len(triangles):
         return None
     vertices = position[valid]
     reach = 0.12 * float(np.median(np.linalg.norm(vertices, axis=1)))
+    name, setting = item.meta.get("label") or item.meta.get("surface") or item.name, item.meta.get("setting", "")
     return Surface3D(
-        f"{item.meta.get('label') or item.meta.get('surface') or item.name}: {item.meta.get('setting', '')}",
+        setting if setting.startswith(name) else f"{name}: {setting}",
         vertices, triangles, _intensity(item, position.shape[:2], step)[valid],
-        (_sparse(position, normal, valid, reach), *_highlights(item, 2.5 * reach)), item.length_unit,
+        (_sparse(position, normal, valid, reach), *_highlights(item, 2.5 * reach)), item.length_unit, curvature,
+        np.asarray(item.meta.get("lights") or [], dtype=float).reshape(-1, 3),
     )  # fmt: skip
 
 

@@ -102,8 +102,9 @@ def measured(figure: LineFigure) -> list[str]:
             text += f"largest departure {number(gap)}{unit} ({where})"
         lines.append(text + ".")
     if figure.empty:
-        shown = "; ".join(figure.empty[:6]) + ("; …" if len(figure.empty) > 6 else "")
-        lines.append(f"No value, so no point, at {len(figure.empty)} places: {shown}.")
+        places = "one place" if len(figure.empty) == 1 else f"{len(figure.empty)} places"
+        shown = "; ".join(figure.empty[:6]) + ("; …" if len(figure.empty) > 6 else ".")
+        lines.append(f"No value, so no point, at {places}: {shown}")
     return lines
 
 

@@ -52,13 +52,14 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "sigma": seen.scene.sensor.noise_sigma,
         "command": command,
         "camera": camera_table(camera),
+        "lights": np.asarray(seen.scene.rig.true_mm()).tolist(),
         "truth": [_truth(j, judged) for j, judged in enumerate(made.truths)],
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made, camera)],
     }
 
     # Pictures are encoded once more where they are drawn.
     linear = seen.scene.sensor.response.model().decode(made.frame)
-    write_item(path, meta, linear, truth.position, truth.normal)
+    write_item(path, meta, linear, truth.position, truth.normal, curvature=truth.larger_curvature)
 
 
 def write_item(path: Path, meta: dict[str, Any], frame: Any, position: Any, normal: Any, **more: Any) -> None:

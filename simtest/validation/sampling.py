@@ -15,6 +15,9 @@ NO_HIGHLIGHT = "no highlight in view"
 Tell = Callable[[int, int, str], None]
 """Called with views found, views wanted, and what was tried last."""
 
+Keep = Callable[[View], dict[str, Any]]
+"""Called with each view that is kept; what it gives goes into views.json beside the view's place."""
+
 
 @dataclass(frozen=True)
 class SampledViews:
@@ -29,11 +32,14 @@ class SampledViews:
     rejected : dict
         Number of places left out by reason: `NO_HIGHLIGHT`, or why the last condition of theory.md section 6 that a
         highlight of the view came to was not met.
+    more : list of dict
+        What else is known of each, such as the pose.
     """
 
     places: list[int | float]
     highlights: list[int]
     rejected: dict[str, int]
+    more: list[dict[str, Any]]
 
     @property
     def tried(self) -> int:
@@ -42,7 +48,10 @@ class SampledViews:
 
     def as_dict(self, key: str) -> dict[str, Any]:
         """Give the content of views.json; `key` is the key path that the places are values of."""
-        accepted = [{key: p, "isolated_highlights": n} for p, n in zip(self.places, self.highlights, strict=True)]
+        accepted = [
+            {key: place, "isolated_highlights": number, **more}
+            for place, number, more in zip(self.places, self.highlights, self.more, strict=True)
+        ]
         return {"tried": self.tried, "accepted": accepted, "rejected": self.rejected}
 
 
@@ -52,6 +61,8 @@ def sample_views(
     places: Iterable[int | float],
     variant: str | None = None,
     tell: Tell | None = None,
+    keep: Keep | None = None,
+    every: bool = False,
 ) -> SampledViews:
     """Try places one after the other until enough of them show an isolated highlight.
 
@@ -67,6 +78,10 @@ def sample_views(
         Mitsuba variant.
     tell : callable, optional
         See `Tell`.
+    keep : callable, optional
+        See `Keep`.
+    every : bool
+        Leave no place out, whatever it shows: a sequence.
 
     Returns
     -------
@@ -83,6 +98,7 @@ def sample_views(
     session: Session | None = None
     found: list[int | float] = []
     numbers: list[int] = []
+    more: list[dict[str, Any]] = []
     rejected: Counter[str] = Counter()
     for place in places:
         surface = scene.surface.model_copy(update={name: place})
@@ -90,16 +106,18 @@ def sample_views(
         session = session or Session(at_place, variant)
         seen = view(session, at_place)
         isolated = sum(truth.isolated for truth in seen.truths)
-        if isolated:
+        if isolated or every:
             found.append(place)
             numbers.append(isolated)
+            pose = {"model_from_camera": session.surface.model_from_camera.tolist()}
+            more.append({**pose, **(keep(seen) if keep else {})})
         else:
             rejected[_why(seen)] += 1
         if tell:
             tell(len(found), count, f"{key} = {place:g}")
         if len(found) == count:
             break
-    return SampledViews(found, numbers, dict(rejected.most_common()))
+    return SampledViews(found, numbers, dict(rejected.most_common()), more)
 
 
 def candidates(scene: Scene, count: int) -> list[int | float]:
@@ -107,6 +125,21 @@ def candidates(scene: Scene, count: int) -> list[int | float]:
     if place_key(scene) == "surface.viewpoint":
         return list(range(count))
     return [round(0.5 + 0.6180339887498949 * i, 9) % 1 for i in range(count)]
+
+
+def along_path(scene: Scene, count: int, first: float, last: float) -> list[int | float]:
+    """Give places evenly spaced along the camera path, in order.
+
+    Raises
+    ------
+    InputError
+        If the scene's views are not on the path, or a share is out of range.
+    """
+    if place_key(scene) == "surface.viewpoint":
+        raise InputError("surface.view = auto: views along the path need another; allowed: path, off_axis, wall")
+    if not (0 <= first <= 1 and 0 <= last <= 1):
+        raise InputError(f"along = {first:g}, {last:g}: must be shares of the path in [0, 1]")
+    return [round(first + (last - first) * i / max(count - 1, 1), 9) for i in range(count)]
 
 
 def place_key(scene: Scene) -> str:

@@ -113,7 +113,7 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
 def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     stride = max(1, -(-max(session.camera.width, session.camera.height) // GRID))
     truth = session.truth(stride)
-    position, k_min, k_max = (np.asarray(part, dtype=float) for part in (truth.position, truth.k_min, truth.k_max))
+    position, curvature = (np.asarray(part, dtype=float) for part in (truth.position, truth.larger_curvature))
     valid = np.isfinite(position).all(axis=-1)
     number = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, -1)
     distance = np.linalg.norm(position, axis=-1)
@@ -125,8 +125,7 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     faces = np.concatenate([np.stack([a, c, b], axis=1)[whole], np.stack([b, c, d], axis=1)[whole]])
     if not len(faces):
         raise InputError("the camera sees no surface; move it or choose another viewpoint")
-    larger = np.where(np.abs(k_max) >= np.abs(k_min), k_max, k_min)
-    return position[valid], faces, larger[valid]
+    return position[valid], faces, curvature[valid]
 
 
 def _estimates(

@@ -5,7 +5,8 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.spec import load_experiment
+from simtest.rendering import Session
+from simtest.spec import load_experiment, load_scene
 from simtest.validation.runner import run_experiment
 
 pytestmark = pytest.mark.render
@@ -49,6 +50,22 @@ def test_real_meshes_give_results(shared_data, tmp_path, name):
 def test_real_meshes_give_at_least_20_specularities(shared_data, tmp_path, name):
     results = results_of(shared_data / "meshes" / f"{name}.ply", range(20), tmp_path / name)
     assert median_error(results, "cone_axis")[1] >= 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["colon", "liver"])
+def test_rendered_normals_are_those_of_the_smooth_surface(name):
+    """As the pixels of frames see them; at silhouettes the triangles' rim is off."""
+    session, errors = Session(load_scene("anatomy", {"surface.path": name})), []
+    for viewpoint in range(60_000, 60_003):
+        session.update(load_scene("anatomy", {"surface.path": name, "surface.viewpoint": viewpoint}))
+        truth = session.truth(2)
+        sine = np.linalg.norm(np.cross(truth.shading_normal, truth.normal), axis=-1)
+        errors.append(np.degrees(np.arcsin(sine[np.isfinite(sine)].clip(max=1))))
+    found = np.concatenate(errors)
+    assert len(found) > 50_000
+    assert found.mean() < 0.05
+    assert np.quantile(found, 0.999) < 0.3
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import pytest
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.report import write_report
+from simtest.report.interactive import surface_3d as interactive_surface
 from simtest.report.run import read_run
 from simtest.report.series import law_misses, line_figures
 from simtest.report.static import heat_range
@@ -113,7 +114,7 @@ def summarise(rows):
     return settings
 
 
-def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose", detail=8):
+def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose", detail=8, curved=False):
     """One cylinder seen from outside, with a true highlight and two estimates."""
     width, height = size
     camera = Camera.from_fov(60, width, height)
@@ -159,8 +160,12 @@ def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     step = max(1, width // detail)
+    more = {}
+    if curved:
+        meta["lights"] = [[1.0, 2.0, 0.0]]
+        more["curvature"] = np.where(np.isfinite(distance), 1 / radius, np.nan)[::step, ::step].astype(np.float16)
     np.savez(path, frame=frame.astype(np.float32), position=position[::step, ::step].astype(np.float32),
-             normal=normal[::step, ::step].astype(np.float32), meta=json.dumps(meta))  # fmt: skip
+             normal=normal[::step, ::step].astype(np.float32), meta=json.dumps(meta), **more)  # fmt: skip
 
 
 PROVENANCE = {
@@ -245,6 +250,22 @@ def test_overview_page_has_its_sections(overview):
     assert {"viewport"} <= {attrs.get("name") for tag, attrs in page.tags if tag == "meta"}
 
 
+def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
+    path = make_run(tmp_path, items=0)
+    make_item(path / "gallery" / "item_00.npz", radius=4.0, curved=True)
+    view = surface_3d(read_run(path))
+    np.testing.assert_allclose(view.curvature, 0.25, rtol=1e-3)
+    assert view.curvature.shape == view.intensity.shape
+    assert view.curvature_limit == pytest.approx(0.25, rel=1e-3)
+    figure = interactive_surface(view, colours(ESTIMATORS))
+    assert [trace.visible for trace in figure.data if trace.type == "mesh3d"] == [False, True]
+    assert [button.label for button in figure.layout.updatemenus[0].buttons] == ["curvature", "picture"]
+    (light,) = [trace for trace in figure.data if trace.name == "light"]
+    assert [light[axis][0] for axis in "xyz"] == [1.0, 2.0, 0.0]
+    page = write_report(path)
+    assert "coloured by its curvature" in page.read_text(encoding="utf-8")
+
+
 def test_overview_figures_are_written(overview):
     path, _ = overview
     names = {file.name for file in (path / "figures").iterdir()}
@@ -321,8 +342,10 @@ def test_anatomy_gives_surfaces_and_bins(tmp_path):
     path = make_run(tmp_path, "anatomy", realisations=3)
     run = read_run(path)
     page = read_page(write_report(path))
-    assert {"surfaces", "coverage", "error_vs_curvature"} <= page.ids()
+    assert {"surfaces", "coverage", "error_vs_curvature", "fineness"} <= page.ids()
     assert png_size(path / "figures" / "anatomy.png")[0] > 800
+    # What triangles alone cost is shown with every run over anatomies, and with no other.
+    assert png_size(path / "figures" / "fineness.png")[0] > 800
     figure = line_figures(run)[0]
     assert not any(curve.joined for curve in figure.curves)
     assert all(curve.x.size <= 12 for curve in figure.curves)

@@ -3,12 +3,14 @@
 import itertools
 import json
 
+import cv2
+import numpy as np
 import pytest
 
 from simtest import api
 from simtest.errors import InputError
 from simtest.spec import load_scene
-from simtest.validation.sampling import NO_HIGHLIGHT, candidates, sample_views
+from simtest.validation.sampling import NO_HIGHLIGHT, along_path, candidates, sample_views
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
 
@@ -42,6 +44,7 @@ def test_a_view_into_the_noise_is_rejected_for_it(tmp_path):
     assert set(sampled.rejected) - {NO_HIGHLIGHT}
     written = json.loads((tmp_path / "views.json").read_text())
     assert written == {"tried": 10, "accepted": [], "rejected": sampled.rejected}
+    assert not (tmp_path / "sheet.png").exists()
 
 
 def test_only_anatomies_are_sampled(tmp_path):
@@ -49,3 +52,36 @@ def test_only_anatomies_are_sampled(tmp_path):
         api.sample_views("plane", tmp_path)
     with pytest.raises(InputError, match="count = 0"):
         api.sample_views("anatomy", tmp_path, 0)
+
+
+@pytest.mark.render
+def test_a_sequence_leaves_no_place_out_and_is_a_film(tmp_path):
+    (tmp_path / "view_0007.png").write_text("of an earlier call")
+    settings = {**SMALL, "surface.view": "path", "sensor.exposure.percentile": 99.5}
+    sampled = api.sample_views("anatomy", tmp_path, 4, settings, along=(0.4, 0.43))
+    assert sampled.places == pytest.approx([0.4, 0.41, 0.42, 0.43])
+    assert not sampled.rejected
+    written = json.loads((tmp_path / "views.json").read_text())["accepted"]
+    poses = np.array([view["model_from_camera"] for view in written])
+    # A hundredth of a path of about 90 mm between frames, and hardly a turn.
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert ((steps > 0.3) & (steps < 2)).all()
+    for a, b in itertools.pairwise(poses[:, :3, 2]):
+        assert a @ b > 0.99
+    assert [view["sensor.seed"] for view in written] == [0, 1, 2, 3]
+    pictures = [cv2.imread(str(tmp_path / view["picture"])) for view in written]
+    film = cv2.VideoCapture(str(tmp_path / "film.avi"))
+    frames = []
+    while (read := film.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == len(pictures) == len(list(tmp_path.glob("view_*.png"))) == 4
+    for frame, picture in zip(frames, pictures, strict=True):
+        assert np.abs(cv2.blur(frame, (9, 9)).astype(float) - cv2.blur(picture, (9, 9))).mean() < 6
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape == (120, 4 * 160, 3)
+
+
+def test_a_sequence_needs_a_path():
+    with pytest.raises(InputError, match=r"surface\.view = auto"):
+        along_path(load_scene("anatomy"), 3, 0.0, 1.0)
+    with pytest.raises(InputError, match=r"along = 0\.5, 1\.5"):
+        along_path(load_scene("anatomy", {"surface.view": "path"}), 3, 0.5, 1.5)
