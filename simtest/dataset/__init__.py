@@ -1,5 +1,23 @@
-"""Labelled frames on disk: what a rendered frame holds and how it is written."""
+"""Labelled frames on disk: one rendered frame with its truth, and datasets of many."""
 
-from simtest.dataset.frame import LabelledFrame, make_frame, write_frame
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["LabelledFrame", "make_frame", "write_frame"]
+if TYPE_CHECKING:
+    from simtest.dataset.fields import FIELDS
+    from simtest.dataset.frame import LabelledFrame, make_frame, write_frame
+    from simtest.dataset.reader import read
+
+_HOMES = {
+    "FIELDS": "fields", "LabelledFrame": "frame", "make_frame": "frame", "write_frame": "frame", "read": "reader",
+}  # fmt: skip
+
+__all__ = ["FIELDS", "LabelledFrame", "make_frame", "read", "write_frame"]
+
+
+def __getattr__(name: str) -> Any:
+    # Reading a dataset needs no renderer.
+    if name not in _HOMES:
+        raise AttributeError(f"module 'simtest.dataset' has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(f"simtest.dataset.{_HOMES[name]}"), name)
