@@ -131,7 +131,7 @@ def decode_octahedral(square: Array) -> Array:
 
 
 NORMAL_LEVELS = 16383
-"""14 bits for each of the two coordinates: 0.012 deg at most, and a third smaller than 16 bits."""
+"""14 bits for each of the two coordinates: 0.015 deg at most, and a third smaller than 16 bits."""
 
 
 def _encode_normal(normal: Array) -> bytes:

@@ -1,6 +1,7 @@
 """A Ray cluster (extra ``ray``): each task runs on some node, and again on another where a node or process dies."""
 
 import os
+import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -10,6 +11,10 @@ from simtest.errors import InputError, SimtestError
 
 POLL_S = 1.0
 """How long one wait lasts; between two of them Ctrl-C is answered."""
+
+
+ANSWER_S = 5.0
+"""How long a cluster's head may take to answer."""
 
 
 class RayEngine:
@@ -54,6 +59,8 @@ class RayEngine:
     def _join(self) -> None:
         ray = self._ray
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        if self._address is not None:
+            _check_address(self._address)
         try:
             if self._address is None:
                 ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
@@ -96,6 +103,17 @@ class RayEngine:
         except ray.exceptions.RayError as error:
             said = str(error).splitlines()[0][:160]
             raise SimtestError(f"the cluster lost a task ({said}); what is finished is kept") from error
+
+
+def _check_address(address: str) -> None:
+    """Raise `InputError` where nobody listens; Ray itself would try for minutes, then end the process."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise InputError(f"--address {address}: must be HOST:PORT, that of the cluster's head")
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        raise InputError(f"--address {address}: no Ray cluster answers ({error.strerror or error})") from None
 
 
 def _work(task: Task, argument: Any, threads: int) -> tuple[Any, int]:
