@@ -1,19 +1,16 @@
 """`simtest dataset`: make a labelled dataset, check it, look at it."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Seed, Settings, Variant, whole_number
+from simtest.cli.options import Address, EngineName, Seed, Settings, Variant, Workers, whole_number
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
 
 Folder = Annotated[Path, Parameter(help="The dataset's folder.")]
 Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
-EngineName = Annotated[Literal["local", "ray"], Parameter(name="--engine", help="local processes, or a Ray cluster.")]
-Workers = Annotated[int, Parameter(help="Processes that render at once.", converter=whole_number)]
-Address = Annotated[str | None, Parameter(help="Of the Ray cluster's head; default: one is started here.")]
 
 
 @dataset.default
@@ -38,7 +35,7 @@ def make(
         A dataset file, or the name of a shipped one: endoscopy, tiny.
     """
     from simtest.cli.progress import progress_bar
-    from simtest.dataset.writer import write_dataset
+    from simtest.dataset.writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.engines import make_engine
     from simtest.spec import load_dataset, parse_settings
 
@@ -47,7 +44,8 @@ def make(
     }
     wanted = load_dataset(described, values)
     with progress_bar("writing the tables") as progress:
-        chosen = make_engine(engine, workers, address, gpu=bool(variant and variant.startswith("cuda")))
+        gpu = bool(variant and variant.startswith("cuda"))
+        chosen = make_engine(engine, workers, address, gpu, SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
     print(out / "README.md")
 
@@ -66,6 +64,7 @@ def verify(
     from simtest.cli.progress import progress_bar
     from simtest.dataset.verify import mend
     from simtest.dataset.verify import verify as check
+    from simtest.dataset.writer import SHARDS_PER_PROCESS
     from simtest.engines import make_engine
 
     with progress_bar("done") as progress:
@@ -73,7 +72,7 @@ def verify(
         for fault in faults:
             print(fault)
         if faults and repair:
-            left = mend(folder, faults, make_engine(engine, workers, address), progress)
+            left = mend(folder, faults, make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS), progress)
             print(*(f"still broken: {fault}" for fault in left), sep="\n", end="\n" * bool(left))
             print("mended" if not left else f"{len(left)} faults are left")
             return 1 if left else 0

@@ -33,6 +33,9 @@ from simtest.validation.runner import Progress
 
 PART = ".part"
 
+SHARDS_PER_PROCESS = 8
+"""A process is renewed after so many, since rebuilding scenes in a loop grows memory."""
+
 
 @dataclass(frozen=True)
 class ShardTask:

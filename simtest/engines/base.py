@@ -52,7 +52,13 @@ def check_workers(workers: int) -> None:
         raise InputError(f"workers = {workers!r}: must be 1 to {MAX_WORKERS}")
 
 
-def make_engine(name: str = "local", workers: int = 1, address: str | None = None, gpu: bool = False) -> Engine:
+def make_engine(
+    name: str = "local",
+    workers: int = 1,
+    address: str | None = None,
+    gpu: bool = False,
+    renew_after: int | None = None,
+) -> Engine:
     """Give an engine by name.
 
     Parameters
@@ -65,6 +71,8 @@ def make_engine(name: str = "local", workers: int = 1, address: str | None = Non
         Of the Ray cluster's head; default: one is started here.
     gpu : bool
         Whether each of a cluster's tasks needs a GPU.
+    renew_after : int, optional
+        Tasks after which a process is replaced, so that what libraries leak does not add up; default never.
 
     Returns
     -------
@@ -81,9 +89,9 @@ def make_engine(name: str = "local", workers: int = 1, address: str | None = Non
 
         if address is not None:
             raise InputError(f"--address {address}: is for --engine ray")
-        return LocalEngine(workers)
+        return LocalEngine(workers, renew_after)
     if name == "ray":
         from simtest.engines.cluster import RayEngine
 
-        return RayEngine(workers, address, gpu)
+        return RayEngine(workers, address, gpu, renew_after)
     raise InputError(f"engine = {name!r}: unknown; allowed: {', '.join(ENGINES)}")

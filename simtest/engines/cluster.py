@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from simtest.engines.base import MAX_DEATHS, Task, Tell
-from simtest.engines.local import TASKS_PER_PROCESS
 from simtest.errors import InputError, SimtestError
 
 POLL_S = 1.0
@@ -29,6 +28,8 @@ class RayEngine:
         with the run.
     gpu : bool
         Whether each task needs a GPU.
+    renew_after : int, optional
+        Tasks after which a process is replaced; default never.
 
     Raises
     ------
@@ -36,13 +37,16 @@ class RayEngine:
         If Ray is not installed.
     """
 
-    def __init__(self, workers: int, address: str | None = None, gpu: bool = False) -> None:
+    def __init__(
+        self, workers: int, address: str | None = None, gpu: bool = False, renew_after: int | None = None
+    ) -> None:
         try:
             import ray
         except ImportError:
             raise InputError("engine = 'ray': needs Ray; install simtest[ray]") from None
         self._ray: Any = ray
         self._workers, self._address, self._gpu = workers, address, gpu
+        self._renew_after = renew_after
 
     def run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
         """See `Engine.run`; steps are told when their task is finished."""
@@ -76,7 +80,7 @@ class RayEngine:
         cores = sum(node["Resources"].get("CPU", 1) for node in nodes)
         each = max(1, int(cores // self._workers))
         remote = ray.remote(
-            num_cpus=each, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=TASKS_PER_PROCESS
+            num_cpus=each, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=self._renew_after or 0
         )(_work)
         waiting = list(enumerate(arguments))
         running: dict[Any, int] = {}

@@ -13,9 +13,6 @@ from typing import Any
 from simtest.engines.base import MAX_DEATHS, Task, Tell
 from simtest.errors import SimtestError
 
-TASKS_PER_PROCESS = 8
-"""A process is renewed after so many tasks, so that what libraries leak does not add up."""
-
 
 @dataclass
 class _Worker:
@@ -32,24 +29,27 @@ class LocalEngine:
     ----------
     workers : int
         Number of processes.
+    renew_after : int, optional
+        Tasks after which a process is replaced, so that what libraries leak does not add up; default never.
     """
 
-    def __init__(self, workers: int) -> None:
-        self._workers = workers
+    def __init__(self, workers: int, renew_after: int | None = None) -> None:
+        self._workers, self._renew_after = workers, renew_after
 
     def run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
         """See `Engine.run`."""
         if self._workers == 1:
             yield from ((i, task(argument, tell)) for i, argument in enumerate(arguments))
             return
-        yield from _Pool(min(self._workers, len(arguments)), task, arguments).run(tell)
+        yield from _Pool(min(self._workers, len(arguments)), task, arguments, self._renew_after).run(tell)
 
 
 class _Pool:
     """The processes of one run."""
 
-    def __init__(self, workers: int, task: Task, arguments: Sequence[Any]) -> None:
+    def __init__(self, workers: int, task: Task, arguments: Sequence[Any], renew_after: int | None) -> None:
         self._count, self._task, self._arguments = workers, task, arguments
+        self._renew_after = renew_after
         self._waiting = deque(range(len(arguments)))
         self._deaths = [0] * len(arguments)
         self._left = len(arguments)
@@ -110,7 +110,7 @@ class _Pool:
             assert number is not None
             worker.doing, worker.done = None, worker.done + 1
             self._left -= 1
-            if worker.done >= TASKS_PER_PROCESS:
+            if self._renew_after is not None and worker.done >= self._renew_after:
                 self._release(worker)
             yield number, content
 

@@ -122,7 +122,7 @@ BAD_USE = {
     "render plane --out x --set surface.tilt_deg=steep": "surface.tilt_deg = 'steep': must be a number",
     "render plane --out x --set rig.lights.3.power=2": "index 3 is not allowed; the first item is 0",
     "render plane --out x --set surface.tilt_deg.x=1": "surface.tilt_deg is a plain value, not a table",
-    "schema kidney": 'Invalid value "kidney" for OF. Choose from: "scene", "experiment", "camera"',
+    "schema kidney": 'Invalid value "kidney" for OF. Choose from: "scene", "experiment", "dataset"',
     "doctor extra": "Unused Tokens: ['extra']",
     "validate": 'Command "validate" parameter EXPERIMENT requires an argument',
     "validate plain": "plain: no such file; shipped by name: anatomy, camera, colon, curvature",

@@ -488,5 +488,5 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
     assert len(told) == 5
     arguments = [(str(tmp_path), i) for i in range(3)]
     assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
-    with pytest.raises(SimtestError, match="no such number: [12]"):
+    with pytest.raises(SimtestError, match=r"no such number: [12]"):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
