@@ -95,39 +95,51 @@ def depth_scale_mm(depth: Array) -> float:
 
 
 def _encode_depth(depth: Array) -> bytes:
-    counts = np.rint(np.nan_to_num(depth, nan=0.0) / depth_scale_mm(depth)).astype(np.uint16)
-    return _png(counts, _SMOOTH)
+    counts = np.asarray(depth, dtype=np.float32) * np.float32(1 / depth_scale_mm(depth)) + np.float32(0.5)
+    return _png(np.nan_to_num(counts, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
 
 
 def _decode_depth(data: bytes, meta: dict[str, Any]) -> Array:
     counts = _pixels(data)
-    depth = counts * np.float32(meta["depth_scale_mm"])
-    depth[counts == 0] = np.nan
+    depth = counts.astype(np.float32)
+    depth *= meta["depth_scale_mm"]
+    missing = counts == 0
+    if missing.any():
+        depth[missing] = np.nan
     return depth
 
 
 # Normals -------------------------------------------------------------------------------------------------------------
 
 
-def encode_octahedral(normal: Array) -> Array:
-    """Give unit vectors, shape (..., 3), as points of the unit square, shape (..., 2): (0.5, 0.5) is (0, 0, -1).
+def encode_octahedral(normal: Array) -> tuple[Array, Array]:
+    """Give unit vectors, shape (..., 3), as two coordinates in [-1, 1], each of shape (...): (0, 0) is (0, 0, -1).
 
-    The octahedral map: v = (x, y) / (abs(x) + abs(y) + abs(z)); where z > 0, v = (1 - abs(v_y, v_x)) sign(v). Then
-    (v + 1) / 2. Camera-facing normals lie about the square's middle.
+    The octahedral map: (u, v) = (x, y) / (abs(x) + abs(y) + abs(z)); where z > 0,
+    (u, v) = (1 - abs(v), 1 - abs(u)) times their signs. Camera-facing normals lie about the square's middle.
     """
-    n = normal / np.sum(np.abs(normal), axis=-1, keepdims=True)
-    v = n[..., :2]
-    folded = (1 - np.abs(v[..., ::-1])) * np.where(v >= 0, 1, -1)
-    return np.asarray((np.where(n[..., 2:] > 0, folded, v) + 1) / 2)
+    x, y, z = (np.asarray(normal[..., k], dtype=np.float32) for k in range(3))
+    scale = 1 / (np.abs(x) + np.abs(y) + np.abs(z))
+    u, v = x * scale, y * scale
+    _fold(u, v, z > 0)
+    return u, v
 
 
-def decode_octahedral(square: Array) -> Array:
-    """Give the unit vectors, shape (..., 3), of points of the unit square, shape (..., 2)."""
-    v = 2 * square - 1
-    z = np.abs(v).sum(axis=-1, keepdims=True) - 1
-    folded = (1 - np.abs(v[..., ::-1])) * np.where(v >= 0, 1, -1)
-    n = np.concatenate([np.where(z > 0, folded, v), z], axis=-1)
-    return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
+def decode_octahedral(u: Array, v: Array) -> Array:
+    """Give the unit vectors, shape (..., 3), of two coordinates in [-1, 1]; they are changed on the way."""
+    z = np.abs(u) + np.abs(v) - 1
+    _fold(u, v, z > 0)
+    scale = 1 / np.sqrt(u * u + v * v + z * z)
+    return np.stack([u * scale, v * scale, z * scale], axis=-1)
+
+
+def _fold(u: Array, v: Array, outer: Array) -> None:
+    """Swap the square's corners, where z > 0, in place."""
+    # Few pixels see a surface that turns so far away from the optical axis.
+    if outer.any():
+        a, b = u[outer], v[outer]
+        u[outer] = np.copysign(1 - np.abs(b), a)
+        v[outer] = np.copysign(1 - np.abs(a), b)
 
 
 NORMAL_LEVELS = 16383
@@ -135,16 +147,22 @@ NORMAL_LEVELS = 16383
 
 
 def _encode_normal(normal: Array) -> bytes:
-    counts = 1 + np.rint(encode_octahedral(normal) * (NORMAL_LEVELS - 1))
-    counts = np.where(np.isfinite(counts), counts, 0).astype(np.uint16)
-    return _png(np.concatenate([counts[..., 0], counts[..., 1]], axis=0), _SMOOTH)
+    both = np.concatenate(encode_octahedral(normal), axis=0)
+    # 1 to the number of levels; what is not finite becomes 0.
+    both *= (NORMAL_LEVELS - 1) / 2
+    both += (NORMAL_LEVELS + 1) / 2 + 0.5
+    return _png(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
 
 
 def _decode_normal(data: bytes, _: dict[str, Any]) -> Array:
-    first, second = np.split(_pixels(data), 2, axis=0)
-    counts = np.stack([first, second], axis=-1).astype(np.float32)
-    normal = decode_octahedral((counts - 1) / np.float32(NORMAL_LEVELS - 1)).astype(np.float32)
-    normal[counts[..., 0] == 0] = np.nan
+    counts = _pixels(data)
+    both = counts.astype(np.float32)
+    both -= (NORMAL_LEVELS + 1) / 2
+    both *= 2 / (NORMAL_LEVELS - 1)
+    normal = decode_octahedral(*np.split(both, 2, axis=0))
+    missing = counts[: len(normal)] == 0
+    if missing.any():
+        normal[missing] = np.nan
     return normal
 
 
@@ -152,17 +170,22 @@ def _decode_normal(data: bytes, _: dict[str, Any]) -> Array:
 
 
 def _encode_curvature(curvature: Array) -> bytes:
-    counts = np.clip(np.rint(curvature / CURVATURE_SCALE) + OFFSET, 1, LEVELS)
-    counts = np.where(np.isfinite(counts), counts, 0).astype(np.uint16)
-    return _png(np.concatenate([counts[..., 0], counts[..., 1]], axis=0), _SMOOTH)
+    both = np.concatenate([curvature[..., 0], curvature[..., 1]], axis=0, dtype=np.float32)
+    both *= 1 / CURVATURE_SCALE
+    both += OFFSET + 0.5
+    np.clip(both, 1, LEVELS, out=both)
+    return _png(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
 
 
 def _decode_curvature(data: bytes, _: dict[str, Any]) -> Array:
-    first, second = np.split(_pixels(data), 2, axis=0)
-    counts = np.stack([first, second], axis=-1)
-    curvature = (counts.astype(np.float32) - OFFSET) * np.float32(CURVATURE_SCALE)
-    curvature[counts == 0] = np.nan
-    return curvature
+    counts = _pixels(data)
+    both = counts.astype(np.float32)
+    both -= OFFSET
+    both *= CURVATURE_SCALE
+    missing = counts == 0
+    if missing.any():
+        both[missing] = np.nan
+    return np.stack(np.split(both, 2, axis=0), axis=-1)
 
 
 # Pictures ------------------------------------------------------------------------------------------------------------
@@ -189,9 +212,9 @@ def _decode_half(data: bytes, _: dict[str, Any]) -> Array:
 
 _PART = "8-bit PNG, sRGB-encoded share of full scale, clipped"
 _OCTAHEDRAL = (
-    f"16-bit PNG of 2 H rows: u above v. 0: no surface. p = 2 (count - 1) / {NORMAL_LEVELS - 1} - 1 for both, "
-    "z = abs(p_u) + abs(p_v) - 1; where z > 0, p = (1 - abs(p_v, p_u)) sign(p_u, p_v); the normal is (p_u, p_v, z), "
-    "made a unit vector"
+    f"16-bit PNG of 2 H rows: u above v, each 2 (count - 1) / {NORMAL_LEVELS - 1} - 1; 0: no surface. "
+    "z = abs(u) + abs(v) - 1; where z > 0, (u, v) = (1 - abs(v), 1 - abs(u)) times the signs of u and v; the normal is "
+    "(u, v, z), made a unit vector"
 )
 _CURVATURE = (
     f"16-bit PNG of 2 H rows: k_min above k_max; k = (count - {OFFSET}) * {CURVATURE_SCALE:g}; 0: unknown; "

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,7 +58,10 @@ class Sample:
 
     def encode(self) -> dict[str, bytes]:
         """Give the members of the shard by suffix, the metadata last, with the hashes of the others."""
-        members = {field.suffix: field.encode(self.images[field.name]) for field in FIELDS if field.name in self.images}
+        here = [field for field in FIELDS if field.name in self.images]
+        with ThreadPoolExecutor(2) as threads:
+            encoded = threads.map(lambda field: field.encode(self.images[field.name]), here)
+            members = {field.suffix: data for field, data in zip(here, encoded, strict=True)}
         hashes = {suffix: hashlib.sha256(data).hexdigest() for suffix, data in members.items()}
         text = json.dumps({**self.meta, "sha256": hashes}, allow_nan=False, separators=(",", ":"))
         return {**members, "json": text.encode()}
