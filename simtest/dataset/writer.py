@@ -210,7 +210,7 @@ def _write_shard(folder: Path, maker: Maker, shard: Shard, tell: Tell) -> FileEn
         count = _go_on(file, shard)
         for _ in range(count):
             tell()
-        _append(file, maker, shard.indices[count:], tell)
+        append(file, maker, shard.indices[count:], tell)
         finish(file)
         file.flush()
         os.fsync(file.fileno())
@@ -239,7 +239,7 @@ def _go_on(file: IO[bytes], shard: Shard) -> int:
     return count
 
 
-def _append(file: IO[bytes], maker: Maker, indices: tuple[int, ...], tell: Tell) -> None:
+def append(file: IO[bytes], maker: Maker, indices: tuple[int, ...], tell: Tell) -> None:
     """Make samples; each is encoded and written while the next is rendered."""
     with ThreadPoolExecutor(1) as writer:
         before: Future[None] | None = None

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.again import compare, sample_again
 from simtest.dataset.index import TABLES
@@ -490,3 +491,35 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
     assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
     with pytest.raises(SimtestError, match=r"no such number: [12]"):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
+
+
+# Command line -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+def test_commands(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["simtest", "dataset", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().out.splitlines()
+
+    size = ["--samples", "6", "--set", "samples_per_anatomy=1"]
+    assert run("tiny", "--out", "made", *size) == (0, ["made/README.md"])
+    assert contents(tmp_path / "made") == contents(made)
+    assert run("verify", "made") == (0, ["sound"])
+    code, said = run("sample", "made", "2")
+    assert (code, said[-1].partition(": ")[2]) == (0, "same bytes")
+    assert run("preview", "made", "--samples", "3") == (0, ["preview.html"])
+    page = (tmp_path / "preview.html").read_text()
+    assert page.count('<section class="card">') == 3
+    assert "http" not in page.replace("http-equiv", "")
+    flip(tmp_path / "made" / TAR, 0.5)
+    code, said = run("verify", "made")
+    assert code == 1
+    assert said[-1] == "1 faults"
+    code, said = run("verify", "made", "--repair")
+    assert (code, said[-1]) == (0, "mended")
+    assert contents(tmp_path / "made") == contents(made)
