@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.dataset.frame import LabelledFrame, make_frame
+from simtest.engines import Engine, make_engine
 from simtest.errors import InputError
 from simtest.files import make_folder, write_json
 from simtest.reconstruction import reconstruct
@@ -157,6 +158,7 @@ def validate(
     variant: str | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    engine: Engine | None = None,
 ) -> Path:
     """Run an experiment and write its report.
 
@@ -175,7 +177,9 @@ def validate(
     progress : callable, optional
         Called with realisations done, realisations in all, and the name of the setting.
     workers : int
-        Processes for what is not rendered, >= 1.
+        Processes of this machine that work at once, >= 1.
+    engine : Engine, optional
+        Who does the work, in place of `workers` (see `simtest.engines.make_engine`).
 
     Returns
     -------
@@ -194,5 +198,5 @@ def validate(
     from simtest.validation.runner import run_experiment
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
-    run = run_experiment(described, Path(out), command, variant, progress, workers)
+    run = run_experiment(described, Path(out), command, variant, progress, engine or make_engine(workers=workers))
     return write_report(run.folder)

@@ -6,7 +6,6 @@ from simtest.anatomy.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.anatomy.base import SurfaceModel
 from simtest.anatomy.mesh_file import MESH_SUFFIXES
 from simtest.errors import InputError
-from simtest.resources import find
 from simtest.spec.surface import (
     AnatomySurface,
     CylinderSurface,
@@ -62,11 +61,13 @@ def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
 
     suffix = Path(spec.path).suffix.lower()
     if suffix in MESH_SUFFIXES:
+        if spec.recipe_values:
+            raise InputError(f"surface.path = {spec.path!r}: a mesh has no recipe; leave out seed and recipe")
         return MeshSurface(spec)
     if suffix not in ("", ".toml"):
         allowed = ", ".join((".toml", *MESH_SUFFIXES))
         raise InputError(
             f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name"
         )
-    recipe = load_recipe(find(spec.path, "meshes"))
+    recipe = load_recipe(spec.file(), spec.recipe_values)
     return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)

@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from simtest.anatomy.base import Array, TriangleMesh, principal_curvatures
-from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, recipe_from_dict
+from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, load_recipe
 from simtest.errors import InputError
 from simtest.resources import find
-from simtest.spec.reading import apply_settings, place, read_toml
 
 
 def load_anatomy(
@@ -38,7 +37,7 @@ def load_anatomy(
     """
     path = find(recipe if recipe is not None else kind, "meshes")
     values = {**(settings or {}), **({} if seed is None else {"seed": seed})}
-    described = recipe_from_dict(apply_settings(read_toml(path), values, str(path)), place(path, values))
+    described = load_recipe(path, values)
     if described.type != kind:
         raise InputError(f"{path}: type = {described.type!r}; simtest mesh {kind} needs {kind!r}")
     return described

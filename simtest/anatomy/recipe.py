@@ -1,13 +1,13 @@
 """Recipes of the generated anatomies: the sizes a colon or a liver is made from."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.spec.reading import Spec, read_toml, validate
+from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
@@ -125,13 +125,15 @@ class LiverRecipe(Spec):
         return self
 
 
-def load_recipe(path: str | Path) -> ColonRecipe | LiverRecipe:
+def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> ColonRecipe | LiverRecipe:
     """Read a recipe file.
 
     Parameters
     ----------
     path : str or Path
         A TOML file with the keys of `ColonRecipe` or `LiverRecipe`; ``type`` says which. Lengths in mm.
+    settings : mapping, optional
+        Values that replace those of the file, by key path; or nested tables of such values.
 
     Returns
     -------
@@ -142,7 +144,17 @@ def load_recipe(path: str | Path) -> ColonRecipe | LiverRecipe:
     InputError
         If the file is missing or malformed.
     """
-    return recipe_from_dict(read_toml(Path(path)), str(path))
+    path, values = Path(path), dict(_flat(settings or {}))
+    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), place(path, values))
+
+
+def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Give nested tables as values by key path."""
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
 
 
 def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | LiverRecipe:

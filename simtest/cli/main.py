@@ -22,13 +22,14 @@ APP = App(
 # Told here, since a sub-command's own text is loaded with it.
 _COMMANDS = {
     "doctor": "Check the rendering backend.",
-    "schema": "Print the JSON schema of a scene, experiment, camera or calibration file.",
+    "schema": "Print the JSON schema of a scene, experiment, dataset, camera or calibration file.",
     "render": "Render a scene with its ground truth.",
     "views": "Pick viewpoints of an anatomy that show isolated highlights.",
     "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture.",
     "validate": "Run an experiment and write its report.",
+    "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
 }
 for _name, _help in _COMMANDS.items():

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
@@ -31,6 +31,7 @@ Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.")
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]
 Workers = Annotated[
-    int,
-    Parameter(help="Processes for what is not rendered; rendering uses all cores by itself.", converter=whole_number),
+    int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)
 ]
+EngineName = Annotated[Literal["local", "ray"], Parameter(name="--engine", help="Local processes, or a Ray cluster.")]
+Address = Annotated[str | None, Parameter(help="Of the Ray cluster's head, HOST:PORT; default: one is started here.")]

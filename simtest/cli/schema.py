@@ -4,7 +4,7 @@ import json
 from typing import Literal
 
 
-def schema(of: Literal["scene", "experiment", "camera", "calibration"] = "scene", /) -> None:
+def schema(of: Literal["scene", "experiment", "dataset", "camera", "calibration"] = "scene", /) -> None:
     """Print the JSON schema of a file.
 
     Parameters
@@ -14,11 +14,12 @@ def schema(of: Literal["scene", "experiment", "camera", "calibration"] = "scene"
     """
     from pydantic import BaseModel
 
-    from simtest.spec import CalibrationSpec, CameraSpec, Experiment, Scene
+    from simtest.spec import CalibrationSpec, CameraSpec, Dataset, Experiment, Scene
 
     models: dict[str, type[BaseModel]] = {
         "scene": Scene,
         "experiment": Experiment,
+        "dataset": Dataset,
         "camera": CameraSpec,
         "calibration": CalibrationSpec,
     }

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Estimators, Realisations, Seed, Settings, Variant, Workers
+from simtest.cli.options import Address, EngineName, Estimators, Realisations, Seed, Settings, Variant, Workers
 
 DEFAULT_OUT = Path("reports/runs")
 
@@ -22,7 +22,9 @@ def validate(
     settings: Settings = None,
     estimators: Estimators = None,
     variant: Variant = None,
+    engine: EngineName = "local",
     workers: Workers = 1,
+    address: Address = None,
 ) -> None:
     """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
 
@@ -34,6 +36,7 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
+    from simtest.engines import make_engine
     from simtest.spec import load_experiment, parse_settings
 
     values = parse_settings(settings or [])
@@ -43,5 +46,6 @@ def validate(
     command = shlex.join(["simtest", *sys.argv[1:]])
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
-        page = run(described, folder, command=command, variant=variant, progress=progress, workers=workers)
+        chosen = make_engine(engine, workers, address, gpu=bool(variant and variant.startswith("cuda")))
+        page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
     print(page)

@@ -230,12 +230,22 @@ def load(variant: str | None = None) -> Any:
     if mitsuba.variant() != name:
         try:
             mitsuba.set_variant(name)
+            if threads := os.environ.get("SIMTEST_THREADS"):
+                _limit_threads(threads)
             # The first use tells: a GPU variant is accepted without a GPU.
             mitsuba.Float(0.0) + 1.0
         except (ImportError, RuntimeError) as error:
             cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
             raise BackendError(f"variant {name}: cannot be used here ({cause})") from error
     return mitsuba
+
+
+def _limit_threads(threads: str) -> None:
+    if not threads.isdecimal() or not 1 <= int(threads) <= 1024:
+        raise BackendError(f"SIMTEST_THREADS = {threads!r}: must be a number of threads, 1 to 1024")
+    import drjit
+
+    drjit.set_thread_count(int(threads))
 
 
 def _drjit_loaded() -> bool:

@@ -2,6 +2,7 @@
 
 from simtest.spec.calibration import CalibrationSpec, load_calibration
 from simtest.spec.camera import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
+from simtest.spec.dataset import Dataset, load_dataset
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
 from simtest.spec.rig import Emission, LightSpec, Rig
@@ -20,6 +21,7 @@ __all__ = [
     "CalibrationSpec",
     "CameraSpec",
     "CylinderSurface",
+    "Dataset",
     "Emission",
     "Experiment",
     "Group",
@@ -37,6 +39,7 @@ __all__ = [
     "describe_camera",
     "load_calibration",
     "load_camera",
+    "load_dataset",
     "load_experiment",
     "load_scene",
     "parse_settings",

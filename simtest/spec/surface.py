@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -92,6 +92,12 @@ class AnatomySurface(Spec):
     type: Literal["anatomy"] = "anatomy"
     path: str = Field(min_length=1, description="recipe by name or path (TOML), or a mesh file: PLY, OBJ, STL, VTK")
     kind: Literal["auto", "lumen", "organ"] = Field("auto", description="lumen: camera inside; organ: camera outside")
+    seed: int | None = Field(
+        None, ge=0, lt=2**32, description="seed of a recipe's irregularities, for another anatomy; default the recipe's"
+    )
+    recipe: dict[str, Any] = Field(
+        default_factory=dict, description="values that replace those of the recipe, by key path"
+    )
     viewpoint: int = Field(0, ge=0, le=10**6, description="number of the automatically chosen camera pose")
     subdivisions: int = Field(1, ge=0, le=3, description="Loop subdivisions of a user's mesh")
     edge_mm: EdgeLength | Literal["auto"] | None = Field(
@@ -132,6 +138,11 @@ class AnatomySurface(Spec):
     def label(self) -> str:
         """Name of the surface in the results."""
         return Path(self.path).stem
+
+    @property
+    def recipe_values(self) -> dict[str, Any]:
+        """The values that replace those of the recipe, the seed among them."""
+        return {**self.recipe, **({} if self.seed is None else {"seed": self.seed})}
 
     def file(self) -> Path:
         """Give the recipe's or mesh's file; raise `InputError` where there is none."""

@@ -162,7 +162,7 @@ def _check(case: Case, experiment: Experiment) -> None:
     for values in ends if len(lows) < 2 else (*ends, lows, highs):
         scene_from_dict(apply_settings(case.data, values, case.where), case.where)
     if isinstance(first.surface, AnatomySurface) and (file := first.surface.file()).suffix == ".toml":
-        load_recipe(file)
+        load_recipe(file, first.surface.recipe_values)
 
 
 def _expand_group(experiment: Experiment, group: Group) -> list[Case]:

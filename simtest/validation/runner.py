@@ -6,6 +6,7 @@ import json
 import re
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,30 +17,22 @@ import numpy as np
 import polars as pl
 
 from simtest import provenance
+from simtest.engines import Engine, make_engine
 from simtest.errors import InputError
-from simtest.estimators import Estimator, load_estimators
+from simtest.estimators import load_estimators
 from simtest.estimators.registry import distributions
 from simtest.files import write_atomically, write_json
-from simtest.rendering import Session, backend
+from simtest.rendering import backend
 from simtest.resources import shown
-from simtest.spec import Experiment, Scene
+from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
-from simtest.validation import gallery
 from simtest.validation.cases import Case, expand, swept_example
-from simtest.validation.metrics import completed, table
-from simtest.validation.paper.bound import cramer_rao_bound
-from simtest.validation.paper.item import save_realisation
-from simtest.validation.paper.rows import paper_rows
-from simtest.validation.pool import Pool, check_workers
-from simtest.validation.realise import View, realise, view
 from simtest.validation.statistics import summarise
+from simtest.validation.work import Part, forget, make_rows, parts_of
 
 GALLERY_ITEMS = 18
 PARTS = "parts"
-
-PAPER_CHUNK = 125
-"""Realisations of the published protocol that a worker makes at a time."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -73,7 +66,7 @@ def run_experiment(
     command: str = "",
     variant: str | None = None,
     progress: Progress | None = None,
-    workers: int = 1,
+    engine: Engine | None = None,
 ) -> Run:
     """Run an experiment, or go on with an interrupted run of the same.
 
@@ -90,8 +83,8 @@ def run_experiment(
         Mitsuba variant.
     progress : callable, optional
         See `Progress`.
-    workers : int
-        Processes for what is not rendered, >= 1; rendering uses all cores by itself. The rows do not depend on it.
+    engine : Engine, optional
+        Who does the work; default this process. The rows do not depend on it.
 
     Returns
     -------
@@ -106,17 +99,15 @@ def run_experiment(
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # All that may be refused is refused before the folder is touched.
-    check_workers(workers)
     cases = expand(experiment)
-    estimators = load_estimators(experiment.estimators)
+    load_estimators(experiment.estimators)
     digest = _fingerprint(experiment, cases, backend.requested_variant(variant))
     _check_folder(folder)
     finished = _finished(folder, digest, len(cases))
     if finished is not None:
         return finished
     parts = _prepare(folder, digest)
-    work = _Work(experiment, cases, estimators, folder, command, variant, workers)
-    resumed = work.run(parts, progress)
+    resumed = _work(experiment, cases, folder, variant, engine or make_engine(), progress)
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
     run = {
         "variant": backend.requested_variant(variant),
@@ -147,86 +138,46 @@ def _summary(experiment: Experiment, results: pl.DataFrame, run: dict[str, Any])
     return {"run": {**provenance.environment(), **run}, "experiments": {experiment.name: content}}
 
 
-@dataclass
-class _Work:
-    experiment: Experiment
-    cases: list[Case]
-    estimators: dict[str, Estimator]
-    folder: Path
-    command: str
-    variant: str | None
-    workers: int
-    session: Session | None = None
+def _work(
+    experiment: Experiment,
+    cases: list[Case],
+    folder: Path,
+    variant: str | None,
+    engine: Engine,
+    progress: Progress | None,
+) -> int:
+    """Run the cases that are not done yet; gives how many were."""
+    total = sum(case.realisations for case in cases)
+    missing = [index for index in range(len(cases)) if not _part_file(folder / PARTS, index).exists()]
+    in_gallery, swept = _in_gallery(cases), swept_example(cases)
+    parts: list[tuple[int, Part]] = []
+    for index in missing:
+        item = folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
+        parts += [(index, part) for part in parts_of(experiment, cases[index], swept, item, variant)]
+    waiting = Counter(index for index, _ in parts)
+    made: dict[int, dict[int, pl.DataFrame]] = {index: {} for index in waiting}
+    done = total - sum(cases[index].realisations for index in missing)
+    name = cases[missing[0]].setting if missing else ""
 
-    def run(self, parts: Path, progress: Progress | None) -> int:
-        """Run the cases that are not done yet; gives how many were."""
-        total, done, resumed = sum(case.realisations for case in self.cases), 0, 0
-        in_gallery = _in_gallery(self.cases)
-        swept = swept_example(self.cases)
-        with Pool(self.workers) as pool:
-            for index, case in enumerate(self.cases):
-                if _part_file(parts, index).exists():
-                    resumed += 1
-                else:
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress and done < total:
+            progress(done, total, name)
 
-                    def step(more: int, before: int = done, name: str = case.setting) -> None:
-                        if progress:
-                            progress(before + more, total, name)
-
-                    item = self.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
-                    if case.is_paper:
-                        made = completed(self._published(case, item, pool, step), swept)
-                    else:
-                        made = table(self._rendered(case, item, step), swept)
-                    write_atomically(_part_file(parts, index), made.write_parquet)
-                done += case.realisations
-        if progress:
-            progress(total, total, "done")
-        return resumed
-
-    def _rendered(self, case: Case, item: Path | None, step: Callable[[int], None]) -> list[dict[str, Any]]:
-        """Make the rows of a rendered case; its first realisation is kept for the gallery where `item` is given."""
-        rows: list[dict[str, Any]] = []
-        seen: View | None = None
-        for done, number in enumerate(case.numbers()):
-            step(done)
-            scene, drawn = case.scene(self.experiment, number)
-            if seen is None or scene != seen.scene:
-                seen = self._view(scene)
-            assert self.session is not None
-            made = realise(self.session, self.experiment, case, number, seen, drawn, self.estimators)
-            rows += made.rows
-            if item and not done:
-                again = f"{case.again(self.experiment, number)} --out frame"
-                gallery.save(item, self.session, case, seen, made, again)
-        return rows
-
-    def _published(self, case: Case, item: Path | None, pool: Pool, step: Callable[[int], None]) -> pl.DataFrame:
-        """Make the rows of a case of the published protocol, in chunks over the workers; see `_rendered` for `item`."""
-        experiment, numbers, setting = self.experiment, case.numbers(), case.paper_setting()
-        names = {"label": case.label, "setting": case.setting}
-        common: dict[str, Any] = {"experiment": experiment.name, **names, **case.paper_columns(), **case.swept}
-        if item:
-            seed = case.noise_seed(experiment, numbers[0])
-            save_realisation(item, setting, experiment.estimators, seed, names)
-        # The bound is that of the light at V.
-        bound = cramer_rao_bound(setting) if setting.eps == 0 else None
-        common["bound_deg"] = None if bound is None else float(np.degrees(bound))
-        tasks = []
-        for first in range(0, len(numbers), PAPER_CHUNK):
-            chunk = numbers[first : first + PAPER_CHUNK]
-            seeds = [case.noise_seed(experiment, number) for number in chunk]
-            tasks.append((setting, common, chunk, seeds, experiment.estimators))
-        made = []
-        for done, rows in enumerate(pool.map(paper_rows, tasks)):
-            step(min(done * PAPER_CHUNK, len(numbers)))
-            made.append(rows)
-        return pl.concat(made)
-
-    def _view(self, scene: Scene) -> View:
-        if self.session is None:
-            self.session = Session(scene, self.variant)
-        return view(self.session, scene)
+    if progress and missing:
+        progress(done, total, name)
+    for place, rows in engine.run(make_rows, [part for _, part in parts], step):
+        index = parts[place][0]
+        made[index][place] = rows
+        if len(made[index]) == waiting[index]:
+            rows = pl.concat([rows for _, rows in sorted(made.pop(index).items())])
+            write_atomically(_part_file(folder / PARTS, index), rows.write_parquet)
+        name = cases[parts[min(place + 1, len(parts) - 1)][0]].setting
+    forget()
+    if progress:
+        progress(total, total, "done")
+    return len(cases) - len(missing)
 
 
 def _in_gallery(cases: list[Case]) -> set[int]:

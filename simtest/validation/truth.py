@@ -8,6 +8,7 @@ import numpy.typing as npt
 from simtest.calibration import NoiseModel
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
 from simtest.detection import contrast, half_height_component
+from simtest.detection.regions import Component
 from simtest.geometry import smooth
 from simtest.rendering import TrueHighlight
 
@@ -86,6 +87,26 @@ def judge(
         _judge(h, (smoothed, seen), peak, owners.get(peak) is h, sigma(peak))
         for h, peak in zip(highlights, peaks, strict=True)
     ]
+
+
+def region_of(highlight: TrueHighlight, smoothed: Image, seen: Mask | None = None) -> Component | None:
+    """Give the pixels above half height of the maximum that a true highlight makes.
+
+    Parameters
+    ----------
+    highlight : TrueHighlight
+        The highlight.
+    smoothed : ndarray of float32, shape (H, W)
+        Noise-free smoothed light.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
+
+    Returns
+    -------
+    Component or None
+        None where a higher maximum lies in it.
+    """
+    return half_height_component(smoothed, *_peak_pixel(smoothed, highlight), seen)
 
 
 def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:

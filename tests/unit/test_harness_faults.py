@@ -224,5 +224,5 @@ def test_a_refused_number_of_workers_touches_no_folder(tmp_path):
     parts.mkdir()
     (parts / "case-00000.parquet").write_bytes(b"half of a run")
     with pytest.raises(InputError, match="workers = 0"):
-        run_experiment(load_experiment("overview"), tmp_path, workers=0)
+        simtest.validate("overview", tmp_path, workers=0)
     assert (parts / "case-00000.parquet").read_bytes() == b"half of a run"

@@ -3,6 +3,8 @@
 import polars as pl
 import pytest
 
+from simtest import validate
+from simtest.engines import make_engine
 from simtest.errors import InputError
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.paper import PaperSetting
@@ -65,7 +67,7 @@ def test_no_two_realisations_share_a_seed(run):
 
 
 def test_rows_do_not_depend_on_the_workers(run, tmp_path):
-    with_two = run_experiment(small(), tmp_path / "two", workers=2)
+    with_two = run_experiment(small(), tmp_path / "two", engine=make_engine(workers=2))
     assert with_two.results.equals(run.results)
     assert (tmp_path / "two" / "results.parquet").read_bytes() == (run.folder / "results.parquet").read_bytes()
 
@@ -84,7 +86,7 @@ def test_a_run_cut_in_two_gives_the_same_bytes(run, tmp_path):
 
 @pytest.mark.slow
 def test_rows_do_not_depend_on_five_workers(run, tmp_path):
-    assert run_experiment(small(), tmp_path, workers=5).results.equals(run.results)
+    assert run_experiment(small(), tmp_path, engine=make_engine(workers=5)).results.equals(run.results)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +113,8 @@ def test_the_published_scene_is_not_for_rendering():
 @pytest.mark.parametrize("workers", [0, -1, 1000, True])
 def test_a_bad_number_of_workers_is_refused(workers, tmp_path):
     with pytest.raises(InputError, match=r"workers = .*: must be 1 to"):
-        run_experiment(small(), tmp_path, workers=workers)
+        validate(small(), tmp_path / "run", workers=workers)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_setting_where_nothing_can_be_fitted_is_reported(tmp_path):

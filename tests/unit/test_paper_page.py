@@ -250,7 +250,7 @@ def small(tmp_path_factory):
         {"scene": "published", "label": "defaults"},
     ]
     experiment = Experiment(name="small", realisations=4, groups=groups, estimators=("circle_pose", "cone_axis"))
-    return run_experiment(experiment, tmp_path_factory.mktemp("paper_page"), workers=1)
+    return run_experiment(experiment, tmp_path_factory.mktemp("paper_page"))
 
 
 def test_the_pages_sections_and_files(small):

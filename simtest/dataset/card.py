@@ -1,0 +1,63 @@
+"""The dataset card: a README that says what is in the folder, and that Hugging Face `datasets` reads."""
+
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.dataset.fields import FIELDS
+from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
+from simtest.dataset.manifest import Manifest
+from simtest.dataset.plan import Plan
+from simtest.files import write_atomically
+from simtest.spec.dataset import Distribution
+
+CARD = "README.md"
+
+
+def write_card(plan: Plan, manifest: Manifest, folder: Path) -> None:
+    """Write the card."""
+    text = make_card(plan, manifest)
+    write_atomically(folder / CARD, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def make_card(plan: Plan, manifest: Manifest) -> str:
+    """Give the card's text; it hangs on the dataset alone."""
+    dataset = plan.dataset
+    counts: dict[str, list[int]] = {name: [0, 0] for name in dataset.splits.shares}
+    for shard in plan.shards:
+        counts[shard.split][0] += len(shard.indices)
+        counts[shard.split][1] += 1
+    environment = Environment(
+        loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    # Markdown, not HTML: nothing is to be escaped.
+    return environment.get_template("card.md.j2").render(
+        dataset=dataset,
+        counts=counts,
+        fields=[field for field in FIELDS if field.name != "radiance" or dataset.radiance],
+        draws=list(_draws(plan)),
+        tables=(SAMPLES, HIGHLIGHTS, ESTIMATES),
+        isovalue=HIGHLIGHT_ISOVALUE,
+        versions=manifest.origin["versions"],
+        variant=manifest.origin["variant"],
+    )
+
+
+def _draws(plan: Plan) -> Any:
+    dataset = plan.dataset
+    for number, family in enumerate(dataset.families):
+        where = f"family {number} ({family.scene}), each"
+        yield from ((f"{where} anatomy", key, _say(drawn)) for key, drawn in family.per_anatomy.items())
+        yield from ((f"{where} sample", key, _say(drawn)) for key, drawn in family.per_sample.items())
+    yield from (("each sample", key, _say(drawn)) for key, drawn in dataset.per_sample.items())
+
+
+def _say(drawn: Distribution) -> str:
+    if drawn.choose:
+        weights = f", weights {list(drawn.weights)}" if drawn.weights else ""
+        return f"one of {list(drawn.choose)}{weights}"
+    kind = "whole numbers" if drawn.integer else "even in the logarithm" if drawn.log else "even"
+    return f"{drawn.low:g} to {drawn.high:g}, {kind}"

@@ -1,0 +1,252 @@
+"""The images of a sample: what each holds, its unit, frame and sign, and how it is written.
+
+Compression was chosen by measurement (docs/datasets.md): PNG without a row filter and with Huffman codes alone for the
+noisy picture, with a row filter and the fastest deflate for the smooth maps.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+DEPTH_SCALES_MM = tuple(0.005 * 2**k for k in range(12))
+"""A sample's depth is counted in the first of these with which its farthest point fits 16 bits."""
+
+CURVATURE_SCALE = 1e-4
+"""1/mm; 16 bits then reach 3.2767 per mm, a radius of 0.3 mm."""
+
+LEVELS = 65535
+OFFSET = 32768
+
+_NOISY = [
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+]  # fmt: skip
+_SMOOTH = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
+_FLAT = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One image of a sample.
+
+    Parameters
+    ----------
+    name : str
+        Of the decoded array.
+    suffix : str
+        Of the member in the shard, after the sample's key.
+    shape, dtype, unit : str
+        Of the decoded array.
+    meaning : str
+        What it holds, with frame and sign.
+    encoding : str
+        How a reader without this package decodes it.
+    encode : callable
+        Array to bytes.
+    decode : callable
+        Bytes and the sample's metadata to the array.
+    """
+
+    name: str
+    suffix: str
+    shape: str
+    dtype: str
+    unit: str
+    meaning: str
+    encoding: str
+    encode: Callable[[Array], bytes]
+    decode: Callable[[bytes, dict[str, Any]], Array]
+
+    def describe(self) -> dict[str, str]:
+        """Give the entry of the field dictionary."""
+        keys = ("name", "shape", "dtype", "unit", "meaning", "encoding")
+        return {"member": f"KEY.{self.suffix}", **{key: getattr(self, key) for key in keys}}
+
+
+def _png(image: Array, options: list[int]) -> bytes:
+    ok, encoded = cv2.imencode(".png", image if image.ndim == 2 else image[:, :, ::-1], options)
+    assert ok
+    return encoded.tobytes()
+
+
+def _pixels(data: bytes) -> Array:
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError("no PNG")
+    return np.asarray(image if image.ndim == 2 else image[:, :, ::-1])
+
+
+# Depth ---------------------------------------------------------------------------------------------------------------
+
+
+def depth_scale_mm(depth: Array) -> float:
+    """Give the unit that a depth map, mm, is counted in; raise `ValueError` where it reaches too far for 16 bits."""
+    largest = float(np.nanmax(depth, initial=0.0))
+    for scale in DEPTH_SCALES_MM:
+        if largest <= scale * LEVELS:
+            return scale
+    raise ValueError(f"depth reaches {largest:g} mm; 16 bits hold {DEPTH_SCALES_MM[-1] * LEVELS:g} mm at most")
+
+
+def _encode_depth(depth: Array) -> bytes:
+    counts = np.asarray(depth, dtype=np.float32) * np.float32(1 / depth_scale_mm(depth)) + np.float32(0.5)
+    return _png(np.nan_to_num(counts, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
+
+
+def _decode_depth(data: bytes, meta: dict[str, Any]) -> Array:
+    counts = _pixels(data)
+    depth = counts.astype(np.float32)
+    depth *= meta["depth_scale_mm"]
+    missing = counts == 0
+    if missing.any():
+        depth[missing] = np.nan
+    return depth
+
+
+# Normals -------------------------------------------------------------------------------------------------------------
+
+
+def encode_octahedral(normal: Array) -> tuple[Array, Array]:
+    """Give unit vectors, shape (..., 3), as two coordinates in [-1, 1], each of shape (...): (0, 0) is (0, 0, -1).
+
+    The octahedral map: (u, v) = (x, y) / (abs(x) + abs(y) + abs(z)); where z > 0,
+    (u, v) = (1 - abs(v), 1 - abs(u)) times their signs. Camera-facing normals lie about the square's middle.
+    """
+    x, y, z = (np.asarray(normal[..., k], dtype=np.float32) for k in range(3))
+    scale = 1 / (np.abs(x) + np.abs(y) + np.abs(z))
+    u, v = x * scale, y * scale
+    _fold(u, v, z > 0)
+    return u, v
+
+
+def decode_octahedral(u: Array, v: Array) -> Array:
+    """Give the unit vectors, shape (..., 3), of two coordinates in [-1, 1]; they are changed on the way."""
+    z = np.abs(u) + np.abs(v) - 1
+    _fold(u, v, z > 0)
+    scale = 1 / np.sqrt(u * u + v * v + z * z)
+    return np.stack([u * scale, v * scale, z * scale], axis=-1)
+
+
+def _fold(u: Array, v: Array, outer: Array) -> None:
+    """Swap the square's corners, where z > 0, in place."""
+    # Few pixels see a surface that turns so far away from the optical axis.
+    if outer.any():
+        a, b = u[outer], v[outer]
+        u[outer] = np.copysign(1 - np.abs(b), a)
+        v[outer] = np.copysign(1 - np.abs(a), b)
+
+
+NORMAL_LEVELS = 16383
+"""14 bits for each of the two coordinates: 0.015 deg at most, and a third smaller than 16 bits."""
+
+
+def _encode_normal(normal: Array) -> bytes:
+    both = np.concatenate(encode_octahedral(normal), axis=0)
+    # 1 to the number of levels; what is not finite becomes 0.
+    both *= (NORMAL_LEVELS - 1) / 2
+    both += (NORMAL_LEVELS + 1) / 2 + 0.5
+    return _png(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
+
+
+def _decode_normal(data: bytes, _: dict[str, Any]) -> Array:
+    counts = _pixels(data)
+    both = counts.astype(np.float32)
+    both -= (NORMAL_LEVELS + 1) / 2
+    both *= 2 / (NORMAL_LEVELS - 1)
+    normal = decode_octahedral(*np.split(both, 2, axis=0))
+    missing = counts[: len(normal)] == 0
+    if missing.any():
+        normal[missing] = np.nan
+    return normal
+
+
+# Curvature -----------------------------------------------------------------------------------------------------------
+
+
+def _encode_curvature(curvature: Array) -> bytes:
+    both = np.concatenate([curvature[..., 0], curvature[..., 1]], axis=0, dtype=np.float32)
+    both *= 1 / CURVATURE_SCALE
+    both += OFFSET + 0.5
+    np.clip(both, 1, LEVELS, out=both)
+    return _png(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), _SMOOTH)
+
+
+def _decode_curvature(data: bytes, _: dict[str, Any]) -> Array:
+    counts = _pixels(data)
+    both = counts.astype(np.float32)
+    both -= OFFSET
+    both *= CURVATURE_SCALE
+    missing = counts == 0
+    if missing.any():
+        both[missing] = np.nan
+    return np.stack(np.split(both, 2, axis=0), axis=-1)
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def _plain(options: list[int]) -> tuple[Callable[[Array], bytes], Callable[[bytes, dict[str, Any]], Array]]:
+    return lambda image: _png(image, options), lambda data, _: _pixels(data)
+
+
+def _encode_half(radiance: Array) -> bytes:
+    from io import BytesIO
+
+    file = BytesIO()
+    largest = float(np.finfo(np.float16).max)
+    np.save(file, np.clip(radiance, 0, largest).astype(np.float16), allow_pickle=False)
+    return file.getvalue()
+
+
+def _decode_half(data: bytes, _: dict[str, Any]) -> Array:
+    from io import BytesIO
+
+    return np.asarray(np.load(BytesIO(data), allow_pickle=False))
+
+
+_PART = "8-bit PNG, sRGB-encoded share of full scale, clipped"
+_OCTAHEDRAL = (
+    f"16-bit PNG of 2 H rows: u above v, each 2 (count - 1) / {NORMAL_LEVELS - 1} - 1; 0: no surface. "
+    "z = abs(u) + abs(v) - 1; where z > 0, (u, v) = (1 - abs(v), 1 - abs(u)) times the signs of u and v; the normal is "
+    "(u, v, z), made a unit vector"
+)
+_CURVATURE = (
+    f"16-bit PNG of 2 H rows: k_min above k_max; k = (count - {OFFSET}) * {CURVATURE_SCALE:g}; 0: unknown; "
+    f"1 and {LEVELS}: that or beyond"
+)
+
+FIELDS = (
+    Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
+          "the sensor's frame, R G B, as its response encodes it", "8-bit PNG", *_plain(_NOISY)),
+    Field("depth", "depth.png", "(H, W)", "float32", "mm",
+          "distance from the camera centre along the pixel's ray (not z); NaN where there is no surface",
+          "16-bit PNG; count times the sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),
+    Field("normal", "normal.png", "(H, W, 3)", "float32", "1",
+          "unit normal, camera frame (x right, y down, z forward), facing the camera: N . ray < 0; NaN off the surface",
+          _OCTAHEDRAL, _encode_normal, _decode_normal),
+    Field("curvature", "curvature.png", "(H, W, 2)", "float32", "1/mm",
+          "principal curvatures k_min <= k_max, convex towards the camera positive; NaN where unknown",
+          _CURVATURE, _encode_curvature, _decode_curvature),
+    Field("specular", "specular.png", "(H, W, 3)", "uint8", "full scale",
+          "direct light off the specular lobe, before lens and noise", _PART, *_plain(_FLAT)),
+    Field("diffuse", "diffuse.png", "(H, W, 3)", "uint8", "full scale",
+          "direct light off the diffuse base, before lens and noise", _PART, *_plain(_FLAT)),
+    Field("indirect", "indirect.png", "(H, W, 3)", "uint8", "full scale",
+          "light of more than one bounce, before lens and noise", _PART, *_plain(_FLAT)),
+    Field("instance", "instance.png", "(H, W)", "uint8", "1",
+          "0, or 1 + the place in the list highlights of the isolated highlight whose region at half height this is",
+          "8-bit PNG", *_plain(_FLAT)),
+    Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
+          "linear radiance before lens and noise, share of full scale; only in datasets that keep it",
+          "NPY", _encode_half, _decode_half),
+)  # fmt: skip
+"""All fields, in the order of the members."""
+
+BY_NAME = {field.name: field for field in FIELDS}
+BY_SUFFIX = {field.suffix: field for field in FIELDS}

@@ -1,0 +1,167 @@
+"""The manifest: what a dataset is, where it comes from, and which of its files are finished."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from simtest import provenance
+from simtest.dataset.plan import Plan, spec_files
+from simtest.errors import InputError
+from simtest.files import write_json
+from simtest.resources import shown
+from simtest.spec.dataset import Dataset
+
+NAME = "manifest.json"
+FORMAT = "simtest dataset, version 1"
+MAX_BYTES = 1_000_000_000
+
+
+class ManifestError(Exception):
+    """A manifest that cannot be used; the text says why."""
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """A finished file.
+
+    Parameters
+    ----------
+    bytes : int
+        Size.
+    sha256 : str
+        Of its content.
+    """
+
+    bytes: int
+    sha256: str
+
+
+@dataclass
+class Manifest:
+    """The truth about a dataset's folder.
+
+    Parameters
+    ----------
+    dataset : dict
+        The whole specification.
+    origin : dict
+        Versions, source, variant and hashes of the inputs: with the same of them the same bytes come out.
+    environment : dict
+        Commit and processor.
+    shards : dict
+        Finished shards by name.
+    tables : dict
+        Finished tables and card by name; there once all shards are.
+    """
+
+    dataset: dict[str, Any]
+    origin: dict[str, Any]
+    environment: dict[str, Any]
+    shards: dict[str, FileEntry] = field(default_factory=dict)
+    tables: dict[str, FileEntry] = field(default_factory=dict)
+
+    def save(self, folder: Path) -> None:
+        """Write the manifest, with a digest of its own content."""
+        content = self._content()
+        write_json(folder / NAME, {**content, "digest": _digest(content)})
+
+    def _content(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "complete": bool(self.tables),
+            "dataset": self.dataset,
+            "origin": self.origin,
+            "environment": self.environment,
+            "shards": {name: vars(self.shards[name]) for name in sorted(self.shards)},
+            "tables": {name: vars(self.tables[name]) for name in sorted(self.tables)},
+        }
+
+    def plan(self) -> Plan:
+        """Lay the dataset out again."""
+        return Plan(Dataset.model_validate(self.dataset))
+
+
+def new_manifest(plan: Plan, variant: str) -> Manifest:
+    """Describe a dataset that is about to be made."""
+    origin = {
+        "versions": provenance.versions(),
+        "source": provenance.source_hash(),
+        "variant": variant,
+        "inputs": {path.name: provenance.file_hash(path) for path in spec_files(plan.dataset)},
+    }
+    found = provenance.environment()
+    environment = {key: found[key] for key in ("commit", "python", "processor", "system")}
+    return Manifest(plan.dataset.model_dump(mode="json"), origin, environment)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read a folder's manifest.
+
+    Raises
+    ------
+    ManifestError
+        If it is missing, is no manifest, or was changed by hand.
+    """
+    path = folder / NAME
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ManifestError(f"{NAME}: larger than {MAX_BYTES} bytes")
+        content = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise ManifestError(f"{NAME}: missing") from None
+    except OSError as error:
+        raise ManifestError(f"{NAME}: cannot be read ({error.strerror})") from None
+    except ValueError:
+        raise ManifestError(f"{NAME}: is no JSON") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ManifestError(f"{NAME}: is no manifest of the form {FORMAT!r}")
+    if content.pop("digest", None) != _digest(content):
+        raise ManifestError(f"{NAME}: was changed; its digest does not fit")
+    return Manifest(
+        content["dataset"],
+        content["origin"],
+        content["environment"],
+        {name: FileEntry(**entry) for name, entry in content["shards"].items()},
+        {name: FileEntry(**entry) for name, entry in content["tables"].items()},
+    )
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def check_same(folder: Path, there: Manifest, wanted: Manifest) -> None:
+    """Raise `InputError` where a folder holds another dataset, or the same made by other code."""
+    for what, old, new in (("dataset", there.dataset, wanted.dataset), ("origin", there.origin, wanted.origin)):
+        difference = _first_difference(old, new)
+        if difference is None:
+            continue
+        key, before, after = difference
+        why = "another dataset" if what == "dataset" else "the same dataset, made by other versions"
+        raise InputError(
+            f"--out {shown(folder)}: holds {why} ({key} = {shown(before, 60)} there, {shown(after, 60)} here); "
+            "must be another folder"
+        )
+
+
+def _first_difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any] | None:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            found = _first_difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+            if found:
+                return found
+        return None
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, pair in enumerate(zip(old, new, strict=True)):
+            found = _first_difference(*pair, f"{path}.{i}")
+            if found:
+                return found
+        return None
+    return None if old == new else (path, old, new)
+
+
+def file_entry(path: Path) -> FileEntry:
+    """Describe a finished file."""
+    return FileEntry(path.stat().st_size, provenance.file_hash(path))

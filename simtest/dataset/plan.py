@@ -1,0 +1,276 @@
+"""Which sample is made of what: anatomies, splits, draws and shards, all known before anything is rendered."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.anatomy.recipe import load_recipe
+from simtest.errors import InputError
+from simtest.estimators import load_estimators
+from simtest.resources import find
+from simtest.seeds import Stage, generator, integer
+from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
+from simtest.spec.dataset import Dataset, Distribution, Family
+
+BYTES_PER_PIXEL = 4.5
+"""Of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
+
+RADIANCE_BYTES_PER_PIXEL = 6.0
+"""Of the linear radiance beside it: three halves."""
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """One anatomy.
+
+    Parameters
+    ----------
+    family : int
+        Its kind, from 0.
+    number : int
+        Which of the family's anatomies, from 0.
+    seed : int or None
+        surface.seed; None where the family has only the scene's.
+    """
+
+    family: int
+    number: int
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The samples of one file.
+
+    Parameters
+    ----------
+    split : str
+        train, validation or test.
+    number : int
+        Of the split's shards, from 0.
+    indices : tuple of int
+        Samples, rising.
+    """
+
+    split: str
+    number: int
+    indices: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return f"{self.split}-{self.number:06d}.tar"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The scene of a sample.
+
+    Parameters
+    ----------
+    scene : Scene
+        With seeds of noise and bounces.
+    anatomy : Anatomy
+        Its anatomy.
+    values : dict
+        What was drawn, by key path.
+    """
+
+    scene: Scene
+    anatomy: Anatomy
+    values: dict[str, Any]
+
+
+class Plan:
+    """Lays out a dataset.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        What is wanted.
+
+    Raises
+    ------
+    InputError
+        If a scene would be malformed anywhere in the ranges, there are too few anatomies, or an estimator is unknown.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+        self._bases = [self._base(k, family) for k, family in enumerate(dataset.families)]
+        for k, family in enumerate(dataset.families):
+            self._check(k, family)
+        load_estimators(dataset.estimators)
+        self._blocks = self._lay_out()
+        self._splits = self._assign()
+
+    def _base(self, number: int, family: Family) -> dict[str, Any]:
+        path = find(family.scene, "scenes")
+        base = apply_settings(read_toml(path), family.set, f"families.{number}.set")
+        base.setdefault("name", f"{self.dataset.name}-{number}"[:80])
+        return base
+
+    def _check(self, number: int, family: Family) -> None:
+        """Try every drawn value's ends, one at a time and together, before anything is rendered."""
+        where = f"families.{number}"
+        drawn = {**family.per_anatomy, **family.per_sample, **self.dataset.per_sample}
+        scene = scene_from_dict(self._bases[number], where)
+        if family.seeds is not None and not isinstance(scene.surface, AnatomySurface):
+            raise InputError(f"{where}.seeds: surface.type = {scene.surface.type} has no seed; leave it out")
+        alone = [{path: value} for path, one in drawn.items() for value in one.ends]
+        together = [{path: one.ends[end] for path, one in drawn.items()} for end in (0, -1)]
+        for values in (*alone, *together):
+            tried = scene_from_dict(apply_settings(self._bases[number], values, where), where)
+            if isinstance(tried.surface, AnatomySurface) and (file := tried.surface.file()).suffix == ".toml":
+                load_recipe(file, tried.surface.recipe_values)
+
+    # Anatomies and splits ------------------------------------------------------------------------------------------
+
+    def _rng(self, branch: str, number: int = 0) -> np.random.Generator:
+        return generator(self.dataset.seed, self.dataset.name, branch, number, Stage.SWEEP)
+
+    def _lay_out(self) -> list[Anatomy]:
+        """Give the anatomy of each block of samples."""
+        dataset = self.dataset
+        count = -(-dataset.samples // dataset.samples_per_anatomy)
+        counts = _shared(count, [family.weight for family in dataset.families])
+        blocks = []
+        for k, (family, wanted) in enumerate(zip(dataset.families, counts, strict=True)):
+            if family.seeds is None:
+                blocks += [Anatomy(k, 0, None)] * wanted
+                continue
+            if wanted > family.seeds.count:
+                raise InputError(
+                    f"families.{k}.seeds: {wanted} anatomies are needed for {dataset.samples} samples and low to high "
+                    f"has {family.seeds.count}; must have as many, or samples_per_anatomy be larger"
+                )
+            seeds = self._rng(f"seeds {k}").choice(family.seeds.count, size=wanted, replace=False)
+            blocks += [Anatomy(k, n, family.seeds.low + int(seed)) for n, seed in enumerate(seeds)]
+        order = self._rng("order").permutation(len(blocks))
+        return [blocks[i] for i in order]
+
+    def _assign(self) -> dict[Anatomy, str]:
+        """Give the split of each anatomy: each in turn goes to the split that lacks most samples."""
+        sizes: dict[Anatomy, int] = {}
+        for block, anatomy in enumerate(self._blocks):
+            sizes[anatomy] = sizes.get(anatomy, 0) + len(self._block_indices(block))
+        shares = self.dataset.splits.shares
+        if len(sizes) < len(shares):
+            raise InputError(
+                f"splits: {len(sizes)} anatomies for {len(shares)} splits ({', '.join(shares)}); no anatomy may be in "
+                "two: give more samples or seeds, a smaller samples_per_anatomy, or fewer splits"
+            )
+        lacking = {name: share * self.dataset.samples for name, share in shares.items()}
+        assigned: dict[Anatomy, str] = {}
+        empty = set(shares)
+        # The largest first; where there are only as many left as splits without any, those get them.
+        for left, anatomy in zip(range(len(sizes), 0, -1), sorted(sizes, key=lambda a: -sizes[a]), strict=True):
+            among = empty if left <= len(empty) else shares
+            chosen = max((name for name in shares if name in among), key=lambda name: lacking[name])
+            assigned[anatomy] = chosen
+            lacking[chosen] -= sizes[anatomy]
+            empty.discard(chosen)
+        return assigned
+
+    def _block_indices(self, block: int) -> range:
+        size = self.dataset.samples_per_anatomy
+        return range(block * size, min((block + 1) * size, self.dataset.samples))
+
+    def anatomy(self, index: int) -> Anatomy:
+        """Give the anatomy of a sample."""
+        return self._blocks[index // self.dataset.samples_per_anatomy]
+
+    def split(self, index: int) -> str:
+        """Give the split of a sample."""
+        return self._splits[self.anatomy(index)]
+
+    # Shards ----------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def samples_per_shard(self) -> int:
+        """How many samples of the expected size a shard holds; it hangs on the dataset alone."""
+        camera = scene_from_dict(self._bases[0]).camera
+        size = BYTES_PER_PIXEL + (RADIANCE_BYTES_PER_PIXEL if self.dataset.radiance else 0)
+        return max(1, int(self.dataset.shard_mb * 1e6 / (size * camera.width * camera.height)))
+
+    @cached_property
+    def shards(self) -> tuple[Shard, ...]:
+        """All shards."""
+        indices: dict[str, list[int]] = {name: [] for name in self.dataset.splits.shares}
+        for block, anatomy in enumerate(self._blocks):
+            indices[self._splits[anatomy]] += self._block_indices(block)
+        size = self.samples_per_shard
+        return tuple(
+            Shard(split, number, tuple(all_of_it[first : first + size]))
+            for split, all_of_it in indices.items()
+            for number, first in enumerate(range(0, len(all_of_it), size))
+        )
+
+    def shard_of(self, index: int) -> Shard:
+        """Give the shard that holds a sample."""
+        return next(shard for shard in self.shards if index in shard.indices)
+
+    # Scenes ----------------------------------------------------------------------------------------------------------
+
+    def draw(self, index: int, attempt: int = 0) -> Drawn:
+        """Draw a sample's scene.
+
+        Parameters
+        ----------
+        index : int
+            Sample, from 0.
+        attempt : int
+            Which draw of what differs between samples; the anatomy stays.
+
+        Returns
+        -------
+        Drawn
+
+        Raises
+        ------
+        InputError
+            If the drawn values do not go together.
+        """
+        dataset, anatomy = self.dataset, self.anatomy(index)
+        family = dataset.families[anatomy.family]
+        values = _draw(family.per_anatomy, self._rng(f"anatomy {anatomy.family}", anatomy.number))
+        if anatomy.seed is not None:
+            values["surface.seed"] = anatomy.seed
+        values |= _draw({**family.per_sample, **dataset.per_sample}, self._rng(f"attempt {attempt}", index))
+        seeds = {
+            "sensor.seed": integer(dataset.seed, dataset.name, "sample", index, Stage.SENSOR),
+            "render.seed": integer(dataset.seed, dataset.name, "sample", index, Stage.RENDER) % 2**32,
+        }
+        where = f"{dataset.name}, sample {index}"
+        data = apply_settings(self._bases[anatomy.family], {**values, **seeds}, where)
+        return Drawn(scene_from_dict(data, where), anatomy, values)
+
+
+def _draw(drawn: Mapping[str, Distribution], rng: np.random.Generator) -> dict[str, Any]:
+    # By name, so that the order of keys in the file does not matter.
+    return {path: drawn[path].draw(rng) for path in sorted(drawn)}
+
+
+def _shared(count: int, weights: list[float]) -> list[int]:
+    """Share a number out by weights, the largest remainders rounded up."""
+    exact = count * np.asarray(weights) / sum(weights)
+    whole: npt.NDArray[np.int64] = np.floor(exact).astype(np.int64)
+    for i in np.argsort(whole - exact, kind="stable")[: count - int(whole.sum())]:
+        whole[i] += 1
+    return [int(n) for n in whole]
+
+
+def spec_files(dataset: Dataset) -> Iterator[Path]:
+    """Give the files that a dataset's content hangs on beside its own: base scenes, recipes and meshes."""
+    for family in dataset.families:
+        path = find(family.scene, "scenes")
+        yield path
+        data = apply_settings(read_toml(path), family.set, str(path))
+        surface = data.get("surface", {})
+        if surface.get("type") == "anatomy":
+            yield find(surface["path"], "meshes")

@@ -1,0 +1,185 @@
+"""Shards: tar files of samples that can be cut short anywhere and gone on with.
+
+A sample is whole when its last member, the metadata, is there and the hashes that it holds are those of the others. So
+a shard that was stopped in the middle needs no journal: it is cut after its last whole sample.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+BLOCK = tarfile.BLOCKSIZE
+MAX_MEMBER_BYTES = 1 << 31
+
+
+@dataclass
+class StoredSample:
+    """A sample in a shard.
+
+    Parameters
+    ----------
+    key : str
+        Its name.
+    members : dict
+        Where each member's bytes begin and how many there are, by suffix.
+    end : int
+        Offset after the sample.
+    meta : dict
+        Its metadata.
+    """
+
+    key: str
+    members: dict[str, tuple[int, int]] = field(default_factory=dict)
+    end: int = 0
+    meta: dict[str, Any] = field(default_factory=dict)
+
+
+class BrokenShardError(Exception):
+    """A shard that does not read as one; the text says where and why."""
+
+
+def write_sample(file: IO[bytes], key: str, members: dict[str, bytes]) -> None:
+    """Append a sample; headers hold no time, owner or machine."""
+    for suffix, data in members.items():
+        header = tarfile.TarInfo(f"{key}.{suffix}")
+        header.size = len(data)
+        file.write(header.tobuf(tarfile.USTAR_FORMAT))
+        file.write(data)
+        file.write(bytes(-len(data) % BLOCK))
+
+
+def finish(file: IO[bytes]) -> None:
+    """Write the end of the archive: two empty blocks, filled up to a record."""
+    file.write(bytes(2 * BLOCK))
+    file.write(bytes(-file.tell() % tarfile.RECORDSIZE))
+
+
+def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
+    """Read a shard's samples.
+
+    Parameters
+    ----------
+    file : file
+        At its beginning.
+    check : bool
+        Read all members and compare their hashes; false reads the metadata alone.
+
+    Yields
+    ------
+    StoredSample
+
+    Raises
+    ------
+    BrokenShardError
+        At the first thing that is not a whole sample, nor the archive's end.
+    """
+    size, offset = os.fstat(file.fileno()).st_size, 0
+    sample: StoredSample | None = None
+    while True:
+        file.seek(offset)
+        block = file.read(BLOCK)
+        if block == bytes(BLOCK):
+            if sample is not None:
+                raise BrokenShardError(f"sample {sample.key} ends without metadata")
+            _check_end(file, offset, size)
+            return
+        name, length = _header(block, offset)
+        key, _, suffix = name.partition(".")
+        start = offset + BLOCK
+        offset = start + length + -length % BLOCK
+        if offset > size:
+            raise BrokenShardError(f"{name} is cut short")
+        if sample is None:
+            sample = StoredSample(key)
+        if key != sample.key:
+            raise BrokenShardError(f"{name} stands inside sample {sample.key}")
+        if suffix in sample.members:
+            raise BrokenShardError(f"{name} is there twice")
+        sample.members[suffix] = (start, length)
+        if suffix == "json":
+            sample.end, sample.meta = offset, _meta(file, name, start, length)
+            if check:
+                _check_hashes(file, sample)
+            yield sample
+            sample = None
+
+
+def _header(block: bytes, offset: int) -> tuple[str, int]:
+    if len(block) < BLOCK:
+        raise BrokenShardError(f"ends at byte {offset + len(block)} without the archive's end")
+    try:
+        header = tarfile.TarInfo.frombuf(block, "ascii", "strict")
+    except (tarfile.HeaderError, UnicodeDecodeError) as error:
+        raise BrokenShardError(f"no tar header at byte {offset} ({error})") from None
+    if not header.isreg() or not 0 <= header.size < MAX_MEMBER_BYTES:
+        raise BrokenShardError(f"{header.name!r} at byte {offset} is no plain member")
+    return header.name, header.size
+
+
+def _meta(file: IO[bytes], name: str, start: int, length: int) -> dict[str, Any]:
+    file.seek(start)
+    try:
+        meta = json.loads(file.read(length))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise BrokenShardError(f"{name} is no JSON") from None
+    if not isinstance(meta, dict) or not isinstance(meta.get("sha256"), dict):
+        raise BrokenShardError(f"{name} holds no hashes")
+    return meta
+
+
+def _check_hashes(file: IO[bytes], sample: StoredSample) -> None:
+    wanted = sample.meta["sha256"]
+    if set(wanted) | {"json"} != set(sample.members):
+        raise BrokenShardError(f"sample {sample.key} has other members than its metadata says")
+    for suffix, digest in wanted.items():
+        start, length = sample.members[suffix]
+        file.seek(start)
+        if hashlib.sha256(file.read(length)).hexdigest() != digest:
+            raise BrokenShardError(f"{sample.key}.{suffix} differs from its hash")
+
+
+def _check_end(file: IO[bytes], offset: int, size: int) -> None:
+    file.seek(offset)
+    if any(file.read()):
+        raise BrokenShardError(f"something follows the archive's end at byte {offset}")
+    if size % tarfile.RECORDSIZE or size - offset < 2 * BLOCK:
+        raise BrokenShardError("the archive's end is cut short")
+
+
+def whole_samples(file: IO[bytes]) -> tuple[list[StoredSample], bool]:
+    """Give the whole samples at a shard's beginning, and whether the shard is whole."""
+    found: list[StoredSample] = []
+    try:
+        for sample in samples(file):
+            found.append(sample)
+    except BrokenShardError:
+        return found, False
+    return found, True
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file to append to, made if need be, that no other process writes meanwhile."""
+    while True:
+        path.touch()
+        with path.open("r+b") as file:
+            # A writer whose parent was killed may live for a moment yet.
+            fcntl.flock(file, fcntl.LOCK_EX)
+            # It may have finished the file and given it its final name.
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                yield file
+                return
+
+
+def read_member(file: IO[bytes], sample: StoredSample, suffix: str) -> bytes:
+    """Give the bytes of a sample's member."""
+    start, length = sample.members[suffix]
+    file.seek(start)
+    return file.read(length)

@@ -1,0 +1,291 @@
+"""Checks a dataset's folder: every byte against its hash, every value against what it must be."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from simtest.dataset.card import CARD, make_card
+from simtest.dataset.fields import BY_SUFFIX, FIELDS
+from simtest.dataset.index import TABLES, make_tables
+from simtest.dataset.manifest import (
+    NAME,
+    FileEntry,
+    Manifest,
+    ManifestError,
+    check_same,
+    file_entry,
+    new_manifest,
+    read_manifest,
+)
+from simtest.dataset.plan import Plan, Shard
+from simtest.dataset.reader import decode
+from simtest.dataset.sample import sample_key
+from simtest.dataset.shard import BrokenShardError, read_member, samples
+from simtest.dataset.writer import PART, repair
+from simtest.engines import Engine
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.spec.camera import CameraSpec
+from simtest.validation.runner import Progress
+
+Array = np.ndarray[Any, Any]
+
+MAX_DEPTH_NORMAL_DEG = 5.0
+"""The median angle between a sample's normals and those of its depth map is far below this, whatever its noise."""
+
+
+MAX_DEPTH_ERROR = 0.05
+"""The nearest pixel's depth differs from a highlight's distance by less than this share, but for another unit."""
+
+REQUIRED = tuple(field.name for field in FIELDS if field.name != "radiance")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that is wrong.
+
+    Parameters
+    ----------
+    file : str
+        Name in the folder.
+    what : str
+        What is wrong with it.
+    """
+
+    file: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.what}"
+
+
+def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
+    """Check a dataset.
+
+    Parameters
+    ----------
+    folder : Path
+        The dataset's.
+    progress : callable, optional
+        Told of samples checked, samples in all, and the shard.
+
+    Returns
+    -------
+    list of Fault
+        Empty where all is well.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    try:
+        manifest = read_manifest(folder)
+        plan = manifest.plan()
+    except (ManifestError, ValueError, KeyError, TypeError) as error:
+        said = str(error) if isinstance(error, ManifestError) else f"{NAME}: its dataset is malformed ({error})"
+        return [Fault(NAME, said.removeprefix(f"{NAME}: "))]
+    faults = list(_files(folder, manifest, plan))
+    damaged = {fault.file for fault in faults}
+    done = 0
+    for shard in plan.shards:
+        if shard.name not in damaged and shard.name in manifest.shards:
+            found = list(_shard(folder, manifest, shard))
+            damaged |= {fault.file for fault in found}
+            faults += found
+        done += len(shard.indices)
+        if progress:
+            progress(done, plan.dataset.samples, shard.name)
+    # Tables are compared with sound shards only.
+    if not any(shard.name in damaged for shard in plan.shards) and len(manifest.shards) == len(plan.shards):
+        faults += _tables(folder, manifest, plan, damaged)
+    return faults
+
+
+def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
+    """Check which files are there."""
+    planned = {shard.name for shard in plan.shards}
+    for name in sorted(planned - set(manifest.shards)):
+        yield Fault(name, "not finished; the dataset's command goes on with it")
+    for name in sorted(set(manifest.shards) - planned):
+        yield Fault(NAME, f"lists {name}, which the dataset does not have")
+    if not planned - set(manifest.shards):
+        yield from (Fault(name, "missing in the manifest") for name in (*TABLES, CARD) if name not in manifest.tables)
+    for name, entry in {**manifest.shards, **manifest.tables}.items():
+        yield from _against(folder / name, entry)
+    known = {NAME, *manifest.shards, *manifest.tables, *planned}
+    for path in sorted(folder.iterdir()):
+        if path.name in known:
+            continue
+        if path.name.endswith(PART):
+            if not planned - set(manifest.shards):
+                yield Fault(path.name, "left over from a stopped run")
+        else:
+            yield Fault(path.name, "does not belong to the dataset")
+
+
+def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
+    if path.is_symlink() or not path.is_file():
+        yield Fault(path.name, "is no plain file" if path.exists() else "missing")
+    elif path.stat().st_size != entry.bytes:
+        yield Fault(path.name, f"has {path.stat().st_size} bytes; must have {entry.bytes}")
+    elif file_entry(path).sha256 != entry.sha256:
+        yield Fault(path.name, "differs from its SHA-256 in the manifest")
+
+
+def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
+    """Make broken files again, remove what does not belong, and check once more.
+
+    Parameters
+    ----------
+    folder : Path
+        The dataset's.
+    faults : list of Fault
+        As `verify` gave them.
+    engine : Engine
+        Who does the work.
+    progress : callable, optional
+        Told of samples done, samples in all, and what is done.
+
+    Returns
+    -------
+    list of Fault
+        What is still broken.
+
+    Raises
+    ------
+    InputError
+        If the manifest is broken, which says what the dataset is: the dataset's own command makes it again.
+    """
+    if any(fault.file == NAME for fault in faults):
+        raise InputError(f"{folder / NAME}: is broken; remove it with the other files, and give the dataset's command")
+    manifest = read_manifest(folder)
+    now = new_manifest(manifest.plan(), str(manifest.origin["variant"]))
+    check_same(folder, manifest, now)
+    known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD}
+    foreign = [fault.file for fault in faults if fault.file not in known]
+    for name in foreign:
+        (folder / name).unlink(missing_ok=True)
+    repair(folder, manifest, [fault.file for fault in faults if fault.file in known], engine, progress)
+    return verify(folder, progress)
+
+
+# Content ------------------------------------------------------------------------------------------------------------
+
+
+def _shard(folder: Path, manifest: Manifest, shard: Shard) -> Iterator[Fault]:
+    indices: list[int] = []
+    try:
+        with (folder / shard.name).open("rb") as file:
+            for sample in samples(file):
+                indices.append(int(sample.meta.get("index", -1)))
+                if sample.key != sample_key(indices[-1]) or sample.meta.get("split") != shard.split:
+                    yield Fault(shard.name, f"sample {sample.key}: index or split do not fit its place")
+                members = {s: read_member(file, sample, s) for s in sample.members if s in BY_SUFFIX}
+                yield from (Fault(shard.name, f"sample {sample.key}: {w}") for w in check_sample(members, sample.meta))
+    except BrokenShardError as error:
+        yield Fault(shard.name, str(error))
+        return
+    if tuple(indices) != shard.indices:
+        yield Fault(shard.name, f"holds {len(indices)} samples; must hold {len(shard.indices)}, in their order")
+
+
+def check_sample(members: dict[str, bytes], meta: dict[str, Any]) -> Iterator[str]:
+    """Check a sample's values: sizes, ranges, unit normals that face the camera, depth against normals, counts.
+
+    Parameters
+    ----------
+    members : dict
+        Bytes by suffix.
+    meta : dict
+        Metadata.
+
+    Yields
+    ------
+    str
+        What is wrong.
+    """
+    try:
+        record = decode(members, meta)
+        camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
+        highlights = meta["highlights"]
+    except (ValueError, KeyError, TypeError) as error:
+        yield f"cannot be decoded ({error})"
+        return
+    if lacking := [name for name in REQUIRED if name not in record]:
+        yield f"has no {', '.join(lacking)}"
+        return
+    size = (camera.height, camera.width)
+    for name, array in record.items():
+        if name != "meta" and array.shape[:2] != size:
+            yield f"{name} is {array.shape[:2]}; must be {size}"
+            return
+    yield from _surface(record, camera)
+    if record["instance"].max() > len(highlights):
+        yield f"instance names highlight {int(record['instance'].max())} of {len(highlights)}"
+    for number, highlight in enumerate(highlights):
+        normal, place = np.asarray(highlight["normal"]), np.asarray(highlight["position_mm"])
+        if abs(float(np.linalg.norm(normal)) - 1) > 1e-6 or normal @ place >= 0:
+            yield f"highlight {number}: its normal is no unit vector that faces the camera"
+        column, row = (min(int(v), end - 1) for v, end in zip(highlight["bp_px"], size[::-1], strict=True))
+        seen = float(record["depth"][row, column])
+        if highlight["isolated"] and not abs(seen / highlight["distance_mm"] - 1) < MAX_DEPTH_ERROR:
+            yield f"highlight {number}: depth is {seen:g} mm and its distance {highlight['distance_mm']:g} mm"
+
+
+def _surface(record: dict[str, Any], camera: Camera) -> Iterator[str]:
+    depth, normal, curvature = record["depth"], record["normal"], record["curvature"]
+    there = np.isfinite(depth)
+    if not there.any():
+        yield "shows no surface"
+        return
+    if float(np.nanmin(depth)) <= 0:
+        yield "depth is not positive"
+        return
+    if (there != np.isfinite(normal[..., 0])).any():
+        yield "normals and depth are not there at the same pixels"
+    rays = camera.unproject(camera.pixel_centres().reshape(-1, 2)).reshape(*depth.shape, 3)
+    facing = np.sum(rays * normal, axis=-1)
+    # An octahedral normal is rounded by 1e-4.
+    if np.nanmax(facing) > 1e-3:
+        yield f"{np.count_nonzero(facing > 1e-3)} normals do not face the camera"
+    if (curvature[..., 0] > curvature[..., 1]).any():
+        yield "k_min is above k_max"
+    angle = _angle_to_depth(depth[..., None] * rays, normal)
+    if angle > MAX_DEPTH_NORMAL_DEG:
+        yield f"normals are {angle:.1f} deg from those of the depth map (median); at most {MAX_DEPTH_NORMAL_DEG:g}"
+
+
+def _angle_to_depth(points: Array, normal: Array) -> float:
+    """Give the median angle between normals and those of the depth map's own differences, deg."""
+    along_x = points[1:-1, 2:] - points[1:-1, :-2]
+    along_y = points[2:, 1:-1] - points[:-2, 1:-1]
+    own = np.cross(along_y, along_x)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own /= np.linalg.norm(own, axis=-1, keepdims=True)
+    inner = normal[1:-1, 1:-1]
+    # Either sign: that they face the camera is checked apart.
+    sine = np.linalg.norm(np.cross(own, inner), axis=-1)
+    return float(np.degrees(np.nanmedian(np.arcsin(np.clip(sine, 0, 1)))))
+
+
+def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> Iterator[Fault]:
+    is_listed = CARD not in damaged and CARD in manifest.tables
+    if is_listed and (folder / CARD).read_text(encoding="utf-8") != make_card(plan, manifest):
+        yield Fault(CARD, "differs from the card that the manifest gives")
+    for name, table in make_tables(plan, folder).items():
+        if name in damaged or name not in manifest.tables:
+            continue
+        try:
+            there = pl.read_parquet(folder / name)
+        except (pl.exceptions.PolarsError, OSError) as error:
+            yield Fault(name, f"cannot be read ({str(error).splitlines()[0]})")
+            continue
+        if not there.equals(table):
+            yield Fault(name, "differs from what the shards say")

@@ -1,0 +1,25 @@
+"""Tasks for the tests of engines: workers import them by name."""
+
+import os
+import signal
+from pathlib import Path
+
+from simtest.errors import InputError
+
+
+def square(number, tell):
+    tell()
+    return number * number
+
+
+def dies_once(argument, tell):
+    folder, number = argument
+    mark = Path(folder) / str(number)
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def fails(number, tell):
+    raise InputError(f"no such number: {number}")

@@ -1,0 +1,525 @@
+"""Datasets: plan, fields, shards, resume, verify, reading."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simtest.cli.main import main
+from simtest.dataset import fields, read
+from simtest.dataset.again import compare, sample_again
+from simtest.dataset.index import TABLES
+from simtest.dataset.manifest import NAME, read_manifest
+from simtest.dataset.plan import Plan
+from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
+from simtest.dataset.verify import mend, verify
+from simtest.dataset.writer import write_dataset
+from simtest.engines import make_engine
+from simtest.errors import InputError, SimtestError
+from simtest.spec import load_dataset, scene_from_dict
+from simtest.spec.dataset import Dataset, Distribution
+from simtest.spec.reading import validate
+
+SIX = {"samples": 6, "samples_per_anatomy": 1}
+
+
+def tiny(**values):
+    return load_dataset("tiny", values)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dataset") / "tiny"
+    write_dataset(tiny(**SIX), folder, make_engine())
+    return folder
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    return Path(shutil.copytree(made, tmp_path / "copy"))
+
+
+# Plan ---------------------------------------------------------------------------------------------------------------
+
+
+@given(
+    samples=st.integers(1, 400), each=st.integers(1, 30), seed=st.integers(0, 99), weight=st.floats(0.1, 9.0)
+)  # fmt: skip
+@settings(max_examples=25, deadline=None)
+def test_plan_shares_samples_out_once_and_no_anatomy_twice(samples, each, seed, weight):
+    colon = {"scene": "anatomy", "set": {"surface.path": "colon"}, "seeds": {"low": 5, "high": 10_000}}
+    liver = {"scene": "anatomy", "set": {"surface.path": "liver"}, "seeds": {"high": 400}, "weight": weight}
+    described = {"name": "d", "samples": samples, "samples_per_anatomy": each, "seed": seed, "families": [colon, liver]}
+    if -(-samples // each) < 3:
+        with pytest.raises(InputError, match="anatomies for 3 splits"):
+            Plan(validate(Dataset, described, "d"))
+        return
+    plan = Plan(validate(Dataset, described, "d"))
+    everything = [index for shard in plan.shards for index in shard.indices]
+    assert sorted(everything) == list(range(samples))
+    splits: dict[object, set[str]] = {}
+    for index in range(samples):
+        splits.setdefault(plan.anatomy(index), set()).add(plan.split(index))
+    assert all(len(found) == 1 for found in splits.values())
+    assert {split for found in splits.values() for split in found} == {"train", "validation", "test"}
+    seeds = [(anatomy.family, anatomy.seed) for anatomy in splits]
+    assert len(set(seeds)) == len(seeds)
+    # A split misses its share by less than two anatomies.
+    train = sum(plan.split(index) == "train" for index in range(samples))
+    assert abs(train - 0.8 * samples) <= 2 * each
+
+
+def test_draws_hang_on_index_and_attempt_alone():
+    plan, again = Plan(tiny()), Plan(tiny())
+    assert [plan.draw(i).scene for i in (3, 1, 2)] == [again.draw(i).scene for i in (3, 1, 2)]
+    assert plan.draw(3, 1).values != plan.draw(3, 0).values
+    assert plan.draw(3, 1).scene.sensor.seed == plan.draw(3, 0).scene.sensor.seed
+    seeds = {plan.draw(i).scene.sensor.seed for i in range(12)}
+    assert len(seeds) == 12
+
+
+@given(
+    low=st.floats(1e-3, 1e3), factor=st.floats(1, 100), log=st.booleans(), integer=st.booleans(), seed=st.integers(0, 9)
+)
+def test_draws_lie_in_their_range(low, factor, log, integer, seed):
+    low, high = (np.ceil(low), np.ceil(low * factor)) if integer else (low, low * factor)
+    drawn = Distribution(low=low, high=high, log=log, integer=integer).draw(np.random.default_rng(seed))
+    assert low * (1 - 1e-12) <= drawn <= high * (1 + 1e-12)
+    assert isinstance(drawn, int) == integer
+
+
+BAD = {
+    "samples = 0": ("samples", 0, "samples = 0: must be greater than or equal to 1"),
+    "families": ("families", [], "families = "),
+    "no range": ("per_sample", {"sensor.noise_sigma": {}}, "nothing to draw from"),
+    "contradiction": ("per_sample", {"sensor.noise_sigma": {"low": 0.2, "high": 0.1}}, "must not exceed high"),
+    "empty choice": ("per_sample", {"sensor.noise_sigma": {"choose": []}}, "nothing to draw from"),
+    "outside": ("per_sample", {"sensor.noise_sigma": {"low": 0.0, "high": 2.0}}, "sensor.noise_sigma = 2.0"),
+    "no such key": ("per_sample", {"sensor.noise": {"low": 0.0, "high": 0.1}}, "sensor.noise = 0.0: unknown key"),
+    "log of 0": ("per_sample", {"sensor.noise_sigma": {"low": 0, "high": 0.1, "log": True}}, "must be above 0"),
+    "splits": ("splits", {"train": 0.5, "test": 0.1}, r"train \+ validation \+ test = 0.7: must be 1"),
+    "few anatomies": ("samples_per_anatomy", 12, "1 anatomies for 3 splits"),
+    "estimator": ("estimators", ["cone"], "cone"),
+    "weights": ("per_sample", {"sensor.seed": {"choose": [1, 2], "weights": [1]}}, "must be as many"),
+    "twice": ("per_sample", {"surface.radius_mm": {"low": 5, "high": 6}}, "drawn twice"),
+    "seeds": ("families", [{"scene": "plane", "seeds": {"high": 4}}], "has no seed; leave it out"),
+}
+
+
+@pytest.mark.parametrize(("key", "value", "said"), BAD.values(), ids=BAD)
+def test_what_cannot_be_made_is_refused_before_anything_is_written(key, value, said, tmp_path):
+    data = tiny().model_dump(mode="json", exclude_unset=True) | {"name": "bad"}
+    with pytest.raises(InputError, match=said):
+        write_dataset(validate(Dataset, {**data, key: value}, "bad"), tmp_path / "out", make_engine())
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_folders_are_left_alone(copy, tmp_path):
+    with pytest.raises(InputError, match=r"another dataset \(seed = 1 there, 2 here\)"):
+        write_dataset(tiny(**SIX, seed=2), copy, make_engine())
+    assert contents(copy)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match=r"holds thesis.tex and no dataset"):
+        write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
+    with pytest.raises(InputError, match="is a file"):
+        write_dataset(tiny(**SIX), tmp_path / "full" / "thesis.tex", make_engine())
+
+
+# Fields -------------------------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 999), scale=st.floats(1.0, 5e3))
+@settings(max_examples=30, deadline=None)
+def test_fields_come_back(seed, scale):
+    rng = np.random.default_rng(seed)
+    normal = rng.standard_normal((5, 7, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    depth = scale * rng.uniform(0.05, 1, (5, 7))
+    curvature = rng.uniform(-3, 3, (5, 7, 2))
+    for array in (normal, depth, curvature):
+        array[2, 3] = np.nan
+    meta = {"depth_scale_mm": fields.depth_scale_mm(depth)}
+    back = {name: fields.BY_NAME[name].decode(fields.BY_NAME[name].encode(array), meta)
+            for name, array in (("normal", normal), ("depth", depth), ("curvature", curvature))}  # fmt: skip
+    for array in back.values():
+        assert np.isnan(array[2, 3]).all()
+    assert np.nanmax(np.abs(back["depth"] - depth)) <= 0.51 * meta["depth_scale_mm"] + 1e-6 * scale
+    assert np.nanmax(np.abs(back["curvature"] - curvature)) <= 0.51 * fields.CURVATURE_SCALE
+    sine = np.linalg.norm(np.cross(back["normal"], normal), axis=-1)
+    assert np.nanmax(np.degrees(np.arcsin(sine))) < 0.015
+    assert np.nanmin(np.sum(back["normal"] * normal, axis=-1)) > 0
+
+
+def test_depth_that_sixteen_bits_cannot_hold_is_refused():
+    with pytest.raises(ValueError, match="16 bits hold"):
+        fields.depth_scale_mm(np.array([[1e6]]))
+
+
+# The folder -----------------------------------------------------------------------------------------------------------
+
+
+def test_dataset_is_sound_and_says_what_it_holds(made):
+    assert verify(made) == []
+    names = {path.name for path in made.iterdir()}
+    assert {NAME, "README.md", *TABLES} <= names
+    assert not any(".part" in name for name in names)
+    records = list(read(made))
+    assert sorted(record["meta"]["index"] for record in records) == list(range(6))
+    for record in records:
+        assert record["image"].shape == (48, 64, 3)
+        assert record["normal"].shape == (48, 64, 3)
+        assert "radiance" not in record
+        isolated = [i + 1 for i, h in enumerate(record["meta"]["highlights"]) if h["isolated"]]
+        assert set(np.unique(record["instance"])) - {0} == set(isolated)
+        # The scene that it names is the one that was rendered.
+        assert scene_from_dict(record["meta"]["scene"]).camera.width == 64
+    table = pl.read_parquet(made / "highlights.parquet")
+    truths = sum(len(record["meta"]["highlights"]) for record in records)
+    assert table.height == truths
+    assert {r["meta"]["index"] for r in read(made, "train")} == set(
+        pl.read_parquet(made / "index.parquet").filter(pl.col("split") == "train")["index"]
+    )
+    assert "no anatomy" in (made / "README.md").read_text().lower()
+
+
+def test_truth_is_where_the_highlight_is(made):
+    for record in read(made, fields=["normal", "depth", "curvature"]):
+        for highlight in record["meta"]["highlights"]:
+            column, row = (int(v) for v in highlight["bp_px"])
+            seen = record["normal"][row, column]
+            # Half a pixel at 64 px is up to a degree of the surface's turn.
+            assert seen @ np.asarray(highlight["normal"]) > np.cos(np.radians(6))
+            assert abs(record["depth"][row, column] - highlight["distance_mm"]) < 0.2
+            kd = np.sort(record["curvature"][row, column]) * highlight["distance_mm"]
+            assert np.allclose(kd, (highlight["kd_min"], highlight["kd_max"]), atol=0.05)
+
+
+def test_same_bytes_again_whole_and_alone(made, tmp_path):
+    write_dataset(tiny(**SIX), tmp_path / "again", make_engine())
+    assert contents(tmp_path / "again") == contents(made)
+    sample_again(made, 4, tmp_path / "alone")
+    assert compare(made, 4, tmp_path / "alone").endswith("same bytes")
+    (tmp_path / "alone" / "000000004.image.png").write_bytes(b"x")
+    assert compare(made, 4, tmp_path / "alone").endswith("differs in image.png")
+
+
+class StopError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 5])
+def test_a_stopped_run_goes_on(made, tmp_path, stop_after):
+    told = 0
+
+    def stop(*_):
+        nonlocal told
+        told += 1
+        if told == stop_after:
+            raise StopError
+
+    with pytest.raises(StopError):
+        write_dataset(tiny(**SIX), tmp_path / "cut", make_engine(), progress=stop)
+    with pytest.raises(InputError, match="not finished"):
+        read(tmp_path / "cut")
+    assert all("not finished" in fault.what for fault in verify(tmp_path / "cut"))
+    write_dataset(tiny(**SIX), tmp_path / "cut", make_engine())
+    assert contents(tmp_path / "cut") == contents(made)
+
+
+@given(cut=st.floats(0, 1), noise=st.binary(max_size=600))
+@settings(max_examples=12, deadline=None)
+def test_a_shard_cut_anywhere_goes_on(made, tmp_path_factory, cut, noise):
+    folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("cut") / "copy"))
+    manifest = read_manifest(folder)
+    name = sorted(manifest.shards)[0]
+    data = (folder / name).read_bytes()
+    (folder / name).unlink()
+    (folder / f"{name}.part").write_bytes(data[: int(cut * len(data))] + noise)
+    write_dataset(tiny(**SIX), folder, make_engine())
+    assert contents(folder) == contents(made)
+
+
+def test_a_finished_shard_that_the_manifest_lost_is_not_made_again(made, copy, monkeypatch):
+    manifest = read_manifest(copy)
+    manifest.shards.pop(sorted(manifest.shards)[0])
+    manifest.save(copy)
+    monkeypatch.setattr("simtest.dataset.sample.Maker.make", lambda *_: pytest.fail("made again"))
+    write_dataset(tiny(**SIX), copy, make_engine())
+    assert contents(copy) == contents(made)
+
+
+def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
+    def full(file, key, members):
+        if key == "000000003":
+            file.write(b"half a sample")
+            raise OSError(28, "No space left on device")
+        write_sample(file, key, members)
+
+    monkeypatch.setattr("simtest.dataset.writer.write_sample", full)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); what is written stays valid"):
+        write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
+    monkeypatch.undo()
+    write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
+    assert contents(tmp_path / "full") == contents(made)
+
+
+def test_reader_names_what_it_does_not_know(made, tmp_path):
+    with pytest.raises(InputError, match="field colour: unknown; allowed: image, depth"):
+        read(made, fields=["colour"])
+    with pytest.raises(InputError, match="split = dev: unknown; allowed: test, train, validation"):
+        read(made, split="dev")
+    with pytest.raises(InputError, match="no dataset to read"):
+        read(tmp_path)
+    with pytest.raises(InputError, match="must be 0 to 5"):
+        sample_again(made, 6, tmp_path / "x")
+
+
+# Damage -------------------------------------------------------------------------------------------------------------
+
+
+def flip(path, place):
+    data = bytearray(path.read_bytes())
+    data[int(place * (len(data) - 1))] ^= 0x40
+    path.write_bytes(data)
+
+
+def edit_manifest(folder, change):
+    content = json.loads((folder / NAME).read_text())
+    change(content)
+    (folder / NAME).write_text(json.dumps(content))
+
+
+def honest(folder, name):
+    """Make the manifest agree with a changed file: only its content then tells."""
+    manifest = read_manifest(folder)
+    from simtest.dataset.manifest import file_entry
+
+    where = manifest.tables if name in manifest.tables else manifest.shards
+    where[name] = file_entry(folder / name)
+    manifest.save(folder)
+
+
+def rewrite(folder, name, change):
+    """Write a shard again with changed samples, hashes and all."""
+    with (folder / name).open("rb") as file:
+        stored = [(s.key, {x: _member(file, s, x) for x in s.members}, s.meta) for s in samples(file)]
+    changed = change(stored)
+    with (folder / name).open("wb") as file:
+        for key, members, meta in changed:
+            images = {suffix: data for suffix, data in members.items() if suffix != "json"}
+            hashes = {suffix: hashlib.sha256(data).hexdigest() for suffix, data in images.items()}
+            write_sample(file, key, {**images, "json": json.dumps({**meta, "sha256": hashes}).encode()})
+        finish(file)
+    honest(folder, name)
+
+
+def _member(file, sample, suffix):
+    start, length = sample.members[suffix]
+    file.seek(start)
+    return file.read(length)
+
+
+def with_image(name, change):
+    """Change one decoded image of the first sample."""
+
+    def apply(stored):
+        key, members, meta = stored[0]
+        field = fields.BY_NAME[name]
+        array = field.decode(members[field.suffix], meta)
+        return [(key, {**members, field.suffix: field.encode(change(array.copy()))}, meta), *stored[1:]]
+
+    return lambda folder: rewrite(folder, TAR, apply)
+
+
+def with_meta(change):
+    def apply(stored):
+        key, members, meta = stored[0]
+        meta = json.loads(json.dumps(meta))
+        change(meta)
+        return [(key, members, meta), *stored[1:]]
+
+    return lambda folder: rewrite(folder, TAR, apply)
+
+
+def put(array, value):
+    array[10:30, 10:30] = value
+    return array
+
+
+TAR, OTHER = "train-000000.tar", "test-000000.tar"
+
+
+def swap(folder):
+    (folder / TAR).rename(folder / "x")
+    (folder / OTHER).rename(folder / TAR)
+    (folder / "x").rename(folder / OTHER)
+
+
+def link(folder):
+    (folder / TAR).rename(folder.parent / "away")
+    (folder / TAR).symlink_to(folder.parent / "away")
+
+
+def as_folder(folder):
+    (folder / TAR).unlink()
+    (folder / TAR).mkdir()
+
+
+def edit(name, change):
+    """Change a table, and let the manifest agree."""
+
+    def apply(folder):
+        change(pl.read_parquet(folder / name)).write_parquet(folder / name)
+        honest(folder, name)
+
+    return apply
+
+
+def new_card(folder):
+    (folder / "README.md").write_text("Better than any other.")
+    honest(folder, "README.md")
+
+
+def first(change):
+    """Change the members of the first sample."""
+    return lambda folder: rewrite(folder, TAR, lambda s: [(s[0][0], change(dict(s[0][1])), s[0][2]), *s[1:]])
+
+
+def without(members):
+    members.pop("normal.png")
+    return members
+
+
+INDEX, HIGHLIGHTS, ESTIMATES = TABLES
+DAMAGE = {
+    "flipped byte at the beginning": (lambda f: flip(f / TAR, 0.0), TAR),
+    "flipped byte in the middle": (lambda f: flip(f / TAR, 0.5), TAR),
+    "flipped byte near the end": (lambda f: flip(f / TAR, 0.9), TAR),
+    "flipped byte in the padding": (lambda f: flip(f / TAR, 1.0), TAR),
+    "truncated shard": (lambda f: (f / TAR).write_bytes((f / TAR).read_bytes()[:5000]), TAR),
+    "empty shard": (lambda f: (f / TAR).write_bytes(b""), TAR),
+    "longer shard": (lambda f: (f / TAR).write_bytes((f / TAR).read_bytes() + b"more"), TAR),
+    "missing shard": (lambda f: (f / TAR).unlink(), TAR),
+    "swapped shards": (swap, TAR),
+    "shard is a folder": (as_folder, TAR),
+    "shard is a link": (link, TAR),
+    "foreign file": (lambda f: (f / "notes.txt").write_text("mine"), "notes.txt"),
+    "left-over part": (lambda f: (f / "train-000009.tar.part").write_bytes(b"x"), "train-000009.tar.part"),
+    "missing manifest": (lambda f: (f / NAME).unlink(), NAME),
+    "manifest is no JSON": (lambda f: (f / NAME).write_text("{"), NAME),
+    "manifest of another format": (lambda f: edit_manifest(f, lambda c: c.update(format="mine")), NAME),
+    "edited hash": (lambda f: edit_manifest(f, lambda c: c["shards"][TAR].update(sha256="0" * 64)), NAME),
+    "edited seed": (lambda f: edit_manifest(f, lambda c: c["dataset"].update(seed=5)), NAME),
+    "missing index": (lambda f: (f / INDEX).unlink(), INDEX),
+    "truncated index": (lambda f: (f / INDEX).write_bytes(b"PAR1"), INDEX),
+    "edited index": (edit(INDEX, lambda t: t.with_columns(n_isolated=pl.lit(7))), INDEX),
+    "row lost from the highlights": (edit(HIGHLIGHTS, lambda t: t.head(3)), HIGHLIGHTS),
+    "edited estimates": (edit(ESTIMATES, lambda t: t.with_columns(error_deg=pl.col("error_deg") / 2)), ESTIMATES),
+    "edited card": (new_card, "README.md"),
+    "normals turned away": (with_image("normal", lambda n: put(n, (0.0, 0.0, 1.0))), TAR),
+    "normals of another frame": (with_image("normal", lambda n: n * np.array([-1, 1, 1])), TAR),
+    "holes in the depth": (with_image("depth", lambda d: put(d, np.nan)), TAR),
+    "depth without a unit": (with_meta(lambda m: m.update(depth_scale_mm=0.0)), TAR),
+    "depth in another unit": (with_meta(lambda m: m.update(depth_scale_mm=10 * m["depth_scale_mm"])), TAR),
+    "curvature with its sign turned": (with_image("curvature", lambda k: -k - np.array([0.0, 0.1])), TAR),
+    "image of another size": (with_image("image", lambda i: i[:-1]), TAR),
+    "no PNG": (first(lambda m: {**m, "depth.png": b"no"}), TAR),
+    "member lost": (first(without), TAR),
+    "sample lost": (lambda f: rewrite(f, TAR, lambda s: s[1:]), TAR),
+    "sample of another split": (with_meta(lambda m: m.update(split="test")), TAR),
+    "highlight's normal scaled": (with_meta(lambda m: m["highlights"][0].update(normal=[0, 0, -2])), TAR),
+    "instance of no highlight": (with_image("instance", lambda i: put(i, 200)), TAR),
+}
+
+
+@pytest.mark.parametrize(("damage", "named"), DAMAGE.values(), ids=DAMAGE)
+def test_damage_is_found_and_named(copy, damage, named):
+    damage(copy)
+    faults = verify(copy)
+    assert named in {fault.file for fault in faults}, faults
+
+
+def test_damage_is_mended(made, copy):
+    DAMAGE["flipped byte in the middle"][0](copy)
+    DAMAGE["edited estimates"][0](copy)
+    DAMAGE["foreign file"][0](copy)
+    assert mend(copy, verify(copy), make_engine()) == []
+    assert contents(copy) == contents(made)
+    (copy / NAME).write_text("{")
+    with pytest.raises(InputError, match="is broken; remove it"):
+        mend(copy, verify(copy), make_engine())
+
+
+def test_shards_that_are_no_tar_are_told(tmp_path):
+    for data in (b"", b"x" * 700, bytes(512)):
+        (tmp_path / "a.tar").write_bytes(data)
+        with (tmp_path / "a.tar").open("rb") as file, pytest.raises(BrokenShardError):
+            list(samples(file))
+
+
+# Engines ------------------------------------------------------------------------------------------------------------
+
+
+def test_engines_are_checked():
+    with pytest.raises(InputError, match="allowed: local, ray"):
+        make_engine("slurm")
+    with pytest.raises(InputError, match="workers = 0: must be 1 to 256"):
+        make_engine(workers=0)
+    with pytest.raises(InputError, match="is for --engine ray"):
+        make_engine(address="here")
+
+
+def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
+    from tests.unit.engine_tasks import dies_once, fails, square
+
+    told = []
+    got = dict(make_engine(workers=2).run(square, range(5), lambda: told.append(1)))
+    assert got == {i: i * i for i in range(5)}
+    assert len(told) == 5
+    arguments = [(str(tmp_path), i) for i in range(3)]
+    assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
+    with pytest.raises(SimtestError, match=r"no such number: [12]"):
+        list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
+
+
+# Command line -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+def test_commands(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["simtest", "dataset", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().out.splitlines()
+
+    size = ["--samples", "6", "--set", "samples_per_anatomy=1"]
+    assert run("tiny", "--out", "made", *size) == (0, ["made/README.md"])
+    assert contents(tmp_path / "made") == contents(made)
+    assert run("verify", "made") == (0, ["sound"])
+    code, said = run("sample", "made", "2")
+    assert (code, said[-1].partition(": ")[2]) == (0, "same bytes")
+    assert run("preview", "made", "--samples", "3") == (0, ["preview.html"])
+    page = (tmp_path / "preview.html").read_text()
+    assert page.count('<section class="card">') == 3
+    assert "http" not in page.replace("http-equiv", "")
+    flip(tmp_path / "made" / TAR, 0.5)
+    code, said = run("verify", "made")
+    assert code == 1
+    assert said[-1] == "1 faults"
+    code, said = run("verify", "made", "--repair")
+    assert (code, said[-1]) == (0, "mended")
+    assert contents(tmp_path / "made") == contents(made)
