@@ -52,6 +52,14 @@ def make_surface(spec: Surface) -> SurfaceModel:
             return surface
 
 
+def forget_meshes() -> None:
+    """Let go of the meshes that are kept for further scenes of the last few anatomies."""
+    from simtest.anatomy import centreline, colon, liver, mesh
+
+    for kept in (centreline._camera_path, colon.build, liver.build, mesh._prepare):
+        kept.cache_clear()
+
+
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
     # Imported here: the mesh libraries are slow to load and analytic scenes do not need them.
     from simtest.anatomy.colon import Colon

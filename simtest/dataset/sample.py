@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from simtest.anatomy import forget_meshes
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import FIELDS, depth_scale_mm
-from simtest.dataset.plan import Drawn, Plan
+from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction import Specularity, reconstruct
-from simtest.rendering import Frame, Session
+from simtest.rendering import Frame, Session, backend
 from simtest.sensor import to_uint8
 from simtest.spec import describe_camera
 from simtest.validation.matching import match
@@ -87,6 +88,7 @@ class Maker:
         self.plan = plan
         self._variant = variant or DEFAULT_VARIANT
         self._session: Session | None = None
+        self._anatomy: Anatomy | None = None
         self._estimators = load_estimators(plan.dataset.estimators)
 
     def make(self, index: int) -> Sample:
@@ -128,7 +130,13 @@ class Maker:
         return sum(truth.isolated for truth in seen.truths) >= self.plan.dataset.highlights
 
     def _at(self, drawn: Drawn) -> Session:
+        if self._session is not None and drawn.anatomy != self._anatomy:
+            # The next anatomy is another scene, and this one's does not come back: memory must not add up.
+            self._session = None
+            forget_meshes()
+            backend.release_memory()
         if self._session is None:
+            self._anatomy = drawn.anatomy
             self._session = Session(drawn.scene, self._variant, labelled=True)
         self._session.update(drawn.scene)
         return self._session

@@ -5,6 +5,7 @@ child process before the real one uses it. Nothing is set when this module is im
 """
 
 import contextlib
+import gc
 import importlib.metadata
 import json
 import os
@@ -238,6 +239,14 @@ def load(variant: str | None = None) -> Any:
             cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
             raise BackendError(f"variant {name}: cannot be used here ({cause})") from error
     return mitsuba
+
+
+def release_memory() -> None:
+    """Give back what scenes that are gone have held: Dr.Jit keeps freed arrays for the next ones."""
+    import drjit
+
+    gc.collect()
+    drjit.flush_malloc_cache()
 
 
 def _limit_threads(threads: str) -> None:
