@@ -7,9 +7,10 @@ from simtest.estimators.spot import Spot
 def spot_flags(spot: Spot) -> tuple[str, ...]:
     """Give the flags of a highlight's isophotes.
 
-    ``missing_isovalues``: some isovalues gave no ellipse. ``partial_arc``: some of them because the isophote runs into
-    the border of the region, the frame or the view, so that the highlight may be cut there.
+    ``missing_isovalues``: some isovalues gave no ellipse. ``partial_arc``: some isophotes run into the border of the
+    region, the frame or the view, so that the highlight may be cut there; they are left out, or fitted to what is seen.
     """
     flags = ("missing_isovalues",) if spot.failures else ()
-    cut = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in spot.failures)
-    return (*flags, "partial_arc") if cut else flags
+    missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in spot.failures)
+    cut = any(isophote.cut for isophote in spot.isophotes)
+    return (*flags, "partial_arc") if cut or missing else flags

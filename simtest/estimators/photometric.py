@@ -21,6 +21,9 @@ Mask = npt.NDArray[np.bool_]
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """Isovalues whose region's pixels are fitted: the first one that closes. Further out there is little but noise."""
 
+CUT_REGION = 0.3
+"""Of a highlight that the border or the view cuts: the isovalue down to which the pixels that are seen are fitted."""
+
 START_ISOVALUE = 0.3
 """Of the circle pose that a plane seen from aside starts with."""
 
@@ -72,7 +75,7 @@ def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
     start = cone_axis(patch, camera)
     if isinstance(start, Failure):
         return start
-    pixels = _pixels(patch, camera)
+    pixels = _pixels(patch, camera, cut=any(isophote.cut for isophote in start.isophotes))
     if isinstance(pixels, Failure):
         return pixels
     fitted = fit_lobe(_quadric(start, patch, pixels.rays), pixels.observed, pixels.clipped)
@@ -162,15 +165,13 @@ def _pose(patch: Patch, camera: Camera, isovalue: float) -> Estimate | Failure:
     return first
 
 
-def _pixels(patch: Patch, camera: Camera) -> _Pixels | Failure:
-    """Gather the pixels of the first region that closes."""
-    for t in REGIONS:
-        crossings = patch.crossings(t)
-        if not isinstance(crossings, Failure):
-            break
-    else:
+def _pixels(patch: Patch, camera: Camera, cut: bool = False) -> _Pixels | Failure:
+    """Gather the pixels of the first region that closes; of a highlight that is cut, those that are seen."""
+    closed = (t for t in REGIONS if not isinstance(patch.crossings(t), Failure))
+    t = next(closed, CUT_REGION if cut else None)
+    if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")
-    rows, columns = np.nonzero(patch.inside(t))
+    rows, columns = np.nonzero(patch.inside(t, cut))
     step = -(-len(rows) // MAX_PIXELS)
     # A step that shares no factor with a row's length spreads over the columns too.
     rows, columns = rows[::step], columns[::step]

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
-from simtest.estimators.base import FittedIsophote, fit_isophotes
+from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.estimators.top import Top, fit_top
 from simtest.geometry import Camera, CirclePose, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
@@ -27,8 +27,8 @@ MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2 = 13.82
-"""Squared Mahalanobis distance beyond which the axis' drift is more than noise: 1 % of a normal pair lies beyond."""
 """Squared Mahalanobis distance beyond which the axis' drift is more than noise: 0.1 % of a normal pair lies beyond."""
+
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
@@ -172,9 +172,9 @@ class Spot:
         by_shift[4:] = ((self._moments_at(step) - self._moments_at(-step)) / (2 * step))[_UPPER]
         by_peak, pixels, shares = -by_shift / self.patch.peak_value, [], []
         for k, isophote in enumerate(self.isophotes):
-            moved = self.patch.sensitivities(isophote.isovalue)
+            moved = self.patch.sensitivities(isophote.isovalue, isophote.cut)
             assert not isinstance(moved, Failure)
-            by_crossing = self._outputs(k) @ self._conic_by_crossing(k, isophote.points, moved.vertical)
+            by_crossing = self._outputs(k) @ self._conic_by_crossing(k, isophote, moved.vertical)
             by_peak = by_peak + by_crossing @ moved.level * isophote.isovalue
             pixels.append((moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel())
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
@@ -208,11 +208,13 @@ class Spot:
         both = np.hstack([np.eye(2), np.eye(2)])
         return np.asarray(both @ self.covariance[:4, :4] @ both.T)
 
-    def _conic_by_crossing(self, k: int, points: Array, vertical: npt.NDArray[np.bool_]) -> Array:
+    def _conic_by_crossing(self, k: int, isophote: FittedIsophote, vertical: npt.NDArray[np.bool_]) -> Array:
         """Tell how the conic a x^2 + b x y + c y^2 + d x + e y = 1 in the basis moves with its crossings, shape (5, N).
 
-        To first order a fit to points near an ellipse moves as the linear one does.
+        To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the
+        conic's gradient where the fit is gradient-weighted.
         """
+        points = isophote.points
         step = np.where(vertical[:, None], [0.0, STEP_PX], [STEP_PX, 0.0])
         x, y = self.tangents(points).T
         dx, dy = ((self.tangents(points + step) - self.tangents(points - step)) / (2 * STEP_PX)).T
@@ -220,7 +222,10 @@ class Spot:
         misfit = (2 * a * x + b * y + d) * dx + (b * x + 2 * c * y + e) * dy
         design = np.stack([x * x, x * y, y * y, x, y], axis=1)
         design /= (scale := np.abs(design).max(axis=0))
-        inverse = np.linalg.solve(design.T @ design, design.T) / scale[:, None]
+        weighted = design
+        if isophote.cut:
+            weighted = design / ((2 * a * x + b * y + d) ** 2 + (b * x + 2 * c * y + e) ** 2)[:, None]
+        inverse = np.linalg.solve(weighted.T @ design, weighted.T) / scale[:, None]
         return np.asarray(-inverse * misfit)
 
     def tangents(self, points: Array) -> Array:
@@ -303,17 +308,36 @@ def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot |
     Returns
     -------
     Spot or Failure
-        With fewer than 2 isophotes (1, where no more were asked for) the first one's Failure.
+        Where fewer than 2 isophotes (1, where no more were asked for) are whole, those that are cut are fitted to what
+        is seen of them; with fewer than 2 of either kind the first one's Failure.
     """
     fitted, failures = fit_isophotes(patch, camera, isovalues)
+    kept, poses, failures = _with_poses(fitted, failures)
+    least = min(MIN_ISOPHOTES, len(isovalues))
+    if len(poses) < least:
+        whole = {isophote.isovalue for isophote in kept}
+        arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in whole]
+        cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
+        if len(kept) + len(cut) < least:
+            return failures[0]
+        failed = [arc for arc in arcs if isinstance(arc, Failure)]
+        kept, poses, failed = _with_poses(sorted([*kept, *cut], key=lambda i: i.isovalue), failed)
+        if len(poses) < least:
+            return failures[0]
+        failures = failed
+    return Spot(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+
+
+def _with_poses(
+    fitted: list[FittedIsophote], failures: list[Failure]
+) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
+    """Give the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
     kept, poses = [], []
     for isophote in fitted:
         pose = isophote.pose()
         if isinstance(pose, Failure):
-            failures.append(pose)
+            failures = [*failures, pose]
         else:
             kept.append(isophote)
             poses.append(pose)
-    if len(poses) < min(MIN_ISOPHOTES, len(isovalues)):
-        return failures[0]
-    return Spot(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+    return kept, poses, failures

@@ -65,12 +65,15 @@ class LevelSet:
         The level.
     corner : tuple of int
         Column and row of the first pixel in the array that the region was found in.
+    sound : ndarray of bool, shape (h, w), optional
+        Of a region that something cuts: the pixels far enough from the cut. Only lines between these are crossed.
     """
 
     values: Image | Array
     inside: Mask
     level: float
     corner: tuple[int, int]
+    sound: Mask | None = None
 
     def crossings(self) -> Array:
         """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
@@ -105,9 +108,13 @@ class LevelSet:
     def _lines(self) -> tuple[int, npt.NDArray[np.intp], Array, Array]:
         """Give how many crossed lines are horizontal; of all lines the first pixel and the values at both ends."""
         width = self.inside.shape[1]
-        rows, columns = np.divmod(np.flatnonzero(self.inside[:, 1:] != self.inside[:, :-1]), width - 1)
+        across, down = self.inside[:, 1:] != self.inside[:, :-1], self.inside[1:] != self.inside[:-1]
+        if self.sound is not None:
+            across &= self.sound[:, 1:] & self.sound[:, :-1]
+            down &= self.sound[1:] & self.sound[:-1]
+        rows, columns = np.divmod(np.flatnonzero(across), width - 1)
         first = rows * width + columns
-        below = np.flatnonzero(self.inside[1:] != self.inside[:-1])
+        below = np.flatnonzero(down)
         values = np.ravel(self.values)
         pixels = np.concatenate([first, below])
         start = values[pixels].astype(float)
@@ -163,6 +170,40 @@ def level_set_around(
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))
+
+
+def cut_level_set_around(
+    values: Image | Array, pixel: tuple[int, int], level: float, margin_px: int, seen: Mask | None = None
+) -> LevelSet:
+    """Find the region above a level that holds a pixel, where the array's border or the view cuts it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (H, W)
+        Finite intensities.
+    pixel : tuple of int
+        Column and row; its value lies above the level.
+    level : float
+        The level.
+    margin_px : int
+        Where the border is crossed nearer than this to the cut, smoothing has drawn it aside: it is left out.
+    seen : ndarray of bool, shape (H, W), optional
+        Where the values are known; default everywhere.
+
+    Returns
+    -------
+    LevelSet
+        Its border is open at the cut.
+    """
+    known = np.ones(values.shape, dtype=bool) if seen is None else seen
+    marks = ((values > level) & known).view(np.uint8)
+    cv2.floodFill(marks, None, pixel, _REGION, flags=4)
+    around = np.pad(np.where(marks == _REGION, np.uint8(_REGION), np.uint8(0)), 1)
+    cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
+    side = 2 * margin_px + 1
+    sound = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
+    framed: Image | Array = np.pad(values, 1, mode="edge")
+    return LevelSet(framed, around != _OUTSIDE, level, (-1, -1), np.asarray(sound))
 
 
 def _first_of_each(points: Array, suspects: Mask) -> Mask:
