@@ -1,16 +1,18 @@
 """`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import Known
 from simtest.errors import Failure, Reason
+from simtest.estimators.aside import with_known_lights
 from simtest.estimators.base import Estimate, FittedIsophote
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.lobe_fit import LobeFit, fit_lobe
+from simtest.estimators.goodness import excess_of_misfit, is_misfit
+from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.geometry import Camera, Patch, cone_rays
 from simtest.geometry.vectors import tangent_basis
@@ -46,19 +48,27 @@ class _Pixels:
     rays: Array
     observed: Array
     clipped: Mask | None
+    noise: float | Array | None
 
     def every(self, step: int) -> "_Pixels":
         """Give every so many pixels."""
         clipped = None if self.clipped is None else self.clipped[::step]
-        return _Pixels(self.rays[::step], self.observed[::step], clipped)
+        noise = self.noise[::step] if isinstance(self.noise, np.ndarray) else self.noise
+        return _Pixels(self.rays[::step], self.observed[::step], clipped, noise)
 
 
-def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
+NOTHING_KNOWN = Known()
+
+
+def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> Estimate | Failure:
     """Fit a quadric patch seen by a camera with its own light, started from `cone_axis`.
 
     N = -s with s the sightline of the BP; beside it the shape d S, the lobe's scale and, with the shape all but
     degenerate, its exponent are open. Under white noise it is the maximum-likelihood estimate. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
+
+    Where the residuals hold more structure than the frame's noise, the flag is ``misfit``, and the covariance holds
+    how far the normal moves when only the pixels around the peak are fitted.
 
     Parameters
     ----------
@@ -66,11 +76,13 @@ def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
         Region of interest.
     camera : Camera
         Calibration.
+    known : Known
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
 
     Returns
     -------
     Estimate or Failure
-        One candidate with its covariance; it looks at the fitted BP.
+        One candidate with its covariance; it looks at the fitted BP. Flags as of `cone_axis`, and ``misfit``.
     """
     start = cone_axis(patch, camera)
     if isinstance(start, Failure):
@@ -84,7 +96,20 @@ def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
     e, f, s = fitted.model.frame
     covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
     ratio = _axis_ratio(fitted.model)
-    return _estimate(fitted, fitted.model.normal[None], camera.project(s), covariance, start.isophotes, ratio)
+    flags = start.flags
+    if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
+        covariance = covariance + excess_of_misfit(fitted, pixels.observed, pixels.clipped) * np.eye(2)
+        flags = (*flags, "misfit")
+    estimate = Estimate(
+        normal=fitted.model.normal,
+        candidates=fitted.model.normal[None],
+        look_px=camera.project(s),
+        axis_ratio=ratio,
+        isophotes=start.isophotes,
+        covariance=covariance,
+        flags=flags,
+    )
+    return with_known_lights(estimate, known)
 
 
 def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = START_ISOVALUE) -> Estimate | Failure:
@@ -134,19 +159,11 @@ def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = STAR
     if len(fits) > 1 and best.sigma > 0:
         margin = float(np.sqrt(COARSE * (fits[1].chi2 - fits[0].chi2)) / best.sigma)
     normals = np.stack([fitted.model.normal for fitted in (best, *fits[1:])])
-    return _estimate(best, normals, camera.project(best.model.foot), covariance, start.isophotes, None, margin)
-
-
-def _estimate(
-    fitted: LobeFit[Any], normals: Array, look: Array, covariance: Array, isophotes: tuple[FittedIsophote, ...],
-    axis_ratio: float | None, margin: float | None = None,
-) -> Estimate:  # fmt: skip
     return Estimate(
         normal=normals[0],
         candidates=normals,
-        look_px=look,
-        axis_ratio=axis_ratio,
-        isophotes=isophotes,
+        look_px=camera.project(best.model.foot),
+        isophotes=start.isophotes,
         choice_margin=margin,
         covariance=covariance,
     )
@@ -180,7 +197,9 @@ def _pixels(patch: Patch, camera: Camera, cut: bool = False) -> _Pixels | Failur
     sound = np.isfinite(rays).all(axis=1)
     values = patch.values if patch.raw is None else patch.raw
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
-    return _Pixels(rays[sound], values[rows, columns][sound].astype(float), clipped)
+    known = patch.noise
+    noise = known[rows, columns][sound].astype(float) if isinstance(known, np.ndarray) else known
+    return _Pixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise)
 
 
 def _quadric(start: Estimate, patch: Patch, rays: Array) -> ColocatedQuadric:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.estimators.top import Top, fit_top
@@ -28,6 +29,9 @@ MIN_ISOPHOTES = 2
 
 DRIFT_CHI2 = 13.82
 """Squared Mahalanobis distance beyond which the axis' drift is more than noise: 0.1 % of a normal pair lies beyond."""
+
+NOISE_FACTOR = 2.0
+"""How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
 
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
@@ -232,6 +236,23 @@ class Spot:
         """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         rays = self.camera.unproject(points)
         return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
+
+    @cached_property
+    def is_bent(self) -> bool:
+        """Whether an isophote is no ellipse by more than that of a point highlight may differ, and noise allows for."""
+        noise = self.patch.noise
+        at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
+        left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
+        for (a, b, c, d, e), isophote in zip(self._conics, self.isophotes, strict=True):
+            x, y = self.tangents(isophote.points).T
+            F = a * x * x + b * x * y + c * y * y + d * x + e * y - 1
+            slope = np.hypot(2 * a * x + b * y + d, b * x + 2 * c * y + e)
+            residual = np.sqrt(np.mean((F / slope) ** 2)) * max(a * c - b * b / 4, 0.0) ** 0.25
+            # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
+            by_noise = left / (-2 * isophote.isovalue * np.log(isophote.isovalue))
+            if residual > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise):
+                return True
+        return False
 
     @cached_property
     def _conics(self) -> list[Array]:

@@ -202,7 +202,7 @@ def cut_level_set_around(
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     side = 2 * margin_px + 1
     sound = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
-    framed: Image | Array = np.pad(values, 1, mode="edge")
+    framed = np.asarray(np.pad(values, 1, mode="edge"), dtype=np.float64)
     return LevelSet(framed, around != _OUTSIDE, level, (-1, -1), np.asarray(sound))
 
 
