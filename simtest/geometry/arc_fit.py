@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 MIN_ARC_RAD = np.radians(120.0)
 """Shorter arcs leave the ellipse open: here the noise of the centre is a hundred times that of a whole ellipse."""
 
-MAX_EVALUATIONS = 60
+MAX_EVALUATIONS = 30
 TOLERANCE = 1e-10
 
 
