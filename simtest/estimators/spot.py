@@ -18,7 +18,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.estimators.top import Top, fit_top
-from simtest.geometry import Camera, CirclePose, Patch, cone_axes
+from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_basis
 
@@ -97,6 +97,10 @@ class Spot:
     def _top(self) -> Top:
         return fit_top(self.patch)
 
+    @cached_property
+    def _weights(self) -> Array:
+        return _to_peak(self.levels)
+
     @property
     def can_extrapolate(self) -> bool:
         """Whether a line through the isophotes is determined."""
@@ -106,7 +110,7 @@ class Spot:
     def drift(self) -> Array:
         """How far the axis at t -> 1 lies from the mean axis, in the basis, rad, shape (2,); 0 for one isophote."""
         places = np.array([pose.axis for pose in self.poses]) @ self.basis.T
-        return _to_peak(self.levels) @ places if self.can_extrapolate else np.zeros(2)
+        return self._weights @ places if self.can_extrapolate else np.zeros(2)
 
     @property
     def peak_axis(self) -> Array:
@@ -139,18 +143,17 @@ class Spot:
         """Give the moments with the levels moved by a shift."""
         levels = self.levels + shift
         added = 2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1)
-        each = np.array(self._tangent_moments) - added[:, None, None] * self._px2
+        each = self._tangent_moments - added[:, None, None] * self._px2
         return np.asarray(np.einsum("k,kij->ij", _to_peak(levels) / (2 * levels), each))
 
     @cached_property
-    def _tangent_moments(self) -> list[Array]:
-        """E(t) of each isophote in the basis, squared tangents, shape (2, 2) each."""
-        made = []
-        for isophote in self.isophotes:
-            (l1, l2, l3), vectors = cone_axes(isophote.cone, isophote.sightline)
-            e1, e2 = self.basis @ vectors[:, 0], self.basis @ vectors[:, 1]
-            made.append(-l3 / l1 * np.outer(e1, e1) - l3 / l2 * np.outer(e2, e2))
-        return made
+    def _tangent_moments(self) -> Array:
+        """E(t) of each isophote in the basis, squared tangents, shape (K, 2, 2)."""
+        cones = np.array([isophote.cone for isophote in self.isophotes])
+        values, vectors = cone_axes(cones, np.array([isophote.sightline for isophote in self.isophotes]))
+        across = self.basis @ vectors[:, :, :2]
+        squares = -values[:, 2:] / values[:, :2]
+        return np.asarray((across * squares[:, None]) @ across.transpose(0, 2, 1))
 
     @cached_property
     def _px2(self) -> Array:
@@ -178,11 +181,12 @@ class Spot:
         step = 1e-4
         by_shift = np.zeros(7)
         by_shift[4:] = ((self._moments_at(step) - self._moments_at(-step)) / (2 * step))[_UPPER]
+        outputs = self._outputs
         by_peak, pixels, shares = -by_shift / self.patch.peak_value, [], []
         for k, isophote in enumerate(self.isophotes):
             moved = self.patch.sensitivities(isophote.isovalue, isophote.cut)
             assert not isinstance(moved, Failure)
-            by_crossing = self._outputs(k) @ self._conic_by_crossing(k, isophote, moved.vertical)
+            by_crossing = outputs[k] @ self._conic_by_crossing(k, moved.vertical)
             by_peak = by_peak + by_crossing @ moved.level * isophote.isovalue
             pixels.append((moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel())
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
@@ -221,25 +225,34 @@ class Spot:
         noise = both @ self.covariance[:4, :4] @ both.T
         return np.asarray(noise + PEAK_SHARE * self.drift_excess * np.eye(2))
 
-    def _conic_by_crossing(self, k: int, isophote: FittedIsophote, vertical: npt.NDArray[np.bool_]) -> Array:
+    def _conic_by_crossing(self, k: int, vertical: npt.NDArray[np.bool_]) -> Array:
         """Tell how the conic a x^2 + b x y + c y^2 + d x + e y = 1 in the basis moves with its crossings, shape (5, N).
 
         To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the
         conic's gradient where the fit is gradient-weighted.
         """
-        points = isophote.points
-        step = np.where(vertical[:, None], [0.0, STEP_PX], [STEP_PX, 0.0])
-        x, y = self.tangents(points).T
-        dx, dy = ((self.tangents(points + step) - self.tangents(points - step)) / (2 * STEP_PX)).T
+        (x, y), by_column, by_row = self._crossings[k]
+        dx, dy = np.where(vertical, by_row, by_column)
         a, b, c, d, e = self._conics[k]
-        misfit = (2 * a * x + b * y + d) * dx + (b * x + 2 * c * y + e) * dy
-        design = np.stack([x * x, x * y, y * y, x, y], axis=1)
-        design /= (scale := np.abs(design).max(axis=0))
-        weighted = design
-        if isophote.cut:
-            weighted = design / ((2 * a * x + b * y + d) ** 2 + (b * x + 2 * c * y + e) ** 2)[:, None]
-        inverse = np.linalg.solve(weighted.T @ design, weighted.T) / scale[:, None]
-        return np.asarray(-inverse * misfit)
+        by_x, by_y = 2 * a * x + b * y + d, b * x + 2 * c * y + e
+        design = np.array([x * x, x * y, y * y, x, y])
+        design /= (scale := np.abs(design).max(axis=1))[:, None]
+        weighted = design / (by_x**2 + by_y**2) if self.isophotes[k].cut else design
+        inverse = np.linalg.solve(weighted @ design.T, weighted) / scale[:, None]
+        return np.asarray(-inverse * (by_x * dx + by_y * dy))
+
+    @cached_property
+    def _crossings(self) -> list[tuple[Array, Array, Array]]:
+        """Tangents of each isophote's points and how they move per px to the right and down, shapes (2, N)."""
+        counts = np.cumsum([len(isophote.points) for isophote in self.isophotes])
+        points = np.concatenate([isophote.points for isophote in self.isophotes])
+        right, down = np.array([STEP_PX, 0.0]), np.array([0.0, STEP_PX])
+        # All at once: a call for each would cost more than the work.
+        places = self.tangents(np.concatenate([points, points + right, points - right, points + down, points - down]))
+        here, *sides = np.split(places.T, 5, axis=1)
+        moves = [(sides[i] - sides[i + 1]) / (2 * STEP_PX) for i in (0, 2)]
+        parts = [np.split(table, counts[:-1], axis=1) for table in (here, *moves)]
+        return list(zip(*parts, strict=True))
 
     def tangents(self, points: Array) -> Array:
         """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
@@ -252,8 +265,9 @@ class Spot:
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
-        for (a, b, c, d, e), isophote in zip(self._conics, self.isophotes, strict=True):
-            x, y = self.tangents(isophote.points).T
+        for k, isophote in enumerate(self.isophotes):
+            a, b, c, d, e = self._conics[k]
+            x, y = self._crossings[k][0]
             F = a * x * x + b * x * y + c * y * y + d * x + e * y - 1
             slope = np.hypot(2 * a * x + b * y + d, b * x + 2 * c * y + e)
             residual = np.sqrt(np.mean((F / slope) ** 2)) * max(a * c - b * b / 4, 0.0) ** 0.25
@@ -264,38 +278,30 @@ class Spot:
         return False
 
     @cached_property
-    def _conics(self) -> list[Array]:
-        """(a, b, c, d, e) of each isophote, the constant -1."""
+    def _conics(self) -> Array:
+        """(a, b, c, d, e) of each isophote, the constant -1, shape (K, 5)."""
         frame = np.concatenate([self.basis, self.axis[None]])
-        made = []
-        for isophote in self.isophotes:
-            C = frame @ isophote.cone @ frame.T
-            C = C / -C[2, 2]
-            made.append(np.array([C[0, 0], 2 * C[0, 1], C[1, 1], 2 * C[0, 2], 2 * C[1, 2]]))
-        return made
+        C = frame @ np.array([isophote.cone for isophote in self.isophotes]) @ frame.T
+        C = C / -C[:, 2:, 2:]
+        return np.stack([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]], axis=1)
 
-    def _outputs(self, k: int) -> Array:
-        """Tell how mean axis, drift and moments move with the conic of an isophote, shape (7, 5)."""
-        a, b, c = self._conics[k][:3]
-        A = np.array([[a, b / 2], [b / 2, c]])
-        E = np.linalg.inv(A)
+    @property
+    def _outputs(self) -> Array:
+        """Tell how mean axis, drift and moments move with the conic of each isophote, shape (K, 7, 5)."""
+        a, b, c = self._conics.T[:3]
+        count, to_peak = len(self.isophotes), self._weights
+        made = np.zeros((count, 7, 5))
         # The cone's axis is its third eigenvector, near the basis' own: -(A + I)^-1 (d, e) / 2.
-        axis_by_linear = -np.linalg.inv(A + np.eye(2)) / 2
-        count, to_peak = len(self.isophotes), _to_peak(self.levels)[k]
-        made = np.zeros((7, 5))
-        made[0:2, 3:] = axis_by_linear / count
-        made[2:4, 3:] = axis_by_linear * (to_peak - 1 / count if self.can_extrapolate else 0.0)
-        for column, change in enumerate(_QUADRATIC):
-            dE = -E @ change @ E * to_peak / (2 * self.levels[k])
-            made[4:, column] = dE[_UPPER]
+        determinant = (a + 1) * (c + 1) - b * b / 4
+        by_linear = np.array([[c + 1, -b / 2], [-b / 2, a + 1]]).transpose(2, 0, 1) / (-2 * determinant[:, None, None])
+        made[:, 0:2, 3:] = by_linear / count
+        if self.can_extrapolate:
+            made[:, 2:4, 3:] = by_linear * (to_peak - 1 / count)[:, None, None]
+        # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
+        p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)
+        dE = -np.array([[p * p, p * q, q * q], [p * q, (p * r + q * q) / 2, q * r], [q * q, q * r, r * r]])
+        made[:, 4:, :3] = dE.transpose(2, 0, 1) * (to_peak / (2 * self.levels))[:, None, None]
         return made
-
-
-_QUADRATIC = (
-    np.array([[1.0, 0.0], [0.0, 0.0]]),
-    np.array([[0.0, 0.5], [0.5, 0.0]]),
-    np.array([[0.0, 0.0], [0.0, 1.0]]),
-)
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
@@ -362,9 +368,13 @@ def _with_poses(
     fitted: list[FittedIsophote], failures: list[Failure]
 ) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
     """Give the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
+    if not fitted:
+        return [], [], failures
+    found = circle_poses(
+        np.array([isophote.cone for isophote in fitted]), np.array([isophote.sightline for isophote in fitted])
+    )
     kept, poses = [], []
-    for isophote in fitted:
-        pose = isophote.pose()
+    for isophote, pose in zip(fitted, (found[i] for i in range(len(fitted))), strict=True):
         if isinstance(pose, Failure):
             failures = [*failures, pose]
         else:
