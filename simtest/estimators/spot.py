@@ -309,7 +309,11 @@ _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 
 def _to_peak(levels: Array) -> Array:
     """Give the weights of values at some levels in the value at level 0 of the straight line through them."""
-    return np.asarray(np.linalg.pinv(np.stack([np.ones_like(levels), levels], axis=1))[0])
+    gaps = levels - levels.mean()
+    spread = float(gaps @ gaps)
+    # One level alone, or several that are the same, leave the slope open: it is then taken as 0.
+    slope = gaps / spread if spread > 0 else np.zeros_like(levels)
+    return np.asarray(1 / len(levels) - levels.mean() * slope)
 
 
 def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:

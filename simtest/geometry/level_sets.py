@@ -98,13 +98,19 @@ class LevelSet:
         across, pixels, start, end = self._lines
         share, rise = (self.level - start) / (end - start), end - start
         vertical = np.arange(len(pixels)) >= across
-        rows, columns = np.divmod(pixels, self.inside.shape[1])
-        first = np.stack([columns, rows], axis=1) + self.corner
-        second = first + np.where(vertical[:, None], [0, 1], [1, 0])
-        weights = np.stack([(share - 1) / rise, -share / rise], axis=1)
-        kept = _first_of_each(first + (second - first) * share[:, None], np.abs(share - 0.5) > _AT_PIXEL)
-        ends: npt.NDArray[np.intp] = np.stack([first, second], axis=1).astype(np.intp)[kept]
-        return Sensitivities(vertical[kept], ends, weights[kept], 1 / rise[kept])
+        ends: npt.NDArray[np.intp] = np.empty((len(pixels), 2, 2), dtype=np.intp)
+        ends[:, 0, 1], ends[:, 0, 0] = np.divmod(pixels, self.inside.shape[1])
+        ends[:, 0] += self.corner
+        ends[:, 1] = ends[:, 0]
+        ends[:across, 1, 0] += 1
+        ends[across:, 1, 1] += 1
+        weights = np.empty((len(pixels), 2))
+        weights[:, 0], weights[:, 1] = (share - 1) / rise, -share / rise
+        at_pixel = np.abs(share - 0.5) > _AT_PIXEL
+        if not at_pixel.any():
+            return Sensitivities(vertical, ends, weights, 1 / rise)
+        kept = _first_of_each(ends[:, 0] + (ends[:, 1] - ends[:, 0]) * share[:, None], at_pixel)
+        return Sensitivities(vertical[kept], ends[kept], weights[kept], 1 / rise[kept])
 
     @cached_property
     def _lines(self) -> tuple[int, npt.NDArray[np.intp], Array, Array]:
