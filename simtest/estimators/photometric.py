@@ -74,7 +74,8 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
     Where the residuals hold more structure than the frame's noise, the flag is ``misfit``, and the covariance holds
-    how far the normal moves when only the pixels around the peak are fitted, or how far the isophotes' axis drifts.
+    how far the normal moves when only the pixels around the peak are fitted. It also holds how far the isophotes' axis
+    drifts where that is more than noise.
 
     Parameters
     ----------
@@ -102,11 +103,11 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     e, f, s = fitted.model.frame
     covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
     ratio = _axis_ratio(fitted.model)
-    flags = spot_flags(spot)
+    flags, excess = spot_flags(spot), spot.drift_excess
     if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
-        excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), spot.drift_excess)
-        covariance = covariance + MISFIT_SHARE * excess * np.eye(2)
+        excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
         flags = (*flags, "misfit")
+    covariance = covariance + MISFIT_SHARE * excess * np.eye(2)
     estimate = Estimate(
         normal=fitted.model.normal,
         candidates=fitted.model.normal[None],

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.propagation import covariance_of
 from simtest.estimators.top import Top, fit_top
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
@@ -32,13 +32,13 @@ DRIFT_CHI2 = 13.82
 
 MEAN_SHARE, PEAK_SHARE = 1.5, 0.25
 """Variance, over the squared drift, of the mean axis and of the axis at t -> 1 about the normal: what 100 highlights of
-the generated colon showed. The line is not all: smoothing moves a lopsided peak too."""
+the generated colon showed. To the latter smoothing adds, which moves a lopsided peak too."""
+
+LEAST_VARIANCE_PX2 = 4.0
+"""A lobe's variance is not trusted below this: a pixel's width and the smoothing's are then all that is left of it."""
 
 NOISE_FACTOR = 2.0
 """How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
-
-KERNEL_SIGMAS = 4.0
-"""Half-width of the smoothing kernel over its standard deviation."""
 
 STEP_PX = 0.1
 """Step of the central differences of sightlines."""
@@ -169,8 +169,7 @@ class Spot:
         """Covariance by noise of (mean axis, drift, moments 11, 12, 22), shape (7, 7); None without known noise.
 
         Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
-        is made of it, with its crossings. What is left is a sum over the smoothed pixels, so that the transpose of
-        smoothing gives it as a sum over the raw ones, whose noise is independent.
+        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
         """
         noise = self.patch.noise
         if noise is None:
@@ -192,12 +191,7 @@ class Spot:
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
         pixels += [self._top.pixels, np.array([row * width + column])]
         flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
-        images, box = _images(flat, np.concatenate(moves, axis=1), width)
-        margin = int(np.ceil(KERNEL_SIGMAS * self.patch.smoothing_px))
-        level = np.pad(noise[box], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-        smoothed = [_transposed_smoothing(image, self.patch.smoothing_px, margin) * level for image in images]
-        raw = np.stack(smoothed).reshape(len(smoothed), -1)
-        return np.asarray(raw @ raw.T)
+        return covariance_of(flat, np.concatenate(moves, axis=1), width, noise, self.patch.smoothing_px)
 
     @property
     def axis_covariance(self) -> Array | None:
@@ -223,7 +217,11 @@ class Spot:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
         noise = both @ self.covariance[:4, :4] @ both.T
-        return np.asarray(noise + PEAK_SHARE * self.drift_excess * np.eye(2))
+        # What smoothing moves a lopsided peak by is the drift over a level of about 2 s^2 / v, v the lobe's variance.
+        values = np.linalg.eigvals(np.linalg.solve(self._px2, self.moments)).real
+        smoothing = self.patch.smoothing_px**2 * float(np.sum(1 / np.maximum(values, LEAST_VARIANCE_PX2)))
+        share = PEAK_SHARE + (smoothing / float(self.levels.mean())) ** 2 / 2
+        return np.asarray(noise + share * self.drift_excess * np.eye(2))
 
     def _conic_by_crossing(self, k: int, vertical: npt.NDArray[np.bool_]) -> Array:
         """Tell how the conic a x^2 + b x y + c y^2 + d x + e y = 1 in the basis moves with its crossings, shape (5, N).
@@ -314,23 +312,6 @@ def _to_peak(levels: Array) -> Array:
     # One level alone, or several that are the same, leave the slope open: it is then taken as 0.
     slope = gaps / spread if spread > 0 else np.zeros_like(levels)
     return np.asarray(1 / len(levels) - levels.mean() * slope)
-
-
-def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:
-    """Sum weights, shape (7, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
-    rows, columns = np.divmod(flat, width)
-    top, left, high, wide = rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1
-    place = (rows - top) * wide + columns - left
-    images = np.array([np.bincount(place, each, high * wide).reshape(high, wide) for each in moves], dtype=float)
-    return images, (slice(top, top + high), slice(left, left + wide))
-
-
-def _transposed_smoothing(image: Array, sigma_px: float, margin: int) -> Array:
-    if sigma_px <= 0:
-        return image
-    padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0.0)
-    side = 2 * margin + 1
-    return np.asarray(cv2.GaussianBlur(padded, (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT))
 
 
 def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot | Failure:
