@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from simtest.calibration import Calibration, Known
 from simtest.detection import estimate_noise
@@ -15,7 +16,8 @@ from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, ViewMask
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
-from simtest.spec import scene_from_dict
+from simtest.spec import load_scene, scene_from_dict
+from simtest.validation.matching import match
 from simtest.validation.metrics import angle_deg, mahalanobis2
 from simtest.validation.realise import view
 
@@ -261,3 +263,23 @@ def test_a_lobe_of_another_form_is_a_misfit_and_a_phong_lobe_is_none(see):
         made = [found(seen.frame(i), seen.calibration, {"photometric": photometric}) for i in range(count)]
         flagged[form] = sum("misfit" in e["photometric"].flags for e in made)
     assert flagged == {"phong": 0, "rough_plastic": count}
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_regions_cover_the_truth_on_a_generated_colon():
+    """Different highlights, one realisation each: none that the covariances' factors were set on."""
+    session, held = None, {key: [] for key in HALVES}
+    for viewpoint in range(5000, 5060):
+        scene = load_scene("anatomy", {"surface.path": "colon", "surface.viewpoint": viewpoint})
+        session = session or Session(scene)
+        seen = view(session, scene)
+        truths = [truth for truth in seen.truths if truth.isolated]
+        spots = reconstruct(seen.frame(viewpoint), seen.calibration, HALVES)
+        for i, j in match(spots, truths).items():
+            for key, estimate in spots[i].estimates.items():
+                if not isinstance(estimate, Failure):
+                    held[key].append(mahalanobis2(estimate, truths[j].highlight.normal) < 5.99)
+    for key, values in held.items():
+        assert len(values) > 35
+        assert np.mean(values) >= binom.ppf(0.001, len(values), 0.93) / len(values), key
