@@ -8,7 +8,7 @@ from rich.table import Table
 
 from benchmarks.measuring import Figure
 
-NAMES = ("published", "rendering", "dataset")
+NAMES = ("estimators", "published", "rendering", "dataset")
 """Modules of this package with a function `figures()`."""
 
 

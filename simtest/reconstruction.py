@@ -132,7 +132,9 @@ def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> 
 def _noise(corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float) -> float | Image:
     """Give the noise of a corrected frame before smoothing: estimated where it is white, then amplified with it."""
     seen = calibration.camera.seen
-    white = estimate_noise(corrected.linear, seen)
+    # A sensor that clips at full scale clips at 0 as well.
+    clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
+    white = estimate_noise(corrected.linear, seen, clipped)
     if calibration.noise.is_silent and corrected.gain is None:
         return white
     known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)

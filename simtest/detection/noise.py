@@ -9,8 +9,16 @@ _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 
 MAD_TO_SIGMA = 1.4826
 
+CLEAR_SIDE_PX = 7
+"""Around a pixel whose noise is looked at, no more than one pixel in a square of this side may be clipped."""
 
-def estimate_noise(frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None) -> float:
+MIN_CLEAR = 100
+"""Fewer pixels clear of clipped ones tell less of the noise than all pixels do."""
+
+
+def estimate_noise(
+    frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None, clipped: npt.NDArray[np.bool_] | None = None
+) -> float:
     """Estimate the standard deviation of white noise, robust against edges and highlights.
 
     Parameters
@@ -19,6 +27,9 @@ def estimate_noise(frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = No
         Intensities before smoothing.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all. What lies outside is not the sensor's noise alone.
+    clipped : ndarray of bool, shape (H, W), optional
+        Pixels at either end of the sensor's range. Their noise is cut off, on a dark ground by half, so that pixels
+        near them are left out where enough others remain.
 
     Returns
     -------
@@ -29,9 +40,15 @@ def estimate_noise(frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = No
     if min(image.shape) < 3:
         return 0.0
     response = cv2.filter2D(image, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
+    whole = np.ones(response.shape, dtype=bool)
     if seen is not None:
         whole = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
-        response = response[whole]
-        if not response.size:
-            return 0.0
+    if clipped is not None and clipped.any():
+        size = (CLEAR_SIDE_PX, CLEAR_SIDE_PX)
+        near = cv2.boxFilter(clipped.astype(np.float32), -1, size, normalize=False)[1:-1, 1:-1]
+        clear = whole & (near < 1.5)
+        whole = clear if np.count_nonzero(clear) >= MIN_CLEAR else whole
+    response = response[whole]
+    if not response.size:
+        return 0.0
     return float(MAD_TO_SIGMA * np.median(np.abs(response)) / 6.0)

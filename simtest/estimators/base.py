@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from simtest.errors import Failure
+from simtest.errors import Failure, Reason
 from simtest.geometry import (
     Camera,
     CirclePose,
@@ -15,11 +15,16 @@ from simtest.geometry import (
     circle_pose,
     cone_of_conic,
     cone_rays,
+    fit_arc,
     fit_ellipses,
 )
+from simtest.geometry.ellipse_fit import MIN_POINTS
 from simtest.geometry.fitting_planes import FORWARD, fitting_planes
 
 Array = npt.NDArray[np.float64]
+
+MAX_ARC_RESIDUAL = 0.1
+"""Most that an arc may miss its ellipse, RMS over the radius, noise included: more, and it is no part of one."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class FittedIsophote:
         C', the cone of sightlines through the fitted curve, camera frame.
     sightline : ndarray, shape (3,)
         A direction inside the cone: tells its two sides apart.
+    cut : bool
+        Whether only a part of the contour is seen.
     """
 
     isovalue: float
@@ -45,6 +52,7 @@ class FittedIsophote:
     conic: FittedConic | None
     cone: Array
     sightline: Array = field(default_factory=lambda: FORWARD)
+    cut: bool = False
 
     def pose(self) -> CirclePose | Failure:
         """Give what the cone says about a circle (see `simtest.geometry.circle_pose`)."""
@@ -168,6 +176,38 @@ def fit_isophotes(
     results = _fit(isovalues, [patch.crossings(t) for t in isovalues], camera)
     fitted = [result for result in results if isinstance(result, FittedIsophote)]
     return fitted, [result for result in results if isinstance(result, Failure)]
+
+
+def fit_cut_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophote | Failure:
+    """Fit what is seen of an isophote that the border or the view cuts (see `simtest.geometry.fit_arc`).
+
+    Parameters
+    ----------
+    patch : Patch
+        Region of interest.
+    camera : Camera
+        Calibration.
+    isovalue : float
+        t in (0, 1).
+
+    Returns
+    -------
+    FittedIsophote or Failure
+        A Failure, too, where what is seen is no part of an ellipse, as where the region of interest lies on a slope.
+    """
+    points = patch.arc(isovalue)
+    if len(points) < MIN_POINTS:
+        return Failure(Reason.TOO_FEW_POINTS, f"{len(points)} points of the arc; at least {MIN_POINTS} are needed")
+    planes = fitting_planes([points], camera)
+    fitted = planes.failures.get(0) or fit_arc(planes.points[0])
+    if isinstance(fitted, Failure):
+        return fitted
+    if fitted.residual > MAX_ARC_RESIDUAL:
+        return Failure(Reason.NOT_AN_ELLIPSE, f"the arc misses its ellipse by {fitted.residual:.2g} of the radius")
+    plane_from_camera = planes.plane_from_camera if planes.plane_from_camera.ndim == 2 else planes.plane_from_camera[0]
+    cone = cone_of_conic(fitted.conic, plane_from_camera)
+    in_image = fitted.conic if camera.distortion is None else None
+    return FittedIsophote(isovalue, points, in_image, cone, planes.sightlines[0], cut=True)
 
 
 def fit_isophote_of_each(

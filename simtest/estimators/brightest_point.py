@@ -1,11 +1,18 @@
 """`brightest_point`: the sightline through the peak carries the normal (theory.md section 3, item 1)."""
 
-from simtest.errors import Failure
+from simtest.calibration import Known
+from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.errors import Failure, Reason
+from simtest.estimators.aside import with_known_lights
 from simtest.estimators.base import Estimate
+from simtest.estimators.flags import spot_flags
+from simtest.estimators.spot import fit_spot
 from simtest.geometry import Camera, Patch
 
+NOTHING_KNOWN = Known()
 
-def brightest_point(patch: Patch, camera: Camera) -> Estimate | Failure:
+
+def brightest_point(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> Estimate | Failure:
     """Give the reversed sightline through the peak of the smoothed patch.
 
     Parameters
@@ -14,11 +21,22 @@ def brightest_point(patch: Patch, camera: Camera) -> Estimate | Failure:
         Region of interest.
     camera : Camera
         Calibration.
+    known : Known
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
 
     Returns
     -------
     Estimate
-        One candidate; it looks where the peak is.
+        One candidate; it looks where the peak is. Flags as of `cone_axis`, by the isophote at t = 0.5: where that runs
+        into the border the peak itself may be cut off, and along a streak it may lie anywhere.
     """
     normal = -camera.unproject(patch.peak_px)
-    return Estimate(normal=normal, candidates=normal[None], look_px=patch.peak_px)
+    estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera))
+    return with_known_lights(estimate, known)
+
+
+def _flags(patch: Patch, camera: Camera) -> tuple[str, ...]:
+    spot = fit_spot(patch, camera, (HIGHLIGHT_ISOVALUE,))
+    if isinstance(spot, Failure):
+        return ("partial_arc",) if spot.reason == Reason.NO_CLOSED_ISOPHOTE else ()
+    return spot_flags(spot)

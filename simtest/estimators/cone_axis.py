@@ -2,15 +2,24 @@
 
 from collections.abc import Sequence
 
+from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
+from simtest.estimators.aside import with_known_lights
 from simtest.estimators.base import Estimate
 from simtest.estimators.flags import spot_flags
 from simtest.estimators.spot import fit_spot
 from simtest.geometry import Camera, Patch
 
+NOTHING_KNOWN = Known()
 
-def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AXIS_ISOVALUES) -> Estimate | Failure:
+
+def cone_axis(
+    patch: Patch,
+    camera: Camera,
+    known: Known = NOTHING_KNOWN,
+    isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
+) -> Estimate | Failure:
     """Average the cones' axes over several isovalues.
 
     Parameters
@@ -19,6 +28,8 @@ def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AX
         Region of interest.
     camera : Camera
         Calibration.
+    known : Known
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
     isovalues : sequence of float
         Each t in (0, 1).
 
@@ -32,7 +43,7 @@ def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AX
     spot = fit_spot(patch, camera, isovalues)
     if isinstance(spot, Failure):
         return spot
-    return Estimate(
+    estimate = Estimate(
         normal=-spot.axis,
         candidates=-spot.axis[None],
         look_px=camera.project(spot.axis),
@@ -41,3 +52,4 @@ def cone_axis(patch: Patch, camera: Camera, isovalues: Sequence[float] = CONE_AX
         covariance=spot.axis_covariance,
         flags=spot_flags(spot),
     )
+    return with_known_lights(estimate, known)

@@ -9,15 +9,16 @@ import numpy.typing as npt
 from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
+from simtest.estimators.aside import with_known_lights
 from simtest.estimators.base import Estimate, EstimatedCurvature
-from simtest.estimators.flags import spot_flags
+from simtest.estimators.flags import STREAK_RATIO, spot_flags
 from simtest.estimators.spot import Spot, fit_spot
 from simtest.geometry import Camera, Patch
 
 Array = npt.NDArray[np.float64]
 
 STREAK_GAIN = 0.1
-"""Below this abs(1 + d k), or this axis ratio where the lobe is not known, the spot is a streak."""
+"""Below this abs(1 + d k), or `STREAK_RATIO` where the lobe is not known, the spot is a streak."""
 
 NOTHING_KNOWN = Known()
 
@@ -42,7 +43,7 @@ def curved(
     camera : Camera
         Calibration.
     known : Known
-        Its `lobe_curvature` is used.
+        Its `lobe_curvature` is used, and its lights as by `cone_axis`.
     isovalues : sequence of float
         Each t in (0, 1).
 
@@ -63,7 +64,7 @@ def curved(
     axis, covariance = spot.axis, spot.axis_covariance
     if spot.drift_is_real:
         axis, covariance = spot.peak_axis, spot.peak_covariance
-    return Estimate(
+    estimate = Estimate(
         normal=-axis,
         candidates=-axis[None],
         look_px=camera.project(axis),
@@ -73,6 +74,7 @@ def curved(
         flags=(*spot_flags(spot), "round") if is_round else spot_flags(spot),
         curvature=curvature,
     )
+    return with_known_lights(estimate, known)
 
 
 def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
@@ -92,14 +94,14 @@ def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool
     directions = vectors.T[::-1] @ spot.basis
     if lobe is None:
         ratio = float(np.sqrt(stiffness[0] / stiffness[1]))
-        hypotheses, smallest = None, ratio
+        hypotheses, smallest, least = None, ratio, STREAK_RATIO
     else:
         hypotheses = _hypotheses(stiffness, lobe)
         smallest, larger = np.sort(np.abs(hypotheses[0]))
-        ratio = float(smallest / larger)
-    if smallest < STREAK_GAIN:
+        ratio, least = float(smallest / larger), STREAK_GAIN
+    if smallest < least:
         of = "axis ratio" if lobe is None else "abs(1 + d k)"
-        return Failure(Reason.STREAK, f"{of} {smallest:.3g}, below {STREAK_GAIN:g}")
+        return Failure(Reason.STREAK, f"{of} {smallest:.3g}, below {least:g}")
     return EstimatedCurvature(directions, ratio, hypotheses), is_round
 
 

@@ -70,9 +70,17 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
     LobeFit or None
         None where it does not converge, or the pixels leave a parameter open.
     """
+    # A step too far leaves the range of numbers: it is then not taken.
+    with np.errstate(all="ignore"):
+        return _descend(start, observed, clipped)
+
+
+def _descend(start: Model, observed: Array, clipped: Mask | None) -> LobeFit[Model] | None:
     model, damping, power = start, FIRST_DAMPING, float(observed @ observed)
     residual, J = _residual(model, observed, clipped)
     chi2 = float(residual @ residual)
+    if not np.isfinite(chi2):
+        return None
     for _ in range(MAX_STEPS):
         normal, gradient = J.T @ J, J.T @ residual
         try:
@@ -83,7 +91,7 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
         trial = model.moved(step)
         next_residual, next_J = _residual(trial, observed, clipped)
         next_chi2 = float(next_residual @ next_residual)
-        if not next_chi2 < chi2:
+        if not (next_chi2 < chi2 and np.isfinite(next_J).all()):
             if damping > MOST_DAMPING:
                 # No step downhill is left: the minimum, to rounding.
                 break

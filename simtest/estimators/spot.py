@@ -10,14 +10,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
-from simtest.estimators.base import FittedIsophote, fit_isophotes
+from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.propagation import covariance_of
 from simtest.estimators.top import Top, fit_top
-from simtest.geometry import Camera, CirclePose, Patch, cone_axes
+from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_basis
 
@@ -27,10 +28,17 @@ MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2 = 13.82
-"""Squared Mahalanobis distance beyond which the axis' drift is more than noise: 1 % of a normal pair lies beyond."""
 """Squared Mahalanobis distance beyond which the axis' drift is more than noise: 0.1 % of a normal pair lies beyond."""
-KERNEL_SIGMAS = 4.0
-"""Half-width of the smoothing kernel over its standard deviation."""
+
+MEAN_SHARE, PEAK_SHARE = 1.5, 0.25
+"""Variance, over the squared drift, of the mean axis and of the axis at t -> 1 about the normal: what 100 highlights of
+the generated colon showed. To the latter smoothing adds, which moves a lopsided peak too."""
+
+LEAST_VARIANCE_PX2 = 4.0
+"""A lobe's variance is not trusted below this: a pixel's width and the smoothing's are then all that is left of it."""
+
+NOISE_FACTOR = 2.0
+"""How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
 
 STEP_PX = 0.1
 """Step of the central differences of sightlines."""
@@ -89,6 +97,10 @@ class Spot:
     def _top(self) -> Top:
         return fit_top(self.patch)
 
+    @cached_property
+    def _weights(self) -> Array:
+        return _to_peak(self.levels)
+
     @property
     def can_extrapolate(self) -> bool:
         """Whether a line through the isophotes is determined."""
@@ -98,7 +110,7 @@ class Spot:
     def drift(self) -> Array:
         """How far the axis at t -> 1 lies from the mean axis, in the basis, rad, shape (2,); 0 for one isophote."""
         places = np.array([pose.axis for pose in self.poses]) @ self.basis.T
-        return _to_peak(self.levels) @ places if self.can_extrapolate else np.zeros(2)
+        return self._weights @ places if self.can_extrapolate else np.zeros(2)
 
     @property
     def peak_axis(self) -> Array:
@@ -131,18 +143,17 @@ class Spot:
         """Give the moments with the levels moved by a shift."""
         levels = self.levels + shift
         added = 2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1)
-        each = np.array(self._tangent_moments) - added[:, None, None] * self._px2
+        each = self._tangent_moments - added[:, None, None] * self._px2
         return np.asarray(np.einsum("k,kij->ij", _to_peak(levels) / (2 * levels), each))
 
     @cached_property
-    def _tangent_moments(self) -> list[Array]:
-        """E(t) of each isophote in the basis, squared tangents, shape (2, 2) each."""
-        made = []
-        for isophote in self.isophotes:
-            (l1, l2, l3), vectors = cone_axes(isophote.cone, isophote.sightline)
-            e1, e2 = self.basis @ vectors[:, 0], self.basis @ vectors[:, 1]
-            made.append(-l3 / l1 * np.outer(e1, e1) - l3 / l2 * np.outer(e2, e2))
-        return made
+    def _tangent_moments(self) -> Array:
+        """E(t) of each isophote in the basis, squared tangents, shape (K, 2, 2)."""
+        cones = np.array([isophote.cone for isophote in self.isophotes])
+        values, vectors = cone_axes(cones, np.array([isophote.sightline for isophote in self.isophotes]))
+        across = self.basis @ vectors[:, :, :2]
+        squares = -values[:, 2:] / values[:, :2]
+        return np.asarray((across * squares[:, None]) @ across.transpose(0, 2, 1))
 
     @cached_property
     def _px2(self) -> Array:
@@ -158,8 +169,7 @@ class Spot:
         """Covariance by noise of (mean axis, drift, moments 11, 12, 22), shape (7, 7); None without known noise.
 
         Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
-        is made of it, with its crossings. What is left is a sum over the smoothed pixels, so that the transpose of
-        smoothing gives it as a sum over the raw ones, whose noise is independent.
+        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
         """
         noise = self.patch.noise
         if noise is None:
@@ -170,22 +180,18 @@ class Spot:
         step = 1e-4
         by_shift = np.zeros(7)
         by_shift[4:] = ((self._moments_at(step) - self._moments_at(-step)) / (2 * step))[_UPPER]
+        outputs = self._outputs
         by_peak, pixels, shares = -by_shift / self.patch.peak_value, [], []
         for k, isophote in enumerate(self.isophotes):
-            moved = self.patch.sensitivities(isophote.isovalue)
+            moved = self.patch.sensitivities(isophote.isovalue, isophote.cut)
             assert not isinstance(moved, Failure)
-            by_crossing = self._outputs(k) @ self._conic_by_crossing(k, isophote.points, moved.vertical)
+            by_crossing = outputs[k] @ self._conic_by_crossing(k, moved.vertical)
             by_peak = by_peak + by_crossing @ moved.level * isophote.isovalue
             pixels.append((moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel())
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
         pixels += [self._top.pixels, np.array([row * width + column])]
         flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
-        images, box = _images(flat, np.concatenate(moves, axis=1), width)
-        margin = int(np.ceil(KERNEL_SIGMAS * self.patch.smoothing_px))
-        level = np.pad(noise[box], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-        smoothed = [_transposed_smoothing(image, self.patch.smoothing_px, margin) * level for image in images]
-        raw = np.stack(smoothed).reshape(len(smoothed), -1)
-        return np.asarray(raw @ raw.T)
+        return covariance_of(flat, np.concatenate(moves, axis=1), width, noise, self.patch.smoothing_px)
 
     @property
     def axis_covariance(self) -> Array | None:
@@ -193,35 +199,58 @@ class Spot:
         covariance = self.covariance
         if covariance is None:
             return None
-        noise = covariance[:2, :2]
-        if not self.drift_is_real:
-            return noise
         # In which direction the peak really lies from here the drift tells only roughly.
-        excess = float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4]))
-        return np.asarray(noise + max(excess, 0.0) * np.eye(2))
+        return np.asarray(covariance[:2, :2] + MEAN_SHARE * self.drift_excess * np.eye(2))
+
+    @cached_property
+    def drift_excess(self) -> float:
+        """Squared drift beyond noise, rad^2; 0 where it is not more than noise, or the noise is not known."""
+        covariance = self.covariance
+        if covariance is None or not self.drift_is_real:
+            return 0.0
+        return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
 
     @property
     def peak_covariance(self) -> Array | None:
-        """Covariance of the axis at t -> 1 in the basis, rad^2, shape (2, 2)."""
+        """Covariance of the axis at t -> 1 in the basis, rad^2, shape (2, 2): noise, and what the line leaves open."""
         if self.covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        return np.asarray(both @ self.covariance[:4, :4] @ both.T)
+        noise = both @ self.covariance[:4, :4] @ both.T
+        # What smoothing moves a lopsided peak by is the drift over a level of about 2 s^2 / v, v the lobe's variance.
+        values = np.linalg.eigvals(np.linalg.solve(self._px2, self.moments)).real
+        smoothing = self.patch.smoothing_px**2 * float(np.sum(1 / np.maximum(values, LEAST_VARIANCE_PX2)))
+        share = PEAK_SHARE + (smoothing / float(self.levels.mean())) ** 2 / 2
+        return np.asarray(noise + share * self.drift_excess * np.eye(2))
 
-    def _conic_by_crossing(self, k: int, points: Array, vertical: npt.NDArray[np.bool_]) -> Array:
+    def _conic_by_crossing(self, k: int, vertical: npt.NDArray[np.bool_]) -> Array:
         """Tell how the conic a x^2 + b x y + c y^2 + d x + e y = 1 in the basis moves with its crossings, shape (5, N).
 
-        To first order a fit to points near an ellipse moves as the linear one does.
+        To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the
+        conic's gradient where the fit is gradient-weighted.
         """
-        step = np.where(vertical[:, None], [0.0, STEP_PX], [STEP_PX, 0.0])
-        x, y = self.tangents(points).T
-        dx, dy = ((self.tangents(points + step) - self.tangents(points - step)) / (2 * STEP_PX)).T
+        (x, y), by_column, by_row = self._crossings[k]
+        dx, dy = np.where(vertical, by_row, by_column)
         a, b, c, d, e = self._conics[k]
-        misfit = (2 * a * x + b * y + d) * dx + (b * x + 2 * c * y + e) * dy
-        design = np.stack([x * x, x * y, y * y, x, y], axis=1)
-        design /= (scale := np.abs(design).max(axis=0))
-        inverse = np.linalg.solve(design.T @ design, design.T) / scale[:, None]
-        return np.asarray(-inverse * misfit)
+        by_x, by_y = 2 * a * x + b * y + d, b * x + 2 * c * y + e
+        design = np.array([x * x, x * y, y * y, x, y])
+        design /= (scale := np.abs(design).max(axis=1))[:, None]
+        weighted = design / (by_x**2 + by_y**2) if self.isophotes[k].cut else design
+        inverse = np.linalg.solve(weighted @ design.T, weighted) / scale[:, None]
+        return np.asarray(-inverse * (by_x * dx + by_y * dy))
+
+    @cached_property
+    def _crossings(self) -> list[tuple[Array, Array, Array]]:
+        """Tangents of each isophote's points and how they move per px to the right and down, shapes (2, N)."""
+        counts = np.cumsum([len(isophote.points) for isophote in self.isophotes])
+        points = np.concatenate([isophote.points for isophote in self.isophotes])
+        right, down = np.array([STEP_PX, 0.0]), np.array([0.0, STEP_PX])
+        # All at once: a call for each would cost more than the work.
+        places = self.tangents(np.concatenate([points, points + right, points - right, points + down, points - down]))
+        here, *sides = np.split(places.T, 5, axis=1)
+        moves = [(sides[i] - sides[i + 1]) / (2 * STEP_PX) for i in (0, 2)]
+        parts = [np.split(table, counts[:-1], axis=1) for table in (here, *moves)]
+        return list(zip(*parts, strict=True))
 
     def tangents(self, points: Array) -> Array:
         """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
@@ -229,38 +258,48 @@ class Spot:
         return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
 
     @cached_property
-    def _conics(self) -> list[Array]:
-        """(a, b, c, d, e) of each isophote, the constant -1."""
+    def is_bent(self) -> bool:
+        """Whether an isophote is no ellipse by more than that of a point highlight may differ, and noise allows for."""
+        noise = self.patch.noise
+        at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
+        left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
+        for k, isophote in enumerate(self.isophotes):
+            a, b, c, d, e = self._conics[k]
+            x, y = self._crossings[k][0]
+            F = a * x * x + b * x * y + c * y * y + d * x + e * y - 1
+            slope = np.hypot(2 * a * x + b * y + d, b * x + 2 * c * y + e)
+            residual = np.sqrt(np.mean((F / slope) ** 2)) * max(a * c - b * b / 4, 0.0) ** 0.25
+            # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
+            by_noise = left / (-2 * isophote.isovalue * np.log(isophote.isovalue))
+            if residual > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise):
+                return True
+        return False
+
+    @cached_property
+    def _conics(self) -> Array:
+        """(a, b, c, d, e) of each isophote, the constant -1, shape (K, 5)."""
         frame = np.concatenate([self.basis, self.axis[None]])
-        made = []
-        for isophote in self.isophotes:
-            C = frame @ isophote.cone @ frame.T
-            C = C / -C[2, 2]
-            made.append(np.array([C[0, 0], 2 * C[0, 1], C[1, 1], 2 * C[0, 2], 2 * C[1, 2]]))
-        return made
+        C = frame @ np.array([isophote.cone for isophote in self.isophotes]) @ frame.T
+        C = C / -C[:, 2:, 2:]
+        return np.stack([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]], axis=1)
 
-    def _outputs(self, k: int) -> Array:
-        """Tell how mean axis, drift and moments move with the conic of an isophote, shape (7, 5)."""
-        a, b, c = self._conics[k][:3]
-        A = np.array([[a, b / 2], [b / 2, c]])
-        E = np.linalg.inv(A)
+    @property
+    def _outputs(self) -> Array:
+        """Tell how mean axis, drift and moments move with the conic of each isophote, shape (K, 7, 5)."""
+        a, b, c = self._conics.T[:3]
+        count, to_peak = len(self.isophotes), self._weights
+        made = np.zeros((count, 7, 5))
         # The cone's axis is its third eigenvector, near the basis' own: -(A + I)^-1 (d, e) / 2.
-        axis_by_linear = -np.linalg.inv(A + np.eye(2)) / 2
-        count, to_peak = len(self.isophotes), _to_peak(self.levels)[k]
-        made = np.zeros((7, 5))
-        made[0:2, 3:] = axis_by_linear / count
-        made[2:4, 3:] = axis_by_linear * (to_peak - 1 / count if self.can_extrapolate else 0.0)
-        for column, change in enumerate(_QUADRATIC):
-            dE = -E @ change @ E * to_peak / (2 * self.levels[k])
-            made[4:, column] = dE[_UPPER]
+        determinant = (a + 1) * (c + 1) - b * b / 4
+        by_linear = np.array([[c + 1, -b / 2], [-b / 2, a + 1]]).transpose(2, 0, 1) / (-2 * determinant[:, None, None])
+        made[:, 0:2, 3:] = by_linear / count
+        if self.can_extrapolate:
+            made[:, 2:4, 3:] = by_linear * (to_peak - 1 / count)[:, None, None]
+        # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
+        p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)
+        dE = -np.array([[p * p, p * q, q * q], [p * q, (p * r + q * q) / 2, q * r], [q * q, q * r, r * r]])
+        made[:, 4:, :3] = dE.transpose(2, 0, 1) * (to_peak / (2 * self.levels))[:, None, None]
         return made
-
-
-_QUADRATIC = (
-    np.array([[1.0, 0.0], [0.0, 0.0]]),
-    np.array([[0.0, 0.5], [0.5, 0.0]]),
-    np.array([[0.0, 0.0], [0.0, 1.0]]),
-)
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
@@ -268,24 +307,11 @@ _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 
 def _to_peak(levels: Array) -> Array:
     """Give the weights of values at some levels in the value at level 0 of the straight line through them."""
-    return np.asarray(np.linalg.pinv(np.stack([np.ones_like(levels), levels], axis=1))[0])
-
-
-def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:
-    """Sum weights, shape (7, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
-    rows, columns = np.divmod(flat, width)
-    top, left, high, wide = rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1
-    place = (rows - top) * wide + columns - left
-    images = np.array([np.bincount(place, each, high * wide).reshape(high, wide) for each in moves], dtype=float)
-    return images, (slice(top, top + high), slice(left, left + wide))
-
-
-def _transposed_smoothing(image: Array, sigma_px: float, margin: int) -> Array:
-    if sigma_px <= 0:
-        return image
-    padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0.0)
-    side = 2 * margin + 1
-    return np.asarray(cv2.GaussianBlur(padded, (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT))
+    gaps = levels - levels.mean()
+    spread = float(gaps @ gaps)
+    # One level alone, or several that are the same, leave the slope open: it is then taken as 0.
+    slope = gaps / spread if spread > 0 else np.zeros_like(levels)
+    return np.asarray(1 / len(levels) - levels.mean() * slope)
 
 
 def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot | Failure:
@@ -303,17 +329,40 @@ def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot |
     Returns
     -------
     Spot or Failure
-        With fewer than 2 isophotes (1, where no more were asked for) the first one's Failure.
+        Where fewer than 2 isophotes (1, where no more were asked for) are whole, those that are cut are fitted to what
+        is seen of them; with fewer than 2 of either kind the first one's Failure.
     """
     fitted, failures = fit_isophotes(patch, camera, isovalues)
+    kept, poses, failures = _with_poses(fitted, failures)
+    least = min(MIN_ISOPHOTES, len(isovalues))
+    if len(poses) < least:
+        whole = {isophote.isovalue for isophote in kept}
+        arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in whole]
+        cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
+        if len(kept) + len(cut) < least:
+            return failures[0]
+        failed = [arc for arc in arcs if isinstance(arc, Failure)]
+        kept, poses, failed = _with_poses(sorted([*kept, *cut], key=lambda i: i.isovalue), failed)
+        if len(poses) < least:
+            return failures[0]
+        failures = failed
+    return Spot(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+
+
+def _with_poses(
+    fitted: list[FittedIsophote], failures: list[Failure]
+) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
+    """Give the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
+    if not fitted:
+        return [], [], failures
+    found = circle_poses(
+        np.array([isophote.cone for isophote in fitted]), np.array([isophote.sightline for isophote in fitted])
+    )
     kept, poses = [], []
-    for isophote in fitted:
-        pose = isophote.pose()
+    for isophote, pose in zip(fitted, (found[i] for i in range(len(fitted))), strict=True):
         if isinstance(pose, Failure):
-            failures.append(pose)
+            failures = [*failures, pose]
         else:
             kept.append(isophote)
             poses.append(pose)
-    if len(poses) < min(MIN_ISOPHOTES, len(isovalues)):
-        return failures[0]
-    return Spot(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+    return kept, poses, failures

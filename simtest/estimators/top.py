@@ -2,15 +2,23 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Patch
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 TOP_ISOVALUE = 0.8
 """Above it a glossy lobe is quadratic in the logarithm to a part in a thousand."""
+
+CLIPPED_ISOVALUE = 0.5
+"""Above it, where the top is clipped: what is left must be wide enough for the paraboloid's bend to show."""
+
+CLIPPED_NEAR = 0.05
+"""Largest share of clipped pixels around one that is fitted: more, and clipping has drawn its smoothed value down."""
 
 MIN_PIXELS = 12
 """Twice the parabola's coefficients."""
@@ -38,16 +46,16 @@ class Top:
 def fit_top(patch: Patch) -> Top:
     """Fit a paraboloid to the logarithm of a patch above t = 0.8 and give its apex.
 
-    The peak's own pixel stands in where that region does not close, is small, is clipped, or is no dome.
+    Where pixels there are clipped, the ring around them down to t = 0.5 is fitted. The peak's own pixel stands in where
+    the region does not close, is small, or is no dome.
     """
     column, row = patch.peak_pixel
     own = np.array([row * patch.values.shape[1] + column])
     fallback = Top(patch.peak_value, own, np.array([1 / patch.peak_value]))
-    inside = patch.inside(TOP_ISOVALUE)
+    inside = _region(patch)
     pixels = np.flatnonzero(inside)
-    clipped = patch.saturated is not None and bool((patch.saturated & inside).any())
     values = patch.values.ravel()[pixels].astype(float)
-    if clipped or len(pixels) < MIN_PIXELS or values.min() <= 0 or inside.all():
+    if len(pixels) < MIN_PIXELS or values.min() <= 0 or inside.all():
         return fallback
     rows, columns = np.divmod(pixels, patch.values.shape[1])
     x, y = (columns - columns.mean()) / max(np.ptp(columns), 1), (rows - rows.mean()) / max(np.ptp(rows), 1)
@@ -65,3 +73,13 @@ def fit_top(patch: Patch) -> Top:
         return fallback
     # At the apex the value does not move with the place.
     return Top(value, pixels, design @ np.linalg.solve(normal, apex) / values)
+
+
+def _region(patch: Patch) -> Mask:
+    """Give the pixels that the paraboloid is fitted to, shape (h, w)."""
+    inside = patch.inside(TOP_ISOVALUE, cut=True)
+    if patch.saturated is None or not (patch.saturated & inside).any():
+        return inside
+    side = 2 * int(np.ceil(2 * patch.smoothing_px)) + 1
+    near = cv2.blur(patch.saturated.astype(np.float32), (side, side), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(patch.inside(CLIPPED_ISOVALUE, cut=True) & (near < CLIPPED_NEAR))

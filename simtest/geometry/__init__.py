@@ -1,5 +1,6 @@
 """NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
 
+from simtest.geometry.arc_fit import FittedArc, fit_arc
 from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.circle_pose import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
@@ -14,6 +15,7 @@ __all__ = [
     "CirclePoses",
     "Distortion",
     "Ellipse",
+    "FittedArc",
     "FittedConic",
     "KannalaBrandt",
     "Patch",
@@ -25,6 +27,7 @@ __all__ = [
     "cone_of_conic",
     "cone_rays",
     "ellipse_of_conic",
+    "fit_arc",
     "fit_ellipse",
     "fit_ellipses",
     "smooth",

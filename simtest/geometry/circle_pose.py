@@ -129,7 +129,10 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
     """
     C = np.asarray(cones, dtype=float)
     finite = np.isfinite(C).all(axis=(1, 2))
-    values, vectors = _ordered(np.where(finite[:, None, None], C, _ROUND), sightlines)
+    C = np.where(finite[:, None, None], C, _ROUND)
+    # The scale means nothing, and squares of very large or small entries would leave the range of numbers.
+    size = np.abs(C).max(axis=(1, 2), keepdims=True)
+    values, vectors = _ordered(C / np.where((size > _HUGE) | (size < 1 / _HUGE), size + (size == 0), 1.0), sightlines)
     l1, l2, l3 = values.T
     sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
     failures = {}
@@ -149,6 +152,7 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
 
 
 _ROUND = np.diag([1.0, 1.0, -1.0])
+_HUGE = 1e100
 
 
 def _pair(across: Array, along: Array) -> Array:

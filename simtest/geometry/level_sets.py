@@ -5,6 +5,7 @@ and without it they are found several times faster than by tracing.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -65,12 +66,15 @@ class LevelSet:
         The level.
     corner : tuple of int
         Column and row of the first pixel in the array that the region was found in.
+    sound : ndarray of bool, shape (h, w), optional
+        Of a region that something cuts: the pixels far enough from the cut. Only lines between these are crossed.
     """
 
     values: Image | Array
     inside: Mask
     level: float
     corner: tuple[int, int]
+    sound: Mask | None = None
 
     def crossings(self) -> Array:
         """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
@@ -78,7 +82,7 @@ class LevelSet:
         Those between horizontal neighbours first, row by row, then those between vertical ones; each point once, though
         several lines cross the border at a pixel whose value is the level.
         """
-        across, pixels, start, end = self._lines()
+        across, pixels, start, end = self._lines
         share = (self.level - start) / (end - start)
         points = np.empty((len(share), 2))
         points[:, 1], points[:, 0] = np.divmod(pixels, self.inside.shape[1])
@@ -91,23 +95,34 @@ class LevelSet:
 
     def sensitivities(self) -> Sensitivities:
         """Tell how the points of `crossings` move with the intensities, in the same order."""
-        across, pixels, start, end = self._lines()
+        across, pixels, start, end = self._lines
         share, rise = (self.level - start) / (end - start), end - start
         vertical = np.arange(len(pixels)) >= across
-        rows, columns = np.divmod(pixels, self.inside.shape[1])
-        first = np.stack([columns, rows], axis=1) + self.corner
-        second = first + np.where(vertical[:, None], [0, 1], [1, 0])
-        weights = np.stack([(share - 1) / rise, -share / rise], axis=1)
-        kept = _first_of_each(first + (second - first) * share[:, None], np.abs(share - 0.5) > _AT_PIXEL)
-        ends: npt.NDArray[np.intp] = np.stack([first, second], axis=1).astype(np.intp)[kept]
-        return Sensitivities(vertical[kept], ends, weights[kept], 1 / rise[kept])
+        ends: npt.NDArray[np.intp] = np.empty((len(pixels), 2, 2), dtype=np.intp)
+        ends[:, 0, 1], ends[:, 0, 0] = np.divmod(pixels, self.inside.shape[1])
+        ends[:, 0] += self.corner
+        ends[:, 1] = ends[:, 0]
+        ends[:across, 1, 0] += 1
+        ends[across:, 1, 1] += 1
+        weights = np.empty((len(pixels), 2))
+        weights[:, 0], weights[:, 1] = (share - 1) / rise, -share / rise
+        at_pixel = np.abs(share - 0.5) > _AT_PIXEL
+        if not at_pixel.any():
+            return Sensitivities(vertical, ends, weights, 1 / rise)
+        kept = _first_of_each(ends[:, 0] + (ends[:, 1] - ends[:, 0]) * share[:, None], at_pixel)
+        return Sensitivities(vertical[kept], ends[kept], weights[kept], 1 / rise[kept])
 
+    @cached_property
     def _lines(self) -> tuple[int, npt.NDArray[np.intp], Array, Array]:
         """Give how many crossed lines are horizontal; of all lines the first pixel and the values at both ends."""
         width = self.inside.shape[1]
-        rows, columns = np.divmod(np.flatnonzero(self.inside[:, 1:] != self.inside[:, :-1]), width - 1)
+        across, down = self.inside[:, 1:] != self.inside[:, :-1], self.inside[1:] != self.inside[:-1]
+        if self.sound is not None:
+            across &= self.sound[:, 1:] & self.sound[:, :-1]
+            down &= self.sound[1:] & self.sound[:-1]
+        rows, columns = np.divmod(np.flatnonzero(across), width - 1)
         first = rows * width + columns
-        below = np.flatnonzero(self.inside[1:] != self.inside[:-1])
+        below = np.flatnonzero(down)
         values = np.ravel(self.values)
         pixels = np.concatenate([first, below])
         start = values[pixels].astype(float)
@@ -163,6 +178,40 @@ def level_set_around(
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))
+
+
+def cut_level_set_around(
+    values: Image | Array, pixel: tuple[int, int], level: float, margin_px: int, seen: Mask | None = None
+) -> LevelSet:
+    """Find the region above a level that holds a pixel, where the array's border or the view cuts it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (H, W)
+        Finite intensities.
+    pixel : tuple of int
+        Column and row; its value lies above the level.
+    level : float
+        The level.
+    margin_px : int
+        Where the border is crossed nearer than this to the cut, smoothing has drawn it aside: it is left out.
+    seen : ndarray of bool, shape (H, W), optional
+        Where the values are known; default everywhere.
+
+    Returns
+    -------
+    LevelSet
+        Its border is open at the cut.
+    """
+    known = np.ones(values.shape, dtype=bool) if seen is None else seen
+    marks = ((values > level) & known).view(np.uint8)
+    cv2.floodFill(marks, None, pixel, _REGION, flags=4)
+    around = np.pad(np.where(marks == _REGION, np.uint8(_REGION), np.uint8(0)), 1)
+    cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
+    side = 2 * margin_px + 1
+    sound = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
+    framed = np.asarray(np.pad(values, 1, mode="edge"), dtype=np.float64)
+    return LevelSet(framed, around != _OUTSIDE, level, (-1, -1), np.asarray(sound))
 
 
 def _first_of_each(points: Array, suspects: Mask) -> Mask:

@@ -8,6 +8,7 @@ from simtest.calibration import Calibration, Known
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.estimators.photometric import photometric
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
@@ -178,7 +179,8 @@ def covered(made, true, key):
 
 def check_covariances(bench, shape, count, low, high):
     exact = lambda number, true: Known(RIG, true.distance)  # noqa: E731
-    made, true = bench.estimates(shape, {"cone_axis": cone_axis, "curved": curved}, count=count)
+    told = {"cone_axis": cone_axis, "curved": curved, "photometric": photometric}
+    made, true = bench.estimates(shape, told, count=count)
     beside, true_beside = bench.estimates(shape, {"bisector": bisector}, exact, count, [OFFSET])
     for each, truth in ((made, true), (beside, true_beside)):
         for key in each[0]:

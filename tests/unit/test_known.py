@@ -168,8 +168,15 @@ def test_the_top_is_not_the_highest_pixel():
         peaks.append(patch.peak_value)
     true = float(lobe(widths=(40.0, 30.0)).peak_value)
     assert abs(np.mean(tops) - true) < 0.25 * (np.mean(peaks) - true)
-    clipped = replace(lobe(), saturated=lobe().values > 0.9)
-    assert fit_top(clipped).value == clipped.peak_value
+
+
+def test_a_clipped_top_is_found_from_the_ring_around_it():
+    whole = lobe(widths=(24.0, 18.0))
+    values = np.minimum(whole.values, 0.7 * whole.peak_value)
+    clipped = replace(whole, values=values, saturated=values == values.max(), peak_value=float(values.max()))
+    assert fit_top(clipped).value == pytest.approx(whole.peak_value, rel=0.01)
+    # Negative control: taken as it is, the top is 30 % too low.
+    assert fit_top(replace(clipped, saturated=None)).value < 0.8 * whole.peak_value
 
 
 @pytest.mark.parametrize("m", [0.2, 1.0, 4.0])

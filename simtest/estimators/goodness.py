@@ -1,0 +1,98 @@
+"""Whether a fitted lobe explains its pixels, and how far the normal hangs on which of them are fitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2
+
+from simtest.estimators.lobe_fit import LobeFit, fit_lobe
+from simtest.estimators.lobe_models import ColocatedQuadric
+from simtest.geometry.vectors import tangent_coordinates
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+RINGS, SECTORS = 6, 8
+"""The lobe is cut into rings of equal numbers of pixels by the model's intensity, each into sectors."""
+
+MIN_IN_BIN = 8
+LEVEL = 1e-3
+"""A fit is a misfit where noise alone would leave as much structure in so small a share of fits."""
+
+FLOOR = 2e-3
+"""Structure below this share of the peak is none: rendering and sampling leave as much."""
+
+INNER = 0.5
+"""Around the peak every smooth lobe is the same: pixels above this share of it are fitted for comparison."""
+
+
+def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
+    """Tell whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
+
+    A sum over single pixels would notice less, since misfits are smooth, and hang on the noise being known to a part
+    in a hundred.
+
+    Parameters
+    ----------
+    fitted : LobeFit
+        The fit.
+    observed : ndarray, shape (m,)
+        Intensities.
+    clipped : ndarray of bool, shape (m,), optional
+        Left out.
+    noise : float, or ndarray, shape (m,)
+        Standard deviation of each pixel's noise.
+
+    Returns
+    -------
+    bool
+    """
+    model, _ = fitted.model.evaluate()
+    e, f = fitted.model.frame[:2]
+    rays = fitted.model.rays
+    kept = np.ones(len(model), dtype=bool) if clipped is None else ~clipped
+    residual, level = (observed - model)[kept], model[kept]
+    variance = np.broadcast_to(np.square(noise), model.shape)[kept]
+    if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
+        return False
+    ring = np.searchsorted(np.quantile(level, np.arange(1, RINGS) / RINGS), level)
+    angle = np.arctan2(rays[kept] @ f, rays[kept] @ e)
+    sector = np.minimum(((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int), SECTORS - 1)
+    place = ring * SECTORS + sector
+    count, total, spread = (
+        np.bincount(place, weights, RINGS * SECTORS) for weights in (np.ones(len(place)), residual, variance)
+    )
+    used = count >= MIN_IN_BIN
+    mean = total[used] / count[used]
+    allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
+    return bool(np.sum(mean**2 / allowed) > chi2.ppf(1 - LEVEL, np.count_nonzero(used)))
+
+
+def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
+    """Give by how much the normal moves when only the pixels near the peak are fitted, beyond noise, squared, rad^2.
+
+    Parameters
+    ----------
+    fitted : LobeFit
+        The fit of all pixels.
+    observed : ndarray, shape (m,)
+        Intensities.
+    clipped : ndarray of bool, shape (m,), optional
+        As of `fit_lobe`.
+
+    Returns
+    -------
+    float
+        0 where the inner pixels do not determine a fit of their own.
+    """
+    model, _ = fitted.model.evaluate()
+    near = model > INNER * model.max()
+    part = replace(fitted.model, rays=fitted.model.rays[near])
+    inner = fit_lobe(part, observed[near], None if clipped is None else clipped[near])
+    if inner is None:
+        return 0.0
+    moved = tangent_coordinates(fitted.model.normal, inner.model.normal)
+    # The two fits share pixels: the variance of their difference is the difference of their variances.
+    noise = float(np.trace(inner.covariance[:2, :2]) - np.trace(fitted.covariance[:2, :2]))
+    return max(float(moved @ moved) - max(noise, 0.0), 0.0)
