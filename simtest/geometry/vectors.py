@@ -39,3 +39,9 @@ def tangent_coordinates(normal: Array, other: Array) -> Array:
     sine = float(np.hypot(*across))
     angle = float(np.arctan2(sine, normal @ other))
     return across * (angle / sine) if sine > 0 else across
+
+
+def angle_deg(first: Array, second: Array) -> Array:
+    """Give the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
+    cross = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
