@@ -10,6 +10,8 @@ from simtest.files import write_atomically
 from simtest.report import static, style, words
 from simtest.report.coverage import coverage
 from simtest.report.gallery import isophote_colour
+from simtest.report.laws.section import laws_section
+from simtest.report.pairs import pairs
 from simtest.report.paper.section import paper_section
 from simtest.report.run import Run, read_run
 from simtest.report.series import LineFigure, line_figures
@@ -68,6 +70,11 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
         sections["paper"] = published[0]
         sections["headline"].append(published[0]["headline"])
         charts |= published[1]
+    laws = laws_section(run, folder)
+    if laws:
+        sections["laws"] = laws[0]
+        sections["headline"].append(laws[0]["headline"])
+        charts |= laws[1]
     maps = heat_maps(run)[:_MAX_HEAT_MAPS]
     if maps:
         static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
@@ -84,6 +91,7 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
             static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
             charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
     sections["coverage"] = coverage(run)
+    sections["pairs"] = pairs(run)
     paths = static.draw_gallery(run.gallery, colours, folder)
     sections["gallery"] = _gallery_section(run, paths)
     view = surface_3d(run)
@@ -165,6 +173,8 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         heat=sections.get("heat", []),
         surfaces=sections.get("surfaces"),
         coverage=sections["coverage"],
+        laws=sections.get("laws"),
+        pairs=sections["pairs"],
         gallery=sections["gallery"],
         gallery_total=run.gallery_total,
         first=_FIRST,

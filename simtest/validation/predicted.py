@@ -105,7 +105,11 @@ def axis_ratio_seen(scene: Scene, estimate: Estimate, truth: JudgedHighlight, sm
     highlight, reflectance = truth.highlight, scene.reflectance
     isovalues = [isophote.isovalue for isophote in estimate.isophotes]
     pure = isinstance(reflectance, PhongReflectance) and not reflectance.normalised and reflectance.diffuse == 0
-    if not (pure and isovalues) or not is_at_camera(scene.rig.true_mm()[highlight.light]) or not _takes_ratio_as_seen(estimate):
+    if (
+        not (pure and isovalues)
+        or not is_at_camera(scene.rig.true_mm()[highlight.light])
+        or not _takes_ratio_as_seen(estimate)
+    ):
         return None
     assert isinstance(reflectance, PhongReflectance)
     seen = laws.axis_ratio_seen(
