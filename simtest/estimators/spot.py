@@ -9,6 +9,7 @@ both are followed to t -> 1 by a straight line (theory.md section 3, items 3 and
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,8 +28,8 @@ MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2 = 13.82
-"""Squared Mahalanobis distance beyond which the axis' drift is more than noise: 1 % of a normal pair lies beyond."""
 """Squared Mahalanobis distance beyond which the axis' drift is more than noise: 0.1 % of a normal pair lies beyond."""
+
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
@@ -130,8 +131,7 @@ class Spot:
     def _moments_at(self, shift: float) -> Array:
         """Give the moments with the levels moved by a shift."""
         levels = self.levels + shift
-        added = 2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1)
-        each = np.array(self._tangent_moments) - added[:, None, None] * self._px2
+        each = np.array(self._tangent_moments) - self._added_px2(levels)[:, None, None] * self._px2
         return np.asarray(np.einsum("k,kij->ij", _to_peak(levels) / (2 * levels), each))
 
     @cached_property
@@ -179,13 +179,41 @@ class Spot:
             pixels.append((moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel())
             shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
         pixels += [self._top.pixels, np.array([row * width + column])]
-        flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
-        images, box = _images(flat, np.concatenate(moves, axis=1), width)
+        moves = [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
+        return self._carried(noise, np.concatenate(pixels), np.concatenate(moves, axis=1))
+
+    def _carried(self, noise: Any, flat: npt.NDArray[np.intp], moves: Array) -> Array:
+        """Carry the raw pixels' noise to values that move by `moves`, shape (p, N), with smoothed pixels; (p, p)."""
+        images, box = _images(flat, moves, self.patch.values.shape[1])
         margin = int(np.ceil(KERNEL_SIGMAS * self.patch.smoothing_px))
         level = np.pad(noise[box], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
         smoothed = [_transposed_smoothing(image, self.patch.smoothing_px, margin) * level for image in images]
         raw = np.stack(smoothed).reshape(len(smoothed), -1)
         return np.asarray(raw @ raw.T)
+
+    def conic(self, k: int) -> Array:
+        """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
+        return self._conics[k]
+
+    def conic_covariance(self, k: int) -> Array:
+        """Give its covariance by noise, shape (5, 5); the noise must be known."""
+        isophote, (column, row) = self.isophotes[k], self.patch.peak_pixel
+        width = self.patch.values.shape[1]
+        moved = self.patch.sensitivities(isophote.isovalue)
+        assert not isinstance(moved, Failure)
+        by_crossing = self._conic_by_crossing(k, isophote.points, moved.vertical)
+        by_peak = by_crossing @ moved.level * isophote.isovalue
+        flat = (moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel()
+        moves = np.column_stack([(by_crossing[:, :, None] * moved.weights).reshape(5, -1), by_peak])
+        return self._carried(self.patch.noise, np.append(flat, row * width + column), moves)
+
+    def widening(self, k: int = 0) -> Array:
+        """Give what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
+        return self._added_px2(self.levels)[k] * self._px2
+
+    def _added_px2(self, levels: Array) -> Array:
+        """Give the same in px^2, for each level."""
+        return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @property
     def axis_covariance(self) -> Array | None:
@@ -272,7 +300,7 @@ def _to_peak(levels: Array) -> Array:
 
 
 def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:
-    """Sum weights, shape (7, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
+    """Sum weights, shape (p, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
     rows, columns = np.divmod(flat, width)
     top, left, high, wide = rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1
     place = (rows - top) * wide + columns - left

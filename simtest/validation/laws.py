@@ -163,8 +163,9 @@ def axis_ratio_seen(
     s2 = np.asarray(smoothing_px, float) ** 2
     added = (level * s2 + (level - 1) * LINEAR_INTERPOLATION_PX2) * np.asarray(pixel, float) ** 2
     first, second = (isophote_half_width(isovalue, exponent, kd) ** 2 + added for kd in (kd_min, kd_max))
+    smaller, larger = np.minimum(first, second), np.maximum(first, second)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(np.minimum(first, second) / np.maximum(first, second)))
+        return np.where(np.isfinite(larger), np.sqrt(smaller / larger), np.nan)
 
 
 def circle_pose_error(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:

@@ -213,7 +213,12 @@ def curvature_errors(estimate: Estimate, true: TrueHighlight) -> dict[str, float
 
 
 def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
-    """Give the squared Mahalanobis distance of the true normal, unit, shape (3,); None without a usable covariance."""
+    """Give the squared Mahalanobis distance of the true normal, unit, shape (3,), by the region or the covariance.
+
+    Both are chi-squared with two degrees of freedom where the estimate's uncertainty is right; None without either.
+    """
+    if estimate.region is not None:
+        return float(estimate.region.statistic(truth))
     if estimate.covariance is None or np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
         return None
     miss = tangent_coordinates(estimate.normal, truth)

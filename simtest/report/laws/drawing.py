@@ -109,7 +109,10 @@ def chart(results: Sequence[LawResult], key: str) -> "Chart | None":
     line: dict[str, Any] = {"color": NEUTRAL, "dash": "dash", "width": 1.5}
     if key == DEPARTURES:
         figure.add_vline(x=1.0, line=line)
-        x = {"type": "log", "title": {"text": "|measured − predicted| / allowed; beyond 1 the law is not met"}}
+        x: dict[str, Any] = {
+            "type": "log",
+            "title": {"text": "|measured − predicted| / allowed; beyond 1 the law is not met"},
+        }
         x |= {"automargin": True, "dtick": 1, "exponentformat": "none"}
         figure.update_layout(layout(420, xaxis=x, yaxis={"autorange": "reversed", "automargin": True}))
         return figure
