@@ -94,7 +94,7 @@ def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool
         ratio = float(np.sqrt(stiffness[0] / stiffness[1]))
         hypotheses, smallest = None, ratio
     else:
-        hypotheses = _hypotheses(stiffness, lobe)
+        hypotheses = sign_hypotheses(stiffness, lobe)
         smallest, larger = np.sort(np.abs(hypotheses[0]))
         ratio = float(smallest / larger)
     if smallest < STREAK_GAIN:
@@ -121,7 +121,7 @@ ROUND_SHARE = 3.0
 """Squared difference of the moments over its noise: -ln 0.05, which 5 % of round spots exceed."""
 
 
-def _hypotheses(stiffness: Array, lobe: float) -> Array:
+def sign_hypotheses(stiffness: Array, lobe: float) -> Array:
     """List (1 + d k) along both directions for all signs, the least curved surface first, shape (4, 2)."""
     positive = gain_of_stiffness(stiffness, lobe)
     pairs = [(m, -2 / lobe - m) for m in positive]

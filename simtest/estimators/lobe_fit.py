@@ -53,7 +53,9 @@ class LobeFit(Generic[Model]):
     chi2: float
 
 
-def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> LobeFit[Model] | None:
+def fit_lobe(
+    start: Model, observed: Array, clipped: Mask | None = None, rounding: float = 0.0
+) -> LobeFit[Model] | None:
     """Fit a model by Levenberg and Marquardt's method: maximum likelihood under white noise.
 
     Parameters
@@ -64,6 +66,8 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
         Intensities of the model's pixels.
     clipped : ndarray of bool, shape (m,), optional
         Pixels that say only that the intensity is at least what was observed: a model above it leaves no residual.
+    rounding : float
+        Relative error of the sum of squares by the model's rounding: a change by no more than that ends the fit.
 
     Returns
     -------
@@ -83,6 +87,8 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
         trial = model.moved(step)
         next_residual, next_J = _residual(trial, observed, clipped)
         next_chi2 = float(next_residual @ next_residual)
+        if abs(next_chi2 - chi2) < rounding * chi2:
+            break
         if not next_chi2 < chi2:
             if damping > MOST_DAMPING:
                 # No step downhill is left: the minimum, to rounding.

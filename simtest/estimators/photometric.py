@@ -37,17 +37,17 @@ SAME_RAD = 1e-3
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class HighlightPixels:
     """Pixels that are fitted: their sightlines and intensities, and which are clipped."""
 
     rays: Array
     observed: Array
     clipped: Mask | None
 
-    def every(self, step: int) -> "_Pixels":
+    def every(self, step: int) -> "HighlightPixels":
         """Give every so many pixels."""
         clipped = None if self.clipped is None else self.clipped[::step]
-        return _Pixels(self.rays[::step], self.observed[::step], clipped)
+        return HighlightPixels(self.rays[::step], self.observed[::step], clipped)
 
 
 def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
@@ -72,7 +72,7 @@ def photometric(patch: Patch, camera: Camera) -> Estimate | Failure:
     start = cone_axis(patch, camera)
     if isinstance(start, Failure):
         return start
-    pixels = _pixels(patch, camera)
+    pixels = highlight_pixels(patch, camera)
     if isinstance(pixels, Failure):
         return pixels
     fitted = fit_lobe(_quadric(start, patch, pixels.rays), pixels.observed, pixels.clipped)
@@ -107,7 +107,7 @@ def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = STAR
     start = _pose(patch, camera, start_isovalue)
     if isinstance(start, Failure):
         return start
-    pixels = _pixels(patch, camera)
+    pixels = highlight_pixels(patch, camera)
     if isinstance(pixels, Failure):
         return pixels
     foot = camera.unproject(patch.peak_px)
@@ -162,7 +162,7 @@ def _pose(patch: Patch, camera: Camera, isovalue: float) -> Estimate | Failure:
     return first
 
 
-def _pixels(patch: Patch, camera: Camera) -> _Pixels | Failure:
+def highlight_pixels(patch: Patch, camera: Camera) -> HighlightPixels | Failure:
     """Gather the pixels of the first region that closes."""
     for t in REGIONS:
         crossings = patch.crossings(t)
@@ -179,7 +179,7 @@ def _pixels(patch: Patch, camera: Camera) -> _Pixels | Failure:
     sound = np.isfinite(rays).all(axis=1)
     values = patch.values if patch.raw is None else patch.raw
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
-    return _Pixels(rays[sound], values[rows, columns][sound].astype(float), clipped)
+    return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped)
 
 
 def _quadric(start: Estimate, patch: Patch, rays: Array) -> ColocatedQuadric:

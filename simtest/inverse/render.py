@@ -1,0 +1,266 @@
+"""Radiance of a quadric patch and its derivatives, by Mitsuba's BSDFs and Dr.Jit's forward mode.
+
+Mitsuba cannot differentiate its intersections of rays with analytic shapes. Here the patch is a quadratic equation a
+ray, written in Dr.Jit, and its surface points are handed to Mitsuba's BSDF, with everything that hangs on the patch's
+parameters differentiated. Each parameter has a copy of the pixels of its own, in which it alone moves, so that one pass
+of one kernel gives the intensities and all derivatives; another highlight compiles nothing.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.rendering import backend, phong
+from simtest.rendering.direct import Material
+
+if TYPE_CHECKING:
+    from simtest.inverse.patch import RenderedQuadric
+
+Array = npt.NDArray[np.float64]
+
+PASSING = 1e-6
+"""Share of the squared slope that stands in for the discriminant where a ray passes the quadric by."""
+
+SAME_HIT = 1e-3
+"""Share of the distance by which a blocker stands before a point at least."""
+
+REACH = 1.0
+"""Half the side of the patch, over the distance, that sends light back to itself; its border is not differentiated."""
+
+GOLDEN = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence: evenly spread points of the unit square, the same for every pixel and every evaluation."""
+
+
+class PatchRenderer:
+    """Renders a quadric patch at the pixels of one highlight.
+
+    Parameters
+    ----------
+    rays : ndarray, shape (m, 3)
+        Sightlines, unit, camera frame.
+    path_depth : int
+        2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself.
+    samples : int
+        Paths a pixel, where there are inter-reflections.
+    variant : str, optional
+        Mitsuba variant.
+    """
+
+    def __init__(self, rays: Array, path_depth: int = 2, samples: int = 16, variant: str | None = None) -> None:
+        mi = backend.load(variant)
+        plugin = phong.register(mi, str(mi.variant()))
+        self.mi, self.count, self.depth = mi, len(rays), path_depth
+        self.samples = samples if path_depth > 2 else 1
+        self._rays = np.repeat(np.ascontiguousarray(rays, dtype=np.float32), self.samples, axis=0)
+        # Lobe and base of unit strength: what they are scaled by is differentiated outside of the BSDF.
+        self._bsdf = mi.load_dict(
+            {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
+        )
+
+    def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
+        """Give intensities and their derivatives by the parameters that are kept.
+
+        Parameters
+        ----------
+        patch : RenderedQuadric
+            At some values of its parameters.
+        kept : list of bool
+            Of the eight: s (2), stretch (3), log scale, log n, base.
+
+        Returns
+        -------
+        intensity : ndarray, shape (m,)
+        derivatives : ndarray, shape (m, p)
+        """
+        import drjit as dr
+
+        mi, columns = self.mi, int(sum(kept))
+        lanes = len(self._rays)
+        # A copy of all pixels for each parameter.
+        rays = mi.Vector3f(np.tile(self._rays.T, (1, columns)))
+        which = dr.arange(mi.UInt32, lanes * columns) // mi.UInt32(self._opaque(lanes, mi.UInt32))
+        values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.log_exponent, patch.base]
+        parameters, place = [], 0
+        for value, is_kept in zip(values, kept, strict=True):
+            parameter = dr.zeros(mi.Float, lanes * columns) + self._opaque(value)
+            if is_kept:
+                dr.enable_grad(parameter)
+                dr.set_grad(parameter, dr.select(which == place, mi.Float(1), mi.Float(0)))
+                place += 1
+            parameters.append(parameter)
+        surface = _Surface(self, patch, parameters)
+        total = self._paths(surface, rays)
+        # Mitsuba's calls of any BSDF trace all that exist: this one must not hold the copies on.
+        self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
+        slope = dr.forward_to(total)
+        dr.eval(total, slope)
+        image, slopes = (
+            np.array(v, dtype=np.float64).reshape(columns, self.count, -1).mean(axis=2) for v in (total, slope)
+        )
+        return image[0], slopes.T
+
+    def _opaque(self, value: Any, kind: Any = None) -> Any:
+        """Give a value that the kernel reads, and that does not compile it anew."""
+        import drjit as dr
+
+        held = (kind or self.mi.Float)(value)
+        dr.make_opaque(held)
+        return held
+
+    def _paths(self, surface: "_Surface", rays: Any) -> Any:
+        """Give the radiance along rays from the camera."""
+        import drjit as dr
+
+        mi = self.mi
+        si = surface.first_hit(rays)
+        radiance, weight = surface.direct(si), mi.Float(1)
+        for bounce in range(self.depth - 2):
+            first, second = self._numbers(bounce, dr.width(rays))
+            context = mi.BSDFContext()
+            local, density = surface.sample(si, first, second)
+            weight *= dr.select(density > 0, surface.reflected(context, si, local) / dr.maximum(density, 1e-6), 0)
+            si, reached = surface.next_hit(si, si.to_world(local))
+            radiance += dr.select(reached, weight * surface.direct(si, lit=surface.is_seen(si)), 0)
+            weight = dr.select(reached, weight, 0)
+        return radiance * dr.exp(surface.log_scale)
+
+    def _numbers(self, bounce: int, width: int) -> tuple[Any, Any]:
+        """Give the random numbers of a bounce: of each path its own, the same at every evaluation."""
+        import drjit as dr
+
+        mi = self.mi
+        lane = dr.arange(mi.UInt32, width)
+        number = mi.Float(lane % mi.UInt32(self._opaque(self.samples, mi.UInt32)))
+        # Each pixel shifts the sequence by an amount of its own.
+        pixel = (lane % mi.UInt32(self._opaque(len(self._rays), mi.UInt32))) // mi.UInt32(
+            self._opaque(self.samples, mi.UInt32)
+        )
+        shift = [mi.Float(mi.sample_tea_32(pixel, 2 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
+        u, v = (number * step + offset for step, offset in zip(GOLDEN, shift[:2], strict=True))
+        w = (number + shift[2]) / self._opaque(float(self.samples))
+        return w - dr.floor(w), mi.Point2f(u - dr.floor(u), v - dr.floor(v))
+
+
+class _Surface:
+    """The patch as the kernel sees it: all that hangs on its parameters."""
+
+    def __init__(self, renderer: PatchRenderer, patch: "RenderedQuadric", parameters: list[Any]) -> None:
+        import drjit as dr
+
+        mi, opaque = renderer.mi, renderer._opaque
+        self.mi = mi
+        by_first, by_second, first, both, second, self.log_scale, log_exponent, self.base = parameters
+        shrink = dr.exp(-log_exponent / 2)
+        self.K = (first * shrink - 1, both * shrink, second * shrink - 1)
+        self.distance = opaque(patch.distance)
+
+        def vector(values: Array) -> Any:
+            held = mi.Vector3f(*values.tolist())
+            dr.make_opaque(held)
+            return held
+
+        across, along = (vector(v) for v in patch.turning)
+        sightline = dr.normalize(vector(patch.sightline) + by_first * across + by_second * along)
+        self.foot = self.distance * sightline
+        self.lights = [vector(light) for light in patch.lights]
+        to_light = vector(patch.light) - self.foot
+        self.normal = dr.normalize(dr.normalize(to_light) - sightline)
+        e = vector(patch.first)
+        self.e = dr.normalize(e - dr.dot(e, self.normal) * self.normal)
+        self.f = dr.cross(self.normal, self.e)
+        bsdf = renderer._bsdf
+        bsdf.exponent = dr.exp(log_exponent)
+        self.material = Material(bsdf, None)
+
+    def local(self, vector: Any) -> tuple[Any, Any, Any]:
+        """Give a vector's parts along e, f and N."""
+        import drjit as dr
+
+        return dr.dot(self.e, vector), dr.dot(self.f, vector), dr.dot(self.normal, vector)
+
+    def bent(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Give K (x, y)^T / d."""
+        k11, k12, k22 = self.K
+        return (k11 * x + k12 * y) / self.distance, (k12 * x + k22 * y) / self.distance
+
+    def first_hit(self, direction: Any) -> Any:
+        """Give the first surface points on rays from the camera."""
+        import drjit as dr
+
+        # (x, y, z) = t r - p solves z + (x, y) K (x, y)^T / (2 d) = 0.
+        rx, ry, rz = self.local(direction)
+        px, py, pz = self.local(self.foot)
+        bx, by = self.bent(rx, ry)
+        cx, cy = self.bent(px, py)
+        a, b, c = (rx * bx + ry * by) / 2, rz - (px * bx + py * by), (px * cx + py * cy) / 2 - pz
+        # Where a ray passes the quadric by, its closest approach stands in.
+        root = dr.sqrt(dr.maximum(b * b - 4 * a * c, PASSING * b * b))
+        t = 2 * c / (root - b)
+        return self.interaction(direction, t * direction, t)
+
+    def next_hit(self, si: Any, direction: Any) -> tuple[Any, Any]:
+        """Give the surface points on rays from surface points, and whether there are any, facing the ray."""
+        import drjit as dr
+
+        x, y, _ = self.local(si.p - self.foot)
+        wx, wy, wz = self.local(direction)
+        bx, by = self.bent(wx, wy)
+        a, b = (wx * bx + wy * by) / 2, wz + x * bx + y * by
+        # One root is the point itself.
+        found = (a * b < 0) & (dr.abs(a) > 1e-9)
+        t = dr.select(found, -b / dr.select(found, a, 1), 1)
+        hit = self.interaction(direction, si.p + t * direction, t)
+        near = dr.maximum(dr.abs(x + t * wx), dr.abs(y + t * wy)) < REACH * self.distance
+        return hit, found & near & (dr.dot(hit.n, direction) < 0)
+
+    def interaction(self, direction: Any, position: Any, reach: Any) -> Any:
+        """Give Mitsuba's surface interaction at surface points."""
+        import drjit as dr
+
+        mi = self.mi
+        x, y, _ = self.local(position - self.foot)
+        kx, ky = self.bent(x, y)
+        normal = dr.normalize(self.normal + kx * self.e + ky * self.f)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
+        si.t, si.p, si.n = reach, mi.Point3f(position), mi.Normal3f(normal)
+        si.sh_frame = mi.Frame3f(si.n)
+        si.wi = si.to_local(-direction)
+        return si
+
+    def direct(self, si: Any, lit: Any = True) -> Any:
+        """Give the radiance off surface points that comes straight from the lights, per unit of their power."""
+        import drjit as dr
+
+        mi, radiance = self.mi, self.mi.Float(0)
+        for light in self.lights:
+            towards = light - si.p
+            squared = dr.squared_norm(towards)
+            lobe, base = self.material.parts(mi, si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(lit))
+            radiance += (dr.mean(lobe) + self.base * dr.mean(base)) / squared * self.distance**2
+        return radiance
+
+    def reflected(self, context: Any, si: Any, local: Any) -> Any:
+        """Give f cos(theta) of lobe and base together."""
+        import drjit as dr
+
+        lobe, base = self.material.parts(self.mi, si, local, self.mi.Bool(True))
+        return dr.mean(lobe) + self.base * dr.mean(base)
+
+    def sample(self, si: Any, first: Any, second: Any) -> tuple[Any, Any]:
+        """Draw directions, local and not differentiated, with their densities."""
+        import drjit as dr
+
+        mi = self.mi
+        with dr.suspend_grad():
+            bs, _ = self.material.bsdf.sample(mi.BSDFContext(), si, first, second, mi.Bool(True))
+            return mi.Vector3f(dr.detach(bs.wo)), mi.Float(dr.detach(bs.pdf))
+
+    def is_seen(self, si: Any) -> Any:
+        """Tell whether the first light reaches surface points past the patch itself."""
+        import drjit as dr
+
+        with dr.suspend_grad():
+            reach = dr.norm(si.p)
+            first = self.first_hit(si.p / reach)
+            return dr.detach(first.t) > dr.detach(reach) * (1 - SAME_HIT)
