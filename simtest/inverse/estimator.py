@@ -1,5 +1,7 @@
 """`inverse_rendering`: a quadric patch fitted by differentiating the renderer; the yardstick of the others."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,7 +12,7 @@ from simtest.estimators.bisector import bisect
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
-from simtest.estimators.photometric import highlight_pixels
+from simtest.estimators.photometric import HighlightPixels, highlight_pixels
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import tangent_basis
 from simtest.inverse.patch import RenderedQuadric
@@ -42,7 +44,8 @@ def inverse_rendering(
     """Fit a rendered quadric patch with a Phong lobe to the pixels, started from `cone_axis`.
 
     Open are the BP's sightline, which the highlight's condition ties the normal to, the shape d S in all three
-    components, the lobe's scale and, as asked for, a Lambertian base and the lobe's exponent. The renderer is
+    components, the lobe's scale and, as asked for, a Lambertian base and the lobe's exponent. The patch is a paraboloid
+    or, where that leaves less, a quadric that is a sphere or cylinder where its curvatures are. The renderer is
     differentiated by Dr.Jit's forward mode; the fit is Levenberg and Marquardt's. Under white noise it is the
     maximum-likelihood estimate. Clipped pixels count as "at least this bright". Pixels are those before smoothing.
 
@@ -87,7 +90,7 @@ def inverse_rendering(
         return pixels
     renderer = PatchRenderer(pixels.rays, path_depth, PATHS, variant)
     model = _start(start, patch, known, renderer, (exponent, base))
-    fitted = fit_lobe(model, pixels.observed, pixels.clipped, ROUNDING)
+    fitted = _fitted(model, pixels)
     if fitted is None:
         return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
     found = fitted.model
@@ -128,6 +131,15 @@ def _start(
     stretch = np.sqrt(lobe / 4) * np.array([M[0, 0], M[0, 1], M[1, 1]])
     logs = float(np.log(patch.peak_value)), float(np.log(lobe / 4))
     return RenderedQuadric(renderer, s, basis[0], distance, light, lights, stretch, *logs, 0.0, *opened)
+
+
+def _fitted(start: RenderedQuadric, pixels: HighlightPixels) -> LobeFit[RenderedQuadric] | None:
+    """Fit a paraboloid, from there a sphere or cylinder, and keep what leaves less."""
+    flat = fit_lobe(start, pixels.observed, pixels.clipped, ROUNDING)
+    begun = start if flat is None else flat.model
+    round_one = fit_lobe(replace(begun, roundness=1.0), pixels.observed, pixels.clipped, ROUNDING)
+    fits = [fit for fit in (flat, round_one) if fit is not None and np.isfinite(fit.chi2)]
+    return min(fits, key=lambda fit: fit.chi2, default=None)
 
 
 def _lit(known: Known) -> tuple[float, Array, Array]:

@@ -17,9 +17,10 @@ class RenderedQuadric:
     """A quadric patch whose radiance the renderer gives, for `simtest.estimators.lobe_fit.fit_lobe`.
 
     The BP is P0 = d s; its normal N bisects the directions to the highlight's light and to the camera. Beside it the
-    surface is z = -(x, y) K (x, y)^T / (2 d) along N, K = d S. Parameters: rotation of s along `turning` (2), the three
-    of sqrt(n) (I + K) in the basis e, f, log of the scale, then log n and the base where they are open. A highlight's
-    shape is sqrt(n) (I + K) to second order; n beside it moves the intensities little, along a straight valley.
+    surface is z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0 along N, K = d S. With q = 0 it is a paraboloid; with
+    q = tr(K^3) / tr(K^2) it is a sphere or cylinder where the curvatures are those of one. Parameters: rotation of s
+    along `turning` (2), the three of sqrt(n) (I + K) in the basis e, f, log of the scale, then log n and the base where
+    they are open. A highlight's shape is sqrt(n) (I + K) to second order; n beside it moves the intensities little.
 
     Parameters
     ----------
@@ -41,6 +42,8 @@ class RenderedQuadric:
         Of the lobe c cos^n(beta); the base's albedo over c.
     open_exponent, open_base : bool
         Whether n and the base are fitted.
+    roundness : float
+        Share of q: 0 a paraboloid, 1 a sphere or cylinder.
     """
 
     renderer: PatchRenderer
@@ -55,6 +58,7 @@ class RenderedQuadric:
     base: float
     open_exponent: bool
     open_base: bool
+    roundness: float = 0.0
 
     @property
     def normal(self) -> Array:

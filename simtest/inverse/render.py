@@ -25,6 +25,9 @@ PASSING = 1e-6
 SAME_HIT = 1e-3
 """Share of the distance by which a blocker stands before a point at least."""
 
+FLAT = 1e-6
+"""Added to tr(K^2), which is 0 on a plane."""
+
 REACH = 1.0
 """Half the side of the patch, over the distance, that sends light back to itself; its border is not differentiated."""
 
@@ -154,6 +157,9 @@ class _Surface:
         shrink = dr.exp(-log_exponent / 2)
         self.K = (first * shrink - 1, both * shrink, second * shrink - 1)
         self.distance = opaque(patch.distance)
+        k11, k12, k22 = self.K
+        cubes, squares = k11**3 + k22**3 + 3 * k12**2 * (k11 + k22), k11**2 + 2 * k12**2 + k22**2
+        self.bulge = opaque(patch.roundness) * cubes / (squares + FLAT) / self.distance
 
         def vector(values: Array) -> Any:
             held = mi.Vector3f(*values.tolist())
@@ -188,12 +194,14 @@ class _Surface:
         """Give the first surface points on rays from the camera."""
         import drjit as dr
 
-        # (x, y, z) = t r - p solves z + (x, y) K (x, y)^T / (2 d) = 0.
+        # (x, y, z) = t r - p solves z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0.
         rx, ry, rz = self.local(direction)
         px, py, pz = self.local(self.foot)
         bx, by = self.bent(rx, ry)
         cx, cy = self.bent(px, py)
-        a, b, c = (rx * bx + ry * by) / 2, rz - (px * bx + py * by), (px * cx + py * cy) / 2 - pz
+        q = self.bulge
+        a, b = (rx * bx + ry * by + q * rz * rz) / 2, rz - (px * bx + py * by + q * pz * rz)
+        c = (px * cx + py * cy + q * pz * pz) / 2 - pz
         # Where a ray passes the quadric by, its closest approach stands in.
         root = dr.sqrt(dr.maximum(b * b - 4 * a * c, PASSING * b * b))
         t = 2 * c / (root - b)
@@ -203,10 +211,10 @@ class _Surface:
         """Give the surface points on rays from surface points, and whether there are any, facing the ray."""
         import drjit as dr
 
-        x, y, _ = self.local(si.p - self.foot)
+        x, y, z = self.local(si.p - self.foot)
         wx, wy, wz = self.local(direction)
         bx, by = self.bent(wx, wy)
-        a, b = (wx * bx + wy * by) / 2, wz + x * bx + y * by
+        a, b = (wx * bx + wy * by + self.bulge * wz * wz) / 2, wz + x * bx + y * by + self.bulge * z * wz
         # One root is the point itself.
         found = (a * b < 0) & (dr.abs(a) > 1e-9)
         t = dr.select(found, -b / dr.select(found, a, 1), 1)
@@ -219,9 +227,9 @@ class _Surface:
         import drjit as dr
 
         mi = self.mi
-        x, y, _ = self.local(position - self.foot)
+        x, y, z = self.local(position - self.foot)
         kx, ky = self.bent(x, y)
-        normal = dr.normalize(self.normal + kx * self.e + ky * self.f)
+        normal = dr.normalize((1 + self.bulge * z) * self.normal + kx * self.e + ky * self.f)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
         si.t, si.p, si.n = reach, mi.Point3f(position), mi.Normal3f(normal)
         si.sh_frame = mi.Frame3f(si.n)

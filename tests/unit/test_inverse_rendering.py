@@ -30,6 +30,8 @@ LOBE = Known(lobe_curvature=4 * N)
 SURFACES = {
     "plane": {"type": "plane", "tilt_deg": 10.0, "azimuth_deg": 40.0},
     "cylinder": {"type": "cylinder", "radius_mm": D, "tilt_deg": 3.0, "spin_deg": 20.0},
+    "tube": {"type": "cylinder", "radius_mm": 2 * D, "side": "inside", "tilt_deg": 3.0, "spin_deg": 20.0},
+    "ball": {"type": "sphere", "radius_mm": D, "tilt_deg": 3.0},
     "saddle": {"type": "quadric", "k1_per_mm": 0.05, "k2_per_mm": -0.05, "spin_deg": 30.0},
 }
 
@@ -85,7 +87,7 @@ def pixels_near(session, highlight, reach=45, step=5):
     return places[kept].astype(int), session.camera.unproject(places[kept] + 0.5)
 
 
-@pytest.mark.parametrize("name", ["plane", "saddle", "aside"])
+@pytest.mark.parametrize("name", ["plane", "saddle", "aside", "tube", "ball", "cylinder"])
 def test_intensities_are_the_renderers(render, name):
     light = {"offset_mm": 2.0, "azimuth_deg": 70.0} if name == "aside" else {}
     surface = SURFACES["saddle" if name == "aside" else name]
@@ -94,7 +96,8 @@ def test_intensities_are_the_renderers(render, name):
     places, rays = pixels_near(session, highlight)
     expected = radiance.total[places[:, 1], places[:, 0]]
     place = session.scene.rig.true_mm()[0]
-    model = model_at(highlight, rays, light=place, base=0.3)
+    round_one = name in ("tube", "ball", "cylinder")
+    model = replace(model_at(highlight, rays, light=place, base=0.3), roundness=float(round_one))
     intensity, _ = model.evaluate()
     # With the light aside the BP is not the anchor: the patch is its own osculating paraboloid, close, not the same.
     tolerance = 5e-3 if name == "aside" else 2e-4
@@ -141,10 +144,10 @@ def test_normal_and_curvatures_are_recovered(render, name):
     assert mahalanobis2(found, highlight.normal) < 14
     errors = curvature_errors(found, highlight)
     assert errors["gain_error"] < 0.01
-    if name != "plane":
+    if name not in ("plane", "ball"):
         assert errors["direction_error_deg"] < 0.2
     law = abs(1 + highlight.kd_min) / abs(1 + highlight.kd_max)
-    assert found.axis_ratio == pytest.approx(law, rel=0.01)
+    assert found.axis_ratio == pytest.approx(law, rel=0.015)
 
 
 def test_it_is_the_maximum_likelihood_estimate_that_photometric_is(render):
