@@ -161,7 +161,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters["degrees"] = style.degrees
+    environment.filters["degrees"], environment.filters["number"] = style.degrees, style.number
     content = run.experiments.get(run.experiment) or {}
     return environment.get_template("template.html.j2").render(
         experiment=run.experiment,

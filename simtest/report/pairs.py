@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 
 from simtest.report.run import Run
-from simtest.report.style import degrees, estimator_order
+from simtest.report.style import estimator_order, number
 from simtest.validation.statistics import student_interval
 
 ALL = "all settings"
@@ -65,7 +65,7 @@ class Pair:
     @property
     def interval(self) -> str:
         """The interval as text."""
-        return NONE if self.low is None else f"{degrees(self.low)} to {degrees(self.high)}"
+        return NONE if self.low is None else f"{number(self.low)} to {number(self.high)}"
 
 
 def pairs(run: Run) -> list[Pair]:
