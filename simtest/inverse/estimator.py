@@ -25,7 +25,7 @@ NOTHING_KNOWN = Known()
 STEP = 1e-5
 """Step of the differences of the normal, rad, and as a share of the distance."""
 
-PATHS = 16
+PATHS = 64
 """Paths a pixel, where there are inter-reflections."""
 
 ROUNDING = 1e-7
@@ -61,7 +61,7 @@ def inverse_rendering(
         Lights and distance, and the lobe's curvature, from which the exponent follows.
     path_depth : int
         2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself, twice as wide as
-        far, with a lobe of strength 1.
+        far, with a lobe of strength 1; they follow scale and base, and are not differentiated by place and shape.
     base : bool
         Whether a Lambertian base is open; else there is none.
     exponent : bool

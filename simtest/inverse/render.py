@@ -3,7 +3,8 @@
 Mitsuba cannot differentiate its intersections of rays with analytic shapes. Here the patch is a quadratic equation a
 ray, written in Dr.Jit, and its surface points are handed to Mitsuba's BSDF, with everything that hangs on the patch's
 parameters differentiated. Each parameter has a copy of the pixels of its own, in which it alone moves, so that one pass
-of one kernel gives the intensities and all derivatives; another highlight compiles nothing.
+of one kernel gives the intensities and all derivatives; another highlight compiles nothing. Inter-reflections of the
+patch with itself are added as a sampled term that follows scale and base.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,9 @@ FLAT = 1e-6
 REACH = 1.0
 """Half the side of the patch, over the distance, that sends light back to itself; its border is not differentiated."""
 
+LOG_SCALE = 5
+"""Place of the log scale among the parameters."""
+
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: evenly spread points of the unit square, the same for every pixel and every evaluation."""
 
@@ -54,8 +58,8 @@ class PatchRenderer:
         mi = backend.load(variant)
         plugin = phong.register(mi, str(mi.variant()))
         self.mi, self.count, self.depth = mi, len(rays), path_depth
-        self.samples = samples if path_depth > 2 else 1
-        self._rays = np.repeat(np.ascontiguousarray(rays, dtype=np.float32), self.samples, axis=0)
+        self.samples = samples
+        self._rays = np.ascontiguousarray(rays, dtype=np.float32)
         # Lobe and base of unit strength: what they are scaled by is differentiated outside of the BSDF.
         self._bsdf = mi.load_dict(
             {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
@@ -76,32 +80,65 @@ class PatchRenderer:
         intensity : ndarray, shape (m,)
         derivatives : ndarray, shape (m, p)
         """
-        import drjit as dr
-
-        mi, columns = self.mi, int(sum(kept))
-        lanes = len(self._rays)
+        mi, columns, lanes = self.mi, int(sum(kept)), len(self._rays)
         # A copy of all pixels for each parameter.
         rays = mi.Vector3f(np.tile(self._rays.T, (1, columns)))
-        which = dr.arange(mi.UInt32, lanes * columns) // mi.UInt32(self._opaque(lanes, mi.UInt32))
+        which = self._lanes(lanes * columns) // self._opaque(lanes, mi.UInt32)
+        direct = _Surface(self, patch, self._parameters(patch, kept, which)).radiance(rays)
+        image, slopes = (values.reshape(columns, lanes) for values in self._evaluated(direct))
+        intensity, J = image[0], slopes.T
+        if self.depth > 2:
+            intensity, J = self._with_bounces(patch, kept, intensity, J)
+        # Mitsuba's calls of any BSDF trace all that exist: this one must not hold the copies on.
+        self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
+        return intensity, J
+
+    def _with_bounces(
+        self, patch: "RenderedQuadric", kept: list[bool], intensity: Array, J: Array
+    ) -> tuple[Array, Array]:
+        """Add what the patch sends back to itself, and its derivatives by log scale and base.
+
+        By place and shape it is not differentiated: its paths are drawn, and light that a concave patch gathers makes
+        their derivatives noise, while the intensities themselves hardly move.
+        """
+        rays = self.mi.Vector3f(np.ascontiguousarray(np.repeat(self._rays, self.samples, axis=0).T))
+        by_base = [False] * (len(kept) - 1) + [kept[-1]]
+        surface = _Surface(self, patch, self._parameters(patch, by_base, self.mi.UInt32(0)))
+        added = self._bounced(surface, rays)
+        value, slope = (v.reshape(self.count, self.samples).mean(axis=1) for v in self._evaluated(added))
+        J = J.copy()
+        J[:, LOG_SCALE] += value
+        if kept[-1]:
+            J[:, -1] += slope
+        return intensity + value, J
+
+    def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
+        """Give the eight parameters; of those that are kept, each moves in the lanes of its own number."""
+        import drjit as dr
+
+        mi, made, place = self.mi, [], 0
         values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.log_exponent, patch.base]
-        parameters, place = [], 0
         for value, is_kept in zip(values, kept, strict=True):
-            parameter = dr.zeros(mi.Float, lanes * columns) + self._opaque(value)
+            parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
             if is_kept:
                 dr.enable_grad(parameter)
                 dr.set_grad(parameter, dr.select(which == place, mi.Float(1), mi.Float(0)))
                 place += 1
-            parameters.append(parameter)
-        surface = _Surface(self, patch, parameters)
-        total = self._paths(surface, rays)
-        # Mitsuba's calls of any BSDF trace all that exist: this one must not hold the copies on.
-        self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
-        slope = dr.forward_to(total)
-        dr.eval(total, slope)
-        image, slopes = (
-            np.array(v, dtype=np.float64).reshape(columns, self.count, -1).mean(axis=2) for v in (total, slope)
-        )
-        return image[0], slopes.T
+            made.append(parameter)
+        return made
+
+    def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
+        """Give the values of all lanes and their derivatives by whatever moves in each."""
+        import drjit as dr
+
+        slope = dr.forward_to(radiance) if dr.grad_enabled(radiance) else dr.zeros(type(radiance), dr.width(radiance))
+        dr.eval(radiance, slope)
+        return np.array(radiance, dtype=np.float64), np.array(slope, dtype=np.float64)
+
+    def _lanes(self, width: int) -> Any:
+        import drjit as dr
+
+        return dr.arange(self.mi.UInt32, width)
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Give a value that the kernel reads, and that does not compile it anew."""
@@ -111,18 +148,17 @@ class PatchRenderer:
         dr.make_opaque(held)
         return held
 
-    def _paths(self, surface: "_Surface", rays: Any) -> Any:
-        """Give the radiance along rays from the camera."""
+    def _bounced(self, surface: "_Surface", rays: Any) -> Any:
+        """Give the radiance along rays from the camera that took more than one bounce."""
         import drjit as dr
 
         mi = self.mi
         si = surface.first_hit(rays)
-        radiance, weight = surface.direct(si), mi.Float(1)
+        radiance, weight = mi.Float(0), mi.Float(1)
         for bounce in range(self.depth - 2):
             first, second = self._numbers(bounce, dr.width(rays))
-            context = mi.BSDFContext()
             local, density = surface.sample(si, first, second)
-            weight *= dr.select(density > 0, surface.reflected(context, si, local) / dr.maximum(density, 1e-6), 0)
+            weight *= dr.select(density > 0, surface.reflected(si, local) / dr.maximum(density, 1e-6), 0)
             si, reached = surface.next_hit(si, si.to_world(local))
             radiance += dr.select(reached, weight * surface.direct(si, lit=surface.is_seen(si)), 0)
             weight = dr.select(reached, weight, 0)
@@ -132,14 +168,11 @@ class PatchRenderer:
         """Give the random numbers of a bounce: of each path its own, the same at every evaluation."""
         import drjit as dr
 
-        mi = self.mi
-        lane = dr.arange(mi.UInt32, width)
-        number = mi.Float(lane % mi.UInt32(self._opaque(self.samples, mi.UInt32)))
+        mi, lane, samples = self.mi, self._lanes(width), self._opaque(self.samples, self.mi.UInt32)
+        number = mi.Float(lane % samples)
         # Each pixel shifts the sequence by an amount of its own.
-        pixel = (lane % mi.UInt32(self._opaque(len(self._rays), mi.UInt32))) // mi.UInt32(
-            self._opaque(self.samples, mi.UInt32)
-        )
-        shift = [mi.Float(mi.sample_tea_32(pixel, 2 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
+        pixel = lane // samples
+        shift = [mi.Float(mi.sample_tea_32(pixel, 3 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
         u, v = (number * step + offset for step, offset in zip(GOLDEN, shift[:2], strict=True))
         w = (number + shift[2]) / self._opaque(float(self.samples))
         return w - dr.floor(w), mi.Point2f(u - dr.floor(u), v - dr.floor(v))
@@ -178,6 +211,12 @@ class _Surface:
         bsdf = renderer._bsdf
         bsdf.exponent = dr.exp(log_exponent)
         self.material = Material(bsdf, None)
+
+    def radiance(self, rays: Any) -> Any:
+        """Give the radiance along rays from the camera that comes straight from the lights."""
+        import drjit as dr
+
+        return self.direct(self.first_hit(rays)) * dr.exp(self.log_scale)
 
     def local(self, vector: Any) -> tuple[Any, Any, Any]:
         """Give a vector's parts along e, f and N."""
@@ -248,7 +287,7 @@ class _Surface:
             radiance += (dr.mean(lobe) + self.base * dr.mean(base)) / squared * self.distance**2
         return radiance
 
-    def reflected(self, context: Any, si: Any, local: Any) -> Any:
+    def reflected(self, si: Any, local: Any) -> Any:
         """Give f cos(theta) of lobe and base together."""
         import drjit as dr
 
