@@ -36,6 +36,14 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
     if patch.noise is None or isinstance(pose, Failure):
         return None
     spot = Spot(patch, camera, (isophote,), (pose,), ())
+    try:
+        return _region(spot)
+    except np.linalg.LinAlgError:
+        # Crossings that leave a parameter of the conic open.
+        return None
+
+
+def _region(spot: Spot) -> PoseRegion | None:
     conic, noise = spot.conic(0), spot.conic_covariance(0)
     shrink = np.append(np.zeros(2), -spot.widening()[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)
@@ -47,7 +55,8 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         # Without noise there is no region, but its two members.
         return None
-    return PoseRegion(np.concatenate([spot.basis, spot.axis[None]]), _conic(own), covariance)
+    region = PoseRegion(np.concatenate([spot.basis, spot.axis[None]]), _conic(own), covariance)
+    return region if np.isfinite(region.statistic(spot.poses[0].normals)).all() else None
 
 
 def _ellipse(conic: Array) -> Array:
