@@ -20,6 +20,7 @@ from simtest.geometry import (
 )
 from simtest.geometry.ellipse_fit import MIN_POINTS
 from simtest.geometry.fitting_planes import FORWARD, fitting_planes
+from simtest.geometry.pose_region import PoseRegion
 
 Array = npt.NDArray[np.float64]
 
@@ -112,6 +113,8 @@ class Estimate:
         Warnings.
     curvature : EstimatedCurvature, optional
         What the estimator says of the surface's curvature.
+    region : PoseRegion, optional
+        The normals that the data allow, where they are no ellipse about the proposed one: in place of a covariance.
     """
 
     normal: Array
@@ -123,6 +126,7 @@ class Estimate:
     covariance: Array | None = None
     flags: tuple[str, ...] = field(default=())
     curvature: EstimatedCurvature | None = None
+    region: PoseRegion | None = None
 
     def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
         """Give the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""

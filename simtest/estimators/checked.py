@@ -81,6 +81,8 @@ def _problem(estimate: Estimate, patch: Patch, camera: Camera) -> Failure | None
     for name, number in (("axis_ratio", estimate.axis_ratio), ("choice_margin", estimate.choice_margin)):
         if number is not None and not np.isfinite(number):
             return Failure(Reason.NOT_FINITE, f"{name} is {number}")
+    if estimate.region is not None and not np.isfinite(estimate.region.statistic(estimate.candidates)).all():
+        return Failure(Reason.NOT_FINITE, "region: the statistic of a candidate is not finite")
     lengths = np.linalg.norm(np.concatenate([estimate.normal[None], estimate.candidates]), axis=1)
     if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
         return Failure(Reason.ESTIMATOR_ERROR, f"normal or candidate of length {lengths.max():g}: must be unit vectors")

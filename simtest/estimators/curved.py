@@ -96,7 +96,7 @@ def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool
         ratio = float(np.sqrt(stiffness[0] / stiffness[1]))
         hypotheses, smallest, least = None, ratio, STREAK_RATIO
     else:
-        hypotheses = _hypotheses(stiffness, lobe)
+        hypotheses = sign_hypotheses(stiffness, lobe)
         smallest, larger = np.sort(np.abs(hypotheses[0]))
         ratio, least = float(smallest / larger), STREAK_GAIN
     if smallest < least:
@@ -123,7 +123,7 @@ ROUND_SHARE = 3.0
 """Squared difference of the moments over its noise: -ln 0.05, which 5 % of round spots exceed."""
 
 
-def _hypotheses(stiffness: Array, lobe: float) -> Array:
+def sign_hypotheses(stiffness: Array, lobe: float) -> Array:
     """List (1 + d k) along both directions for all signs, the least curved surface first, shape (4, 2)."""
     positive = gain_of_stiffness(stiffness, lobe)
     pairs = [(m, -2 / lobe - m) for m in positive]

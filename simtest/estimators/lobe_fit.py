@@ -53,7 +53,9 @@ class LobeFit(Generic[Model]):
     chi2: float
 
 
-def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> LobeFit[Model] | None:
+def fit_lobe(
+    start: Model, observed: Array, clipped: Mask | None = None, rounding: float = 0.0
+) -> LobeFit[Model] | None:
     """Fit a model by Levenberg and Marquardt's method: maximum likelihood under white noise.
 
     Parameters
@@ -64,6 +66,8 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
         Intensities of the model's pixels.
     clipped : ndarray of bool, shape (m,), optional
         Pixels that say only that the intensity is at least what was observed: a model above it leaves no residual.
+    rounding : float
+        Relative error of the sum of squares by the model's rounding: a change by no more than that ends the fit.
 
     Returns
     -------
@@ -72,10 +76,10 @@ def fit_lobe(start: Model, observed: Array, clipped: Mask | None = None) -> Lobe
     """
     # A step too far leaves the range of numbers: it is then not taken.
     with np.errstate(all="ignore"):
-        return _descend(start, observed, clipped)
+        return _descend(start, observed, clipped, rounding)
 
 
-def _descend(start: Model, observed: Array, clipped: Mask | None) -> LobeFit[Model] | None:
+def _descend(start: Model, observed: Array, clipped: Mask | None, rounding: float) -> LobeFit[Model] | None:
     model, damping, power = start, FIRST_DAMPING, float(observed @ observed)
     residual, J = _residual(model, observed, clipped)
     chi2 = float(residual @ residual)
@@ -91,6 +95,8 @@ def _descend(start: Model, observed: Array, clipped: Mask | None) -> LobeFit[Mod
         trial = model.moved(step)
         next_residual, next_J = _residual(trial, observed, clipped)
         next_chi2 = float(next_residual @ next_residual)
+        if abs(next_chi2 - chi2) < rounding * chi2:
+            break
         if not (next_chi2 < chi2 and np.isfinite(next_J).all()):
             if damping > MOST_DAMPING:
                 # No step downhill is left: the minimum, to rounding.

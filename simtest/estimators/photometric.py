@@ -48,7 +48,7 @@ SAME_RAD = 1e-3
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class HighlightPixels:
     """Pixels that are fitted: their sightlines and intensities, and which are clipped."""
 
     rays: Array
@@ -56,11 +56,11 @@ class _Pixels:
     clipped: Mask | None
     noise: float | Array | None
 
-    def every(self, step: int) -> "_Pixels":
+    def every(self, step: int) -> "HighlightPixels":
         """Give every so many pixels."""
         clipped = None if self.clipped is None else self.clipped[::step]
         noise = self.noise[::step] if isinstance(self.noise, np.ndarray) else self.noise
-        return _Pixels(self.rays[::step], self.observed[::step], clipped, noise)
+        return HighlightPixels(self.rays[::step], self.observed[::step], clipped, noise)
 
 
 NOTHING_KNOWN = Known()
@@ -94,7 +94,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     spot = fit_spot(patch, camera, CONE_AXIS_ISOVALUES)
     if isinstance(spot, Failure):
         return spot
-    pixels = _pixels(patch, camera, cut=any(isophote.cut for isophote in spot.isophotes))
+    pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in spot.isophotes))
     if isinstance(pixels, Failure):
         return pixels
     fitted = fit_lobe(_quadric(spot, pixels.rays), pixels.observed, pixels.clipped)
@@ -143,7 +143,7 @@ def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = STAR
     start = _pose(patch, camera, start_isovalue)
     if isinstance(start, Failure):
         return start
-    pixels = _pixels(patch, camera)
+    pixels = highlight_pixels(patch, camera)
     if isinstance(pixels, Failure):
         return pixels
     foot = camera.unproject(patch.peak_px)
@@ -190,7 +190,7 @@ def _pose(patch: Patch, camera: Camera, isovalue: float) -> Estimate | Failure:
     return first
 
 
-def _pixels(patch: Patch, camera: Camera, cut: bool = False) -> _Pixels | Failure:
+def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> HighlightPixels | Failure:
     """Gather the pixels of the first region that closes; of a highlight that is cut, those that are seen."""
     closed = (t for t in REGIONS if not isinstance(patch.crossings(t), Failure))
     t = next(closed, CUT_REGION if cut else None)
@@ -207,7 +207,7 @@ def _pixels(patch: Patch, camera: Camera, cut: bool = False) -> _Pixels | Failur
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
     known = patch.noise
     noise = known[rows, columns][sound].astype(float) if isinstance(known, np.ndarray) else known
-    return _Pixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise)
+    return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise)
 
 
 def _quadric(spot: Spot, rays: Array) -> ColocatedQuadric:

@@ -142,8 +142,7 @@ class Spot:
     def _moments_at(self, shift: float) -> Array:
         """Give the moments with the levels moved by a shift."""
         levels = self.levels + shift
-        added = 2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1)
-        each = self._tangent_moments - added[:, None, None] * self._px2
+        each = self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2
         return np.asarray(np.einsum("k,kij->ij", _to_peak(levels) / (2 * levels), each))
 
     @cached_property
@@ -192,6 +191,32 @@ class Spot:
         pixels += [self._top.pixels, np.array([row * width + column])]
         flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
         return covariance_of(flat, np.concatenate(moves, axis=1), width, noise, self.patch.smoothing_px)
+
+    def conic(self, k: int) -> Array:
+        """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
+        return self._conics[k]
+
+    def conic_covariance(self, k: int) -> Array:
+        """Give its covariance by noise, shape (5, 5); the noise must be known."""
+        isophote, (column, row) = self.isophotes[k], self.patch.peak_pixel
+        width = self.patch.values.shape[1]
+        moved = self.patch.sensitivities(isophote.isovalue)
+        assert not isinstance(moved, Failure)
+        by_crossing = self._conic_by_crossing(k, moved.vertical)
+        by_peak = by_crossing @ moved.level * isophote.isovalue
+        flat = (moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel()
+        moves = np.column_stack([(by_crossing[:, :, None] * moved.weights).reshape(5, -1), by_peak])
+        noise = self.patch.noise
+        assert noise is not None
+        return covariance_of(np.append(flat, row * width + column), moves, width, noise, self.patch.smoothing_px)
+
+    def widening(self, k: int = 0) -> Array:
+        """Give what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
+        return self._added_px2(self.levels)[k] * self._px2
+
+    def _added_px2(self, levels: Array) -> Array:
+        """Give the same in px^2, for each level."""
+        return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @property
     def axis_covariance(self) -> Array | None:

@@ -10,6 +10,8 @@ from simtest.files import write_atomically
 from simtest.report import fineness, static, style, words
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.gallery import isophote_colour
+from simtest.report.laws.section import laws_section
+from simtest.report.pairs import pairs
 from simtest.report.paper.section import paper_section
 from simtest.report.run import Run, read_run
 from simtest.report.series import LineFigure, line_figures
@@ -68,6 +70,11 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
         sections["paper"] = published[0]
         sections["headline"].append(published[0]["headline"])
         charts |= published[1]
+    laws = laws_section(run, folder)
+    if laws:
+        sections["laws"] = laws[0]
+        sections["headline"].append(laws[0]["headline"])
+        charts |= laws[1]
     maps = heat_maps(run)[:_MAX_HEAT_MAPS]
     if maps:
         static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
@@ -86,6 +93,7 @@ def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[
     sections["coverage"] = coverage(run)
     if is_anatomical(run):
         sections["fineness"] = _fineness_section(folder, charts)
+    sections["pairs"] = pairs(run)
     paths = static.draw_gallery(run.gallery, colours, folder)
     sections["gallery"] = _gallery_section(run, paths)
     view = surface_3d(run)
@@ -169,7 +177,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters["degrees"] = style.degrees
+    environment.filters["degrees"], environment.filters["number"] = style.degrees, style.number
     content = run.experiments.get(run.experiment) or {}
     return environment.get_template("template.html.j2").render(
         experiment=run.experiment,
@@ -182,6 +190,8 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         surfaces=sections.get("surfaces"),
         coverage=sections["coverage"],
         fineness=sections.get("fineness"),
+        laws=sections.get("laws"),
+        pairs=sections["pairs"],
         gallery=sections["gallery"],
         gallery_total=run.gallery_total,
         first=_FIRST,

@@ -3,13 +3,18 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.resources import find
 from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
+
+LawName = Literal[
+    "circle_pose", "branch_point", "axis_ratio", "axis_ratio_seen", "offset", "bisector", "falloff", "look"
+]
+"""Error laws of docs/theory.md, section 4, that a page compares with what was measured."""
 
 
 class Uniform(Spec):
@@ -39,6 +44,9 @@ class Group(Spec):
     pool: tuple[dict[str, tuple[Any, ...]], ...] = ()
     random: dict[str, Uniform] = Field(default_factory=dict)
     realisations: int | None = Field(None, ge=1, le=10**6, description="default the experiment's")
+    laws: tuple[LawName, ...] = Field(
+        (), description="laws of docs/theory.md, section 4, that the page holds against what these settings measure"
+    )
     isolated: bool = Field(
         True,
         description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V",

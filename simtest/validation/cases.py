@@ -44,6 +44,8 @@ class Case:
         Name or path of the base scene, as the experiment gives it.
     settings : dict
         Value by key path of all that differs from the base scene, drawn values apart.
+    laws : tuple of str
+        Names of the laws that the page holds against the setting.
     """
 
     label: str
@@ -57,6 +59,7 @@ class Case:
     isolated: bool
     source: str
     settings: dict[str, Any]
+    laws: tuple[str, ...] = ()
 
     @property
     def is_paper(self) -> bool:
@@ -179,10 +182,13 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}
             settings = {**group.set, **values}
-            random, isolated = dict(group.random), group.isolated
+            random, source = dict(group.random), group.scene
             cases.append(
-                Case(label, setting, part, columns, data, str(path), random, count, isolated, group.scene, settings)
-            )
+                Case(
+                    label, setting, part, columns, data, str(path), random, count, group.isolated, source, settings,
+                    group.laws,
+                )
+            )  # fmt: skip
     return cases
 
 

@@ -7,6 +7,8 @@ half-axes are tangents of the half-angles of the back-projected cone.
 import numpy as np
 import numpy.typing as npt
 
+from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
+
 Array = npt.NDArray[np.float64]
 
 
@@ -75,6 +77,95 @@ def isophote_half_axes(
 
     first, second = half_axis(kd_min), half_axis(kd_max)
     return np.maximum(first, second), np.minimum(first, second)
+
+
+def isophote_half_width(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, kd: npt.ArrayLike) -> Array:
+    """Give the half-width of a Phong isophote across a circle, at any isovalue (section 3, item 3).
+
+    Light and camera are at one place. With w the image angle and m = 1 + d k, the law of sines gives
+    sin(theta) = abs(m) sin(w) for the angle theta between normal and view, and
+    r = (m + 1) / (m cos(w) + cos(theta)) for the distance over d, so that
+
+        log t = n log(1 - 2 m^2 sin^2 w) - 2 log r,
+
+    which `isophote_half_axes` holds to second order.
+
+    Parameters
+    ----------
+    isovalue : array_like
+        t in (0, 1).
+    exponent : array_like
+        n.
+    kd : array_like
+        d times the curvature of the principal section.
+
+    Returns
+    -------
+    ndarray
+        Tangent of the half-angle; inf where the isophote does not close.
+    """
+    t, n, m = np.broadcast_arrays(*(np.asarray(v, float) for v in (isovalue, exponent, 1 + np.asarray(kd, float))))
+
+    def excess(squared_sine: Array) -> Array:
+        """Log radiance over t; falls from above 0."""
+        cosine, normal = np.sqrt(1 - squared_sine), np.sqrt(1 - m**2 * squared_sine)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Each form where it has no cancellation.
+            reach = np.where(m < 0, (m * cosine - normal) / (m - 1), (m + 1) / (m * cosine + normal))
+            return np.asarray(n * np.log1p(-2 * m**2 * squared_sine) - 2 * np.log(reach) - np.log(t))
+
+    with np.errstate(divide="ignore"):
+        high = np.minimum(1.0, 1 / (2 * m**2)) * (1 - 1e-12)
+    open_ended, low = ~(excess(high) < 0), np.zeros_like(high)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        above = excess(middle) > 0
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return np.where(open_ended, np.inf, np.sqrt(low / (1 - low)))
+
+
+_BISECTIONS = 60
+"""Halvings that leave nothing of an interval but rounding."""
+
+
+def axis_ratio_seen(
+    isovalue: npt.ArrayLike,
+    exponent: npt.ArrayLike,
+    kd_min: npt.ArrayLike,
+    kd_max: npt.ArrayLike,
+    smoothing_px: npt.ArrayLike = 0.0,
+    pixel: npt.ArrayLike = 0.0,
+) -> Array:
+    """Give the axis ratio of an isophote as it is traced: `axis_ratio` with its corrections (section 3, item 3).
+
+    Falloff and finite isovalue are those of `isophote_half_width`. Smoothing by s and the linear interpolation between
+    pixels widen both squared half-axes alike (section 4, smoothing): by -2 ln t s^2 + (-2 ln t - 1) v, v = 1/6 px^2.
+
+    Parameters
+    ----------
+    isovalue : array_like
+        t in (0, 1).
+    exponent : array_like
+        n of a Phong lobe.
+    kd_min, kd_max : array_like
+        d times the principal curvatures.
+    smoothing_px : array_like
+        s, px.
+    pixel : array_like
+        Angle of a pixel at the BP, rad; 0: a picture without pixels.
+
+    Returns
+    -------
+    ndarray
+        In (0, 1]; NaN where the isophote does not close.
+    """
+    level = -2 * np.log(np.asarray(isovalue, float))
+    s2 = np.asarray(smoothing_px, float) ** 2
+    added = (level * s2 + (level - 1) * LINEAR_INTERPOLATION_PX2) * np.asarray(pixel, float) ** 2
+    first, second = (isophote_half_width(isovalue, exponent, kd) ** 2 + added for kd in (kd_min, kd_max))
+    smaller, larger = np.minimum(first, second), np.maximum(first, second)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(larger), np.sqrt(smaller / larger), np.nan)
 
 
 def circle_pose_error(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:

@@ -13,11 +13,9 @@ from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.rendering import Session, TrueHighlight
 from simtest.rendering.frames import Array
-from simtest.spec.profile import CosineProfile
-from simtest.spec.reflectance import PhongReflectance
-from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.validation import laws
+from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, law_deg, look_law_deg
 from simtest.validation.truth import JudgedHighlight
 
 SCHEMA: dict[str, pl.DataType] = {
@@ -35,16 +33,11 @@ SCHEMA: dict[str, pl.DataType] = {
     "isovalues": pl.String(), "axis_ratio": pl.Float64(), "axis_ratio_law": pl.Float64(), "path_depth": pl.Int64(),
     "n_lights": pl.Int64(), "saturated_share": pl.Float64(), "gain_1": pl.Float64(), "gain_2": pl.Float64(),
     "gain_error": pl.Float64(), "gain_oracle_error": pl.Float64(), "direction_error_deg": pl.Float64(),
+    "axis_ratio_seen_law": pl.Float64(), "error_look_law_deg": pl.Float64(), "laws": pl.String(),
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
 
 MISSED = "missed"
-
-SAME_DEG = 1e-4
-"""Directions that differ by less are the same but for rounding."""
-
-EQUAL_KD = 1e-3
-"""Principal curvatures times distance that differ by less are those of a plane or a sphere."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +155,11 @@ def _result(
     gains = None if result.curvature is None else result.curvature.gains
     if gains is not None:
         row |= {"gain_1": float(gains[0]), "gain_2": float(gains[1])}
-    return row if truth is None else row | _errors(context, result, truth)
+    if truth is None:
+        return row
+    smoothing = 0.0 if isinstance(specularity.patch, Failure) else specularity.patch.smoothing_px
+    row["axis_ratio_seen_law"] = axis_ratio_seen(context.scene, result, truth, smoothing)
+    return row | _errors(context, result, truth)
 
 
 def _errors(context: RowContext, estimate: Estimate, truth: JudgedHighlight) -> dict[str, Any]:
@@ -174,6 +171,7 @@ def _errors(context: RowContext, estimate: Estimate, truth: JudgedHighlight) -> 
         "error_oracle_deg": float(to_truth.min()),
         "error_look_deg": float(angle_deg(estimate.normal, look.normal[0])) if seen and look is not None else None,
         "error_law_deg": law_deg(context.scene, estimate, truth),
+        "error_look_law_deg": look_law_deg(context.scene, estimate, truth),
         "rank_correct": int(to_truth.argmin()),
         "mahalanobis2": mahalanobis2(estimate, truth.highlight.normal),
         **curvature_errors(estimate, truth.highlight),
@@ -215,77 +213,16 @@ def curvature_errors(estimate: Estimate, true: TrueHighlight) -> dict[str, float
 
 
 def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
-    """Give the squared Mahalanobis distance of the true normal, unit, shape (3,); None without a usable covariance."""
+    """Give the squared Mahalanobis distance of the true normal, unit, shape (3,), by the region or the covariance.
+
+    Both are chi-squared with two degrees of freedom where the estimate's uncertainty is right; None without either.
+    """
+    if estimate.region is not None:
+        return float(estimate.region.statistic(truth))
     if estimate.covariance is None or np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
         return None
     miss = tangent_coordinates(estimate.normal, truth)
     return float(miss @ np.linalg.solve(estimate.covariance, miss))
-
-
-def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
-    """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
-
-    With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
-    vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
-    camera for those that take the reversed sightline for the normal.
-    """
-    highlight = truth.highlight
-    light = scene.rig.true_mm()[highlight.light]
-    offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
-    if power is None or (offset and power > 0):
-        return None
-    if len(estimate.candidates) == 1:
-        if offset:
-            if not _reverses_sightline(scene, estimate):
-                return None
-            return float(np.degrees(laws.bisector_angle(highlight.position, light)))
-        return _vignetting_law_deg(scene, estimate, truth, power) if power > 0 else None
-    if offset or power > 0 or len(estimate.isophotes) != 1:
-        return None
-    a, b = laws.isophote_half_axes(
-        estimate.isophotes[0].isovalue, lobe_curvature(scene), highlight.kd_min, highlight.kd_max
-    )
-    error = float(np.degrees(laws.circle_pose_error(a, b)))
-    return error if np.isfinite(error) else None
-
-
-def unknown_falloff(scene: Scene, light: int) -> float | None:
-    """Give k of the falloff cos^k about the optical axis that reconstruction is not told; None for another form."""
-    sensor, emitter = scene.sensor, scene.rig.lights[light]
-    parts = [] if sensor.vignetting_known else [sensor.vignetting]
-    if scene.rig.known_emission() is None and not emitter.is_isotropic:
-        if (profile := emitter.profile_of_view) is None:
-            return None
-        parts.append(profile)
-    powers = [part.power if isinstance(part, CosineProfile) else None for part in parts]
-    return None if None in powers else float(sum(power for power in powers if power))
-
-
-def _reverses_sightline(scene: Scene, estimate: Estimate) -> bool:
-    """Tell whether the proposed normal is the reversed sightline that the estimate looks along."""
-    if not np.isfinite(estimate.look_px).all():
-        return False
-    sightline = scene.camera.model().unproject(estimate.look_px)
-    return bool(angle_deg(estimate.normal, -sightline) < SAME_DEG)
-
-
-def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight, power: float) -> float | None:
-    """Give the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
-    highlight = truth.highlight
-    if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
-        return None
-    off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
-    isovalues = [isophote.isovalue for isophote in estimate.isophotes] or [1.0]
-    shifts = laws.vignetting_shift(off_axis, power, lobe_curvature(scene), highlight.kd_min, isovalues)
-    return float(np.degrees(shifts.mean())) if np.isfinite(shifts).all() else None
-
-
-def lobe_curvature(scene: Scene) -> float:
-    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form."""
-    reflectance = scene.reflectance
-    if isinstance(reflectance, PhongReflectance):
-        return reflectance.lobe_curvature
-    return 1e6
 
 
 def table(made: list[dict[str, Any]], swept: dict[str, Any]) -> pl.DataFrame:

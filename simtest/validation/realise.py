@@ -184,6 +184,7 @@ def realise(
         "setting": case.setting,
         "realisation": number,
         "seed": seed,
+        "laws": ",".join(case.laws) or None,
         **case.swept,
         **drawn,
     }

@@ -67,9 +67,15 @@ def _or_none(statistic: Any, values: np.ndarray) -> float | None:
 
 
 def mean_interval(values: np.ndarray) -> tuple[float | None, float | None]:
-    """Give Student's 95 % interval of the mean; None with fewer than two values."""
+    """Give Student's 95 % interval of the mean of angles; None with fewer than two values."""
+    low, high = student_interval(values)
+    # An angle is not negative, nor is its mean.
+    return None if low is None else max(low, 0.0), high
+
+
+def student_interval(values: np.ndarray) -> tuple[float | None, float | None]:
+    """Give Student's 95 % interval of the mean, such as of paired differences; None with fewer than two values."""
     if len(values) < 2:
         return None, None
     half = stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    # An angle is not negative, nor is its mean.
-    return max(float(np.mean(values) - half), 0.0), float(np.mean(values) + half)
+    return float(np.mean(values) - half), float(np.mean(values) + half)

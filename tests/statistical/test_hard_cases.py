@@ -14,11 +14,12 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, ViewMask
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_scene, scene_from_dict
 from simtest.validation.matching import match
-from simtest.validation.metrics import angle_deg, mahalanobis2
+from simtest.validation.metrics import mahalanobis2
 from simtest.validation.realise import view
 
 D = 10.0

@@ -155,7 +155,7 @@ def test_what_is_no_file(tmp_path, load):
     refused(lambda: load(pipe), f"{pipe}: ", "no such file" if load in NAMED else "is no plain file")
 
 
-NAMED = {load_scene: "anatomy, cylinder, plane", load_experiment: "anatomy, camera, colon, curvature"}
+NAMED = {load_scene: "anatomy, cylinder, plane", load_experiment: "anatomy, camera, colon, compare, curvature"}
 
 
 @pytest.mark.parametrize("load", NAMED)

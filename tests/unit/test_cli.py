@@ -133,7 +133,7 @@ BAD_USE = {
     "dataset preview nowhere": "nowhere: no dataset to read (manifest.json: missing)",
     "doctor extra": "Unused Tokens: ['extra']",
     "validate": 'Command "validate" parameter EXPERIMENT requires an argument',
-    "validate plain": "plain: no such file; shipped by name: anatomy, anatomy_sensor, camera, colon, curvature",
+    "validate plain": "plain: no such file; shipped by name: anatomy, anatomy_sensor, camera, colon, compare",
     "validate overview --realisations many": "Invalid value for --realisations: many is not a whole number",
     "validate overview --realisations 0": "with replaced values: realisations = 0: must be greater than or equal to 1",
     "validate overview --seed -1": "overview.toml with replaced values: seed = -1: must be greater than or equal to 0",

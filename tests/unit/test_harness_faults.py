@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -127,7 +126,8 @@ def test_mahalanobis_distance_is_that_of_the_tangent_plane():
     estimate = Estimate(normal, normal[None], np.zeros(2), covariance=covariance)
     assert mahalanobis2(estimate, truth) == pytest.approx(1 + 4, rel=5e-3)
     assert mahalanobis2(Estimate(normal, normal[None], np.zeros(2)), truth) is None
-    assert mahalanobis2(SimpleNamespace(normal=normal, covariance=np.zeros((2, 2))), truth) is None
+    singular = Estimate(normal, normal[None], np.zeros(2), covariance=np.zeros((2, 2)))
+    assert mahalanobis2(singular, truth) is None
 
 
 def test_a_cylinder_seen_along_its_axis_from_inside_is_allowed():

@@ -215,3 +215,35 @@ def test_renders_follow_the_law_of_the_light_offset(measure, eps):
             error = error_deg(estimates[name], highlight)
             assert within(error, OFFSETS[eps])
             assert error == pytest.approx(exact, rel=0.025)
+
+
+# Corrections of the axis ratio ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kd", [0.0, 0.5, 3.0, -0.3, -0.8, -1.0 - 1e-9, -1.8, -2.0, -3.5])
+@pytest.mark.parametrize("t", [0.3, 0.5, 0.9])
+def test_half_widths_are_where_the_radiance_falls_to_the_isovalue(kd, t):
+    """By the law of sines against the intersection of line and circle."""
+    n = 50
+    width = laws.isophote_half_width(t, n, kd)
+    if np.isfinite(width):
+        assert phong_profile(float(np.arctan(width)), kd, n) == pytest.approx(t, rel=1e-6)
+    else:
+        angles = np.linspace(0, 1.5, 200)
+        assert all(phong_profile(float(w), kd, n) > t for w in angles)
+
+
+def test_half_widths_go_to_those_of_second_order():
+    kd = np.array([-0.7, 0.0, 2.0])
+    exact = laws.isophote_half_width(0.999, 50, kd)
+    np.testing.assert_allclose(exact, laws.isophote_half_axes(0.999, C_PHONG, kd, kd)[0], rtol=2e-3)
+
+
+def test_corrections_of_the_axis_ratio_are_those_of_theory():
+    """Section 3, item 3: smoothing +2 % at R/d = 0.5 and +4 % at k d = 3; finite isovalue and falloff at -0.8."""
+    seen = [laws.axis_ratio_seen(t, 50, 0, [2.0, 3.0], 2.0, 1 / 406) for t in (0.3, 0.4, 0.5, 0.6, 0.7)]
+    np.testing.assert_allclose(np.mean(seen, axis=0) * [3, 4] - 1, [0.0195, 0.0365], atol=2e-3)
+    assert laws.axis_ratio_seen(0.5, 50, -0.8, 0) / 0.2 - 1 == pytest.approx(-0.06, abs=0.005)
+    assert laws.axis_ratio_seen(0.5, 50, -0.3, -0.3) == 1
+    assert laws.axis_ratio_seen(0.9999, 5000, -0.5, 1) == pytest.approx(0.25, rel=1e-3)
+    assert np.isnan(laws.axis_ratio_seen(0.3, 2, -0.95, 0))

@@ -17,7 +17,7 @@ from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
-from simtest.validation.metrics import unknown_falloff
+from simtest.validation.predicted import unknown_falloff
 from simtest.validation.realise import view
 from simtest.validation.runner import run_experiment
 

@@ -1,0 +1,1 @@
+"""The error laws: what was measured against what they predict."""

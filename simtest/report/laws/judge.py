@@ -1,0 +1,227 @@
+"""Which law is about which rows, and whether the measurements meet it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+import polars as pl
+
+from simtest.report.run import Run
+from simtest.report.series import TOLERANCE_DEG, TOLERANCE_SHARE
+from simtest.report.style import Array, degrees, number
+from simtest.spec.experiment import LawName
+from simtest.validation import laws
+
+MET, DEPARTS, ABSENT = "met", "departs", "not in this run"
+
+SLOPE = "branch_point_slope"
+BRANCH_SLOPE = 0.5
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law and where its two sides stand in the results.
+
+    Parameters
+    ----------
+    title, formula : str
+        In words and in signs.
+    estimator : str
+        Whose rows it is about.
+    measured, predicted : str
+        Columns; of `predicted` the branch point's is made from the row's own axis ratio.
+    is_angle : bool
+        Met within 0.3 deg or 3 %; else a ratio, met within 3 %.
+    """
+
+    title: str
+    formula: str
+    estimator: str
+    measured: str
+    predicted: str
+    is_angle: bool = True
+
+
+LAWS: dict[LawName, Law] = {
+    "circle_pose": Law(
+        "circle pose on a curved surface", "sin(error) = √((1 − (b/a)²) / (1 + b²))",
+        "circle_pose", "error_oracle_deg", "error_law_deg",
+    ),
+    "branch_point": Law(
+        "circle pose near its branch point", "error = √(2δ), δ = 1 − b/a",
+        "circle_pose", "error_oracle_deg", "branch_point_deg",
+    ),
+    "axis_ratio": Law(
+        "axis ratio", "b/a = |1 + d k|min / |1 + d k|max",
+        "cone_axis", "axis_ratio", "axis_ratio_law", False,
+    ),
+    "axis_ratio_seen": Law(
+        "axis ratio as it is seen", "with falloff, finite isovalue, smoothing and pixels",
+        "cone_axis", "axis_ratio", "axis_ratio_seen_law", False,
+    ),
+    "offset": Law(
+        "sightline under light offset", "error = half the angle between L and V, about atan(ε/d) / 2",
+        "cone_axis", "error_deg", "error_law_deg",
+    ),
+    "bisector": Law(
+        "bisector with a wrong distance", "difference of those angles at d and at d (1 + e)",
+        "bisector", "error_deg", "error_law_deg",
+    ),
+    "falloff": Law(
+        "vignetting or emission not known", "error = k tan φ / (c m² + 2 m + k + k tan² φ)",
+        "cone_axis", "error_deg", "error_law_deg",
+    ),
+    "look": Law(
+        "a miss, where the estimate looks", "error = |(I + d S) w|",
+        "brightest_point", "error_look_deg", "error_look_law_deg",
+    ),
+}  # fmt: skip
+assert set(LAWS) == set(get_args(LawName))
+
+
+@dataclass(frozen=True)
+class LawResult:
+    """What a run says about one law.
+
+    Parameters
+    ----------
+    name : str
+        Of `LAWS`, or `SLOPE`.
+    law : Law
+        The law.
+    settings : tuple of str
+        Those with a value.
+    measured, predicted : ndarray, shape (n,)
+        Means over each setting's realisations; deg or ratios.
+    rows, failed : int
+        Rows of the law's estimator, and those without a value on either side.
+    tolerance : ndarray, shape (n,)
+        What each setting may depart by.
+    """
+
+    name: str
+    law: Law
+    settings: tuple[str, ...]
+    measured: Array
+    predicted: Array
+    rows: int
+    failed: int
+    tolerance: Array
+
+    @property
+    def gap(self) -> Array:
+        """Measured less predicted."""
+        return self.measured - self.predicted
+
+    @property
+    def met(self) -> int:
+        """Settings within tolerance."""
+        return int((np.abs(self.gap) <= self.tolerance).sum())
+
+    @property
+    def verdict(self) -> str:
+        """Met only where every setting has a value and is within tolerance."""
+        if not self.settings:
+            return ABSENT
+        return MET if self.met == len(self.settings) and not self.failed else DEPARTS
+
+    def text(self, value: float) -> str:
+        """Write a value in the law's unit."""
+        return degrees(value) if self.law.is_angle else number(value)
+
+    @property
+    def cells(self) -> dict[str, str]:
+        """Texts of the table's cells."""
+        if not self.settings:
+            return dict.fromkeys(("range", "worst", "share", "where", "met"), "–")
+        share = np.abs(self.gap) / np.abs(self.predicted)
+        worst, most = int(np.abs(self.gap).argmax()), int(share.argmax())
+        met = f"{self.met} of {len(self.settings)}"
+        return {
+            "range": f"{self.text(self.predicted.min())} to {self.text(self.predicted.max())}",
+            "worst": self.text(float(self.gap[worst])),
+            "share": f"{number(100 * float(share[most]), 2)}\u00a0%",
+            "where": self.settings[most],
+            "met": met if not self.failed else f"{met}, {self.failed} of {self.rows} rows without a value",
+        }
+
+
+def law_results(run: Run) -> list[LawResult]:
+    """Judge each law on the settings that the experiment names for it.
+
+    Parameters
+    ----------
+    run : Run
+        A run directory.
+
+    Returns
+    -------
+    list of LawResult
+        In the order of `LAWS`; empty where the experiment names no law.
+    """
+    if "laws" not in run.results.columns or run.results["laws"].null_count() == run.results.height:
+        return []
+    ratio = run.results["axis_ratio"]
+    tilt = pl.Series(np.degrees(laws.branch_point_error(1 - ratio.to_numpy().astype(float))))
+    rows = run.results.with_columns(branch_point_deg=tilt, named=pl.col("laws").str.split(","))
+    results = []
+    for name, law in LAWS.items():
+        own = rows.filter(pl.col("named").list.contains(name) & (pl.col("estimator") == law.estimator))
+        results.append(_result(name, law, own))
+        if name == "branch_point" and (slope := _slope(own)):
+            results.append(slope)
+    return results
+
+
+def _result(name: str, law: Law, rows: pl.DataFrame) -> LawResult:
+    both = pl.col(law.measured).is_finite() & pl.col(law.predicted).is_finite() & (pl.col("status") == "ok")
+    kept = rows.filter(both.fill_null(False))
+    means = kept.group_by("setting", maintain_order=True).agg(
+        measured=pl.col(law.measured).mean(), predicted=pl.col(law.predicted).mean()
+    )
+    measured, predicted = (means[side].to_numpy().astype(float) for side in ("measured", "predicted"))
+    floor = TOLERANCE_DEG if law.is_angle else 0.0
+    tolerance = np.maximum(floor, TOLERANCE_SHARE * np.abs(predicted))
+    settings = tuple(str(setting) for setting in means["setting"])
+    return LawResult(name, law, settings, measured, predicted, rows.height, rows.height - kept.height, tolerance)
+
+
+def _slope(rows: pl.DataFrame) -> LawResult | None:
+    """Fit the slope of log error over log sigma; None with fewer than three noise levels."""
+    ok = rows.filter((pl.col("status") == "ok") & (pl.col("noise_sigma") > 0) & (pl.col("error_oracle_deg") > 0))
+    means = ok.group_by("noise_sigma").agg(pl.col("error_oracle_deg").mean()).sort("noise_sigma")
+    if means.height < 3:
+        return None
+    slope = np.polyfit(np.log(means["noise_sigma"].to_numpy()), np.log(means["error_oracle_deg"].to_numpy()), 1)[0]
+    # The errors' spread over the realisations; the noise levels are independent.
+    spread = ok.group_by("noise_sigma").agg(
+        share=pl.col("error_oracle_deg").std() / pl.col("error_oracle_deg").mean() / pl.len().sqrt()
+    )
+    place = np.log(means["noise_sigma"].to_numpy())
+    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((place - place.mean()) ** 2)))
+    law = Law(
+        "the same: slope of log error over log σ", f"1/2; here ± {number(error, 2)} by the errors' spread",
+        "circle_pose", "", "", False,
+    )  # fmt: skip
+    sigmas = f"σ = {means['noise_sigma'][0]:g} to {means['noise_sigma'][-1]:g}"
+    allowed = np.array([TOLERANCE_SHARE * BRANCH_SLOPE + 2 * error])
+    return LawResult(
+        SLOPE,
+        law,
+        (sigmas,),
+        np.array([slope]),
+        np.array([BRANCH_SLOPE]),
+        rows.height,
+        rows.height - ok.height,
+        allowed,
+    )
+
+
+def sentence(results: Sequence[LawResult]) -> str:
+    """Say how many laws are met."""
+    judged = [result for result in results if result.verdict != ABSENT]
+    met = sum(result.verdict == MET for result in judged)
+    departing = [result.law.title for result in judged if result.verdict != MET]
+    text = f"Of {len(judged)} error laws, {met} are met at every setting within 0.3° or 3 % (ratios: 3 %)"
+    return f"{text}; not everywhere: {'; '.join(departing)}." if departing else f"{text}."

@@ -1,0 +1,119 @@
+"""Estimators compared pair by pair on the same highlights."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from simtest.report.run import Run
+from simtest.report.style import estimator_order, number
+from simtest.validation.statistics import student_interval
+
+ALL = "all settings"
+
+KEYS = ("experiment", "setting", "realisation", "true_id")
+"""A true highlight of a frame."""
+
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two estimators over the highlights that both answered.
+
+    Parameters
+    ----------
+    label : str
+        Which curve's highlights, or `ALL`.
+    first, second : str
+        Names.
+    n : int
+        Highlights that both answered.
+    only_first, only_second : int
+        Those that one alone answered.
+    mean_first, mean_second : float or None
+        Mean errors over the n, deg.
+    difference : float or None
+        Mean of first less second, deg.
+    low, high : float or None
+        Its 95 % interval (Student's t); None with fewer than two.
+    first_better : int
+        Highlights where the first is nearer to the truth.
+    """
+
+    label: str
+    first: str
+    second: str
+    n: int
+    only_first: int
+    only_second: int
+    mean_first: float | None
+    mean_second: float | None
+    difference: float | None
+    low: float | None
+    high: float | None
+    first_better: int
+
+    @property
+    def better(self) -> str:
+        """The one whose error is smaller by more than chance; a dash where the interval holds 0."""
+        if self.low is None or self.high is None or self.low <= 0 <= self.high:
+            return NONE
+        return self.first if self.high < 0 else self.second
+
+    @property
+    def interval(self) -> str:
+        """The interval as text."""
+        return NONE if self.low is None else f"{number(self.low)} to {number(self.high)}"
+
+
+def pairs(run: Run) -> list[Pair]:
+    """Compare each two estimators by the errors of their proposed normals.
+
+    Parameters
+    ----------
+    run : Run
+        A run directory.
+
+    Returns
+    -------
+    list of Pair
+        Over all settings first, then label by label where there are several; empty for a single estimator.
+    """
+    true = run.results.filter(pl.col("true_id").is_not_null())
+    names = estimator_order(true["estimator"].drop_nulls().to_list())
+    if len(names) < 2:
+        return []
+    wide = _side_by_side(true, names)
+    labels = wide["label"].unique(maintain_order=True).to_list()
+    groups = [(ALL, wide)]
+    if len(labels) > 1:
+        groups += [(str(label), wide.filter(pl.col("label") == label)) for label in labels]
+    return [
+        _pair(label, first, second, part)
+        for label, part in groups
+        for first, second in itertools.combinations(names, 2)
+    ]
+
+
+def _side_by_side(true: pl.DataFrame, names: list[str]) -> pl.DataFrame:
+    """Give a row a true highlight with each estimator's error; null where it did not answer."""
+    error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
+    # A highlight may be found twice; the first detection counts for all estimators alike.
+    columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]
+    return true.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns)
+
+
+def _pair(label: str, first: str, second: str, wide: pl.DataFrame) -> Pair:
+    one, other = (wide[f"of {name}"] for name in (first, second))
+    answered = wide.filter(one.is_not_null() & other.is_not_null())
+    a, b = (answered[f"of {name}"].to_numpy().astype(float) for name in (first, second))
+    n = len(a)
+    low, high = student_interval(a - b)
+    return Pair(
+        label, first, second, n,
+        int((one.is_not_null() & other.is_null()).sum()), int((one.is_null() & other.is_not_null()).sum()),
+        float(a.mean()) if n else None, float(b.mean()) if n else None, float((a - b).mean()) if n else None,
+        low, high, int(np.sum(a < b)),
+    )  # fmt: skip

@@ -1,0 +1,161 @@
+"""What the laws of theory.md section 4 predict for an estimate at a true highlight."""
+
+import numpy as np
+
+from simtest.errors import Failure
+from simtest.estimators import Estimate
+from simtest.geometry.vectors import angle_deg
+from simtest.rendering import TrueHighlight
+from simtest.rendering.frames import Array
+from simtest.spec.profile import CosineProfile
+from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.rig import is_at_camera
+from simtest.spec.scene import Scene
+from simtest.validation import laws
+from simtest.validation.truth import JudgedHighlight
+
+SAME_DEG = 1e-4
+"""Directions that differ by less are the same but for rounding."""
+
+EQUAL_KD = 1e-3
+"""Principal curvatures times distance that differ by less are those of a plane or a sphere."""
+
+
+def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
+    """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
+
+    With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
+    vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
+    camera for those that take the reversed sightline for the normal; for others, which were told a distance, what its
+    error leaves.
+    """
+    highlight = truth.highlight
+    light = scene.rig.true_mm()[highlight.light]
+    offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
+    if power is None or (offset and power > 0):
+        return None
+    if len(estimate.candidates) == 1:
+        if offset:
+            return _offset_law_deg(scene, estimate, highlight, light)
+        return _vignetting_law_deg(scene, estimate, truth, power) if power > 0 else None
+    if offset or power > 0 or len(estimate.isophotes) != 1:
+        return None
+    a, b = laws.isophote_half_axes(
+        estimate.isophotes[0].isovalue, lobe_curvature(scene), highlight.kd_min, highlight.kd_max
+    )
+    error = float(np.degrees(laws.circle_pose_error(a, b)))
+    return error if np.isfinite(error) else None
+
+
+def unknown_falloff(scene: Scene, light: int) -> float | None:
+    """Give k of the falloff cos^k about the optical axis that reconstruction is not told; None for another form."""
+    sensor, emitter = scene.sensor, scene.rig.lights[light]
+    parts = [] if sensor.vignetting_known else [sensor.vignetting]
+    if scene.rig.known_emission() is None and not emitter.is_isotropic:
+        if (profile := emitter.profile_of_view) is None:
+            return None
+        parts.append(profile)
+    powers = [part.power if isinstance(part, CosineProfile) else None for part in parts]
+    return None if None in powers else float(sum(power for power in powers if power))
+
+
+def _reverses_sightline(scene: Scene, estimate: Estimate) -> bool:
+    """Tell whether the proposed normal is the reversed sightline that the estimate looks along."""
+    if not np.isfinite(estimate.look_px).all():
+        return False
+    sightline = scene.camera.model().unproject(estimate.look_px)
+    return bool(angle_deg(estimate.normal, -sightline) < SAME_DEG)
+
+
+def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight, power: float) -> float | None:
+    """Give the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
+    highlight = truth.highlight
+    if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
+        return None
+    off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
+    isovalues = [isophote.isovalue for isophote in estimate.isophotes] or [1.0]
+    shifts = laws.vignetting_shift(off_axis, power, lobe_curvature(scene), highlight.kd_min, isovalues)
+    return float(np.degrees(shifts.mean())) if np.isfinite(shifts).all() else None
+
+
+def lobe_curvature(scene: Scene) -> float:
+    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form."""
+    reflectance = scene.reflectance
+    if isinstance(reflectance, PhongReflectance):
+        return reflectance.lobe_curvature
+    return 1e6
+
+
+def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: TrueHighlight, light: Array) -> float | None:
+    """Give the law of one candidate with a light beside the camera, deg."""
+    if _reverses_sightline(scene, estimate):
+        return float(np.degrees(laws.bisector_angle(highlight.position, light)))
+    # Which light a highlight is ascribed to, and which distance a rig of several was told, is another matter.
+    told = scene.calibration(highlight.distance).known.distance_mm
+    if told is None or len(scene.rig.lights) > 1:
+        return None
+    return float(np.degrees(laws.bisector_residual(highlight.position, light, told / highlight.distance - 1)))
+
+
+def axis_ratio_seen(scene: Scene, estimate: Estimate, truth: JudgedHighlight, smoothing_px: float) -> float | None:
+    """Give the axis ratio that an estimate which takes the isophotes as they are should find; None for others.
+
+    For a Phong lobe without a base under a light at the camera, mean of the estimate's isovalues.
+    """
+    highlight, reflectance = truth.highlight, scene.reflectance
+    isovalues = [isophote.isovalue for isophote in estimate.isophotes]
+    pure = isinstance(reflectance, PhongReflectance) and not reflectance.normalised and reflectance.diffuse == 0
+    if (
+        not (pure and isovalues)
+        or not is_at_camera(scene.rig.true_mm()[highlight.light])
+        or not _takes_ratio_as_seen(estimate)
+    ):
+        return None
+    assert isinstance(reflectance, PhongReflectance)
+    seen = laws.axis_ratio_seen(
+        isovalues,
+        reflectance.exponent,
+        highlight.kd_min,
+        highlight.kd_max,
+        smoothing_px,
+        _pixel_angle(scene, highlight),
+    )
+    return float(seen.mean()) if np.isfinite(seen).all() else None
+
+
+def _takes_ratio_as_seen(estimate: Estimate) -> bool:
+    """Tell whether an estimate's axis ratio is that of its cones."""
+    poses = [isophote.pose() for isophote in estimate.isophotes]
+    ratios = [pose.axis_ratio for pose in poses if not isinstance(pose, Failure)]
+    return estimate.axis_ratio is not None and bool(np.isclose(np.mean(ratios), estimate.axis_ratio, atol=1e-9))
+
+
+def _pixel_angle(scene: Scene, highlight: TrueHighlight) -> float:
+    """Give the angle of a pixel at a BP, rad: the root of its solid angle."""
+    camera = scene.camera.model()
+    steps = np.array([[0.5, 0.0], [0.0, 0.5]])
+    ahead, behind = camera.unproject(highlight.bp_px + steps), camera.unproject(highlight.bp_px - steps)
+    return float(np.sqrt(np.linalg.norm(np.cross(*(ahead - behind)))))
+
+
+def look_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
+    """Give abs((I + dS) w) of an estimate's own miss w in the image, deg (theory.md section 4).
+
+    For estimates that take the reversed sightline for the normal under a light at the camera.
+    """
+    highlight = truth.highlight
+    at_camera = is_at_camera(scene.rig.true_mm()[highlight.light])
+    if not at_camera or not _reverses_sightline(scene, estimate):
+        return None
+    look = scene.camera.model().unproject(estimate.look_px)
+    sightline = highlight.position / np.linalg.norm(highlight.position)
+    across = look / (look @ sightline) - sightline
+    if highlight.direction_min is None:
+        if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
+            return None
+        miss = np.array([np.linalg.norm(across), 0.0])
+    else:
+        miss = np.array(
+            [across @ highlight.direction_min, across @ np.cross(highlight.normal, highlight.direction_min)]
+        )
+    return float(np.degrees(laws.look_error(miss, highlight.kd_min, highlight.kd_max)))

@@ -1,0 +1,219 @@
+"""The differentiated patch against the renderer and finite differences, and what is fitted with it."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from simtest.calibration import Calibration, Known
+from simtest.errors import Failure, Reason
+from simtest.estimators.checked import run
+from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.curved import curved
+from simtest.estimators.photometric import photometric
+from simtest.geometry.vectors import angle_deg, tangent_basis
+from simtest.inverse import inverse_rendering
+from simtest.inverse.patch import RenderedQuadric
+from simtest.inverse.render import PatchRenderer
+from simtest.reconstruction import reconstruct
+from simtest.rendering import Session
+from simtest.seeds import from_integer
+from simtest.spec import scene_from_dict
+from simtest.validation.metrics import curvature_errors, mahalanobis2
+
+pytestmark = pytest.mark.render
+
+D, N = 10.0, 50.0
+LOBE = Known(lobe_curvature=4 * N)
+
+SURFACES = {
+    "plane": {"type": "plane", "tilt_deg": 10.0, "azimuth_deg": 40.0},
+    "cylinder": {"type": "cylinder", "radius_mm": D, "tilt_deg": 3.0, "spin_deg": 20.0},
+    "tube": {"type": "cylinder", "radius_mm": 2 * D, "side": "inside", "tilt_deg": 3.0, "spin_deg": 20.0},
+    "ball": {"type": "sphere", "radius_mm": D, "tilt_deg": 3.0},
+    "saddle": {"type": "quadric", "k1_per_mm": 0.05, "k2_per_mm": -0.05, "spin_deg": 30.0},
+}
+
+
+@pytest.fixture(scope="module")
+def render():
+    """Give a function from a surface and more tables to session, radiance and true highlight."""
+    held = []
+
+    def make(surface, **tables):
+        camera = {"width": 300, "height": 300, "fx": 406.0, "fy": 406.0}
+        scene = scene_from_dict({"surface": {"distance_mm": D, **surface}, "camera": camera, **tables})
+        if held:
+            held[0].update(scene)
+        else:
+            held.append(Session(scene))
+        radiance = held[0].radiance()
+        return held[0], radiance, held[0].highlights(radiance)[0]
+
+    return make
+
+
+def frame_of(radiance, sigma, seed=0):
+    clean = radiance.total / radiance.total.max()
+    return (clean + sigma * from_integer(seed).standard_normal(clean.shape)).astype(np.float32)
+
+
+def answers(session, frame, known=LOBE, **estimators):
+    named = {name: lambda p, c, e=e: run(e, p, c, known) for name, e in estimators.items()}
+    (found,) = reconstruct(frame, Calibration(session.camera, known=known), named, isolated=False)
+    return found.estimates
+
+
+def model_at(highlight, rays, n=N, light=(0.0, 0, 0), depth=2, samples=1, base=0.0, opened=(True, True)):
+    """The patch at a true highlight."""
+    s = highlight.position / highlight.distance
+    first = highlight.direction_min
+    if first is None:
+        first = tangent_basis(highlight.normal[None])[0][0]
+    stretch = np.sqrt(n) * np.array([1 + highlight.kd_min, 0, 1 + highlight.kd_max])
+    light = np.array(light)
+    renderer = PatchRenderer(rays, depth, samples)
+    return RenderedQuadric(
+        renderer, s, first, highlight.distance, light, light[None], stretch, 0.0, float(np.log(n)), base, *opened
+    )
+
+
+def pixels_near(session, highlight, reach=45, step=5):
+    steps = np.arange(-reach, reach + 1, step)
+    centre = np.floor(highlight.bp_px)
+    places = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + centre
+    kept = ((places >= 0) & (places < 300)).all(axis=1)
+    return places[kept].astype(int), session.camera.unproject(places[kept] + 0.5)
+
+
+@pytest.mark.parametrize("name", ["plane", "saddle", "aside", "tube", "ball", "cylinder"])
+def test_intensities_are_the_renderers(render, name):
+    light = {"offset_mm": 2.0, "azimuth_deg": 70.0} if name == "aside" else {}
+    surface = SURFACES["saddle" if name == "aside" else name]
+    more = {"rig": {"lights": [light]}, "reflectance": {"type": "phong", "exponent": N, "diffuse": 0.3}}
+    session, radiance, highlight = render(surface, **more)
+    places, rays = pixels_near(session, highlight)
+    expected = radiance.total[places[:, 1], places[:, 0]]
+    place = session.scene.rig.true_mm()[0]
+    round_one = name in ("tube", "ball", "cylinder")
+    model = replace(model_at(highlight, rays, light=place, base=0.3), roundness=float(round_one))
+    intensity, _ = model.evaluate()
+    # With the light aside the BP is not the anchor: the patch is its own osculating paraboloid, close, not the same.
+    tolerance = 5e-3 if name == "aside" else 2e-4
+    np.testing.assert_allclose(
+        intensity / highlight.distance**2, expected, rtol=tolerance, atol=tolerance * expected.max()
+    )
+
+
+def test_derivatives_are_those_of_the_intensities(render):
+    more = {"rig": {"lights": [{"offset_mm": 1.0, "azimuth_deg": 20.0}]}}
+    session, _, highlight = render(SURFACES["saddle"], **more)
+    _, rays = pixels_near(session, highlight)
+    model = model_at(highlight, rays, light=session.scene.rig.true_mm()[0], base=0.2)
+    _, J = model.evaluate()
+    for column, size in enumerate((2e-3, 2e-3, 2e-2, 2e-2, 2e-2, 1e-2, 1e-2, 1e-2)):
+        step = np.zeros(8)
+        step[column] = size
+        numeric = (model.moved(step).evaluate()[0] - model.moved(-step).evaluate()[0]) / (2 * size)
+        assert np.abs(J[:, column] - numeric).max() < 0.01 * np.abs(numeric).max() + 1e-5
+
+
+def test_inter_reflections_are_the_renderers(render):
+    """A bowl with a bright base, within the sampling error, which the scatter of the pixels' ratios tells."""
+    bowl = {"type": "quadric", "k1_per_mm": -0.06, "k2_per_mm": -0.05}
+    more = {"reflectance": {"type": "phong", "exponent": N, "diffuse": 0.8}}
+    session, direct, highlight = render(bowl, **more)
+    places, rays = pixels_near(session, highlight, reach=60, step=4)
+    _, full, _ = render(bowl, render={"path_depth": 3, "samples_per_pixel": 24}, **more)
+    expected = (full.total - direct.total)[places[:, 1], places[:, 0]]
+    models = [model_at(highlight, rays, depth=depth, samples=64, base=0.8) for depth in (2, 3)]
+    made = (models[1].evaluate()[0] - models[0].evaluate()[0]) / D**2
+    gap, error = (made - expected).mean(), np.std(made - expected) / np.sqrt(len(made))
+    assert error < 0.03 * expected.mean()
+    assert abs(gap) < 4 * error
+    assert expected.mean() > 0.002 * direct.total.max()
+
+
+@pytest.mark.parametrize("name", list(SURFACES))
+def test_normal_and_curvatures_are_recovered(render, name):
+    session, radiance, highlight = render(SURFACES[name])
+    found = answers(session, frame_of(radiance, 0.02), inverse=inverse_rendering)["inverse"]
+    # 0.002 deg of noise at sigma 2 %; the gains to a fraction of a percent.
+    assert angle_deg(found.normal, highlight.normal) < 0.012
+    assert mahalanobis2(found, highlight.normal) < 14
+    errors = curvature_errors(found, highlight)
+    assert errors["gain_error"] < 0.01
+    if name not in ("plane", "ball"):
+        assert errors["direction_error_deg"] < 0.2
+    law = abs(1 + highlight.kd_min) / abs(1 + highlight.kd_max)
+    assert found.axis_ratio == pytest.approx(law, rel=0.015)
+
+
+def test_it_is_the_maximum_likelihood_estimate_that_photometric_is(render):
+    """On the frame of a quadric both find the same normal; the curvature is nearer than that of `curved`."""
+    session, radiance, highlight = render(SURFACES["saddle"])
+    without_base = partial(inverse_rendering, base=False)
+    ours, others, axes = [], [], []
+    for seed in range(3):
+        found = answers(
+            session, frame_of(radiance, 0.05, seed), inverse=without_base, photometric=photometric, curved=curved,
+            cone_axis=cone_axis,
+        )  # fmt: skip
+        assert angle_deg(found["inverse"].normal, found["photometric"].normal) < 0.006
+        ours.append(curvature_errors(found["inverse"], highlight)["gain_error"])
+        others.append(curvature_errors(found["curved"], highlight)["gain_error"])
+        axes.append(angle_deg(found["cone_axis"].normal, highlight.normal))
+        np.testing.assert_allclose(
+            np.sqrt(np.diag(found["inverse"].covariance)), np.sqrt(np.diag(found["photometric"].covariance)), rtol=0.15
+        )
+    assert np.mean(ours) < np.mean(others)
+    assert max(axes) < 0.05
+
+
+def test_a_known_light_beside_the_camera(render):
+    more = {"rig": {"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]}}
+    session, radiance, highlight = render(SURFACES["cylinder"], **more)
+    lights = tuple(map(tuple, session.scene.rig.true_mm().tolist()))
+    known = Known(lights, highlight.distance, 0.0, 4 * N)
+    found = answers(session, frame_of(radiance, 0.02), known, inverse=inverse_rendering)["inverse"]
+    assert angle_deg(found.normal, highlight.normal) < 0.02
+    assert curvature_errors(found, highlight)["gain_error"] < 0.01
+    unaware = answers(session, frame_of(radiance, 0.02), replace(known, lights_mm=()), inverse=inverse_rendering)
+    assert 2 < angle_deg(unaware["inverse"].normal, highlight.normal) < 4
+    vague = answers(session, frame_of(radiance, 0.02), replace(known, distance_sd_mm=1.0), inverse=inverse_rendering)
+    assert np.trace(vague["inverse"].covariance) > 100 * np.trace(found.covariance)
+
+
+def test_the_exponent_is_found_without_noise(render):
+    session, radiance, highlight = render(SURFACES["saddle"])
+    opened = partial(inverse_rendering, base=False, exponent=True)
+    found = answers(session, frame_of(radiance, 0.0), Known(), inverse=opened)["inverse"]
+    assert angle_deg(found.normal, highlight.normal) < 1e-3
+    gains = np.sort(np.abs(1 + np.array([highlight.kd_min, highlight.kd_max])))
+    assert found.axis_ratio == pytest.approx(gains[0] / gains[1], rel=5e-3)
+
+
+def test_another_highlight_compiles_nothing(render):
+    render(SURFACES["plane"])
+    # Not before the renderer has chosen its library.
+    import drjit as dr
+
+    for name, sigma in (("plane", 0.02), ("saddle", 0.02)):
+        session, radiance, _ = render(SURFACES[name])
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            answers(session, frame_of(radiance, sigma), inverse=inverse_rendering)
+            history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        assert history
+    assert all(kernel["cache_hit"] for kernel in history)
+
+
+def test_what_has_no_start_is_refused_with_its_reason(render):
+    session, _, _ = render(SURFACES["plane"])
+    flat = np.full((300, 300), 0.3, np.float32)
+    flat[100:200, 100:200] += 0.5
+    found = reconstruct(flat, Calibration(session.camera), {"inverse": inverse_rendering}, isolated=False)
+    for estimate in (specularity.estimates["inverse"] for specularity in found):
+        assert isinstance(estimate, Failure)
+        assert estimate.reason != Reason.ESTIMATOR_ERROR

@@ -1,0 +1,151 @@
+"""The page's section of error laws, and the table of pairs, on hand-made rows."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.errors import InputError
+from simtest.report.laws.judge import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
+from simtest.report.laws.section import laws_section
+from simtest.report.pairs import ALL, NONE, pairs
+from simtest.spec import load_experiment
+from simtest.validation import laws
+from simtest.validation.cases import expand
+
+SIDES = ("error_deg", "error_oracle_deg", "error_law_deg", "error_look_deg", "error_look_law_deg", "axis_ratio",
+         "axis_ratio_law", "axis_ratio_seen_law", "noise_sigma")  # fmt: skip
+
+
+def run_of(*rows):
+    blank = dict.fromkeys(SIDES) | {"status": "ok", "laws": None, "label": "a", "realisation": 0, "true_id": 0}
+    schema = dict.fromkeys(SIDES, pl.Float64) | {"laws": pl.String}
+    table = pl.DataFrame([{"experiment": "x", **blank, **row} for row in rows], schema_overrides=schema)
+    return SimpleNamespace(results=table)
+
+
+def offset(setting, error, law, **more):
+    return {
+        "estimator": "cone_axis",
+        "setting": setting,
+        "laws": "offset",
+        "error_deg": error,
+        "error_law_deg": law,
+    } | more
+
+
+def result(run, name="offset"):
+    return next(r for r in law_results(run) if r.name == name)
+
+
+def test_a_law_is_met_within_the_larger_of_both_tolerances_at_every_setting():
+    met = run_of(offset("s", 0.55, 0.3), offset("l", 20.5, 20.0))
+    assert (result(met).verdict, result(met).met) == (MET, 2)
+    for error, law in ((0.65, 0.3), (20.7, 20.0), (19.3, 20.0)):
+        departing = result(run_of(offset("s", 0.3, 0.3), offset("d", error, law)))
+        assert (departing.verdict, departing.met) == (DEPARTS, 1)
+    assert result(met, "look").verdict == ABSENT
+    assert "1 are met" in sentence(law_results(met))
+
+
+def test_a_row_without_a_value_is_a_departure():
+    rows = [offset("s", 0.3, 0.3), offset("f", None, None, status="no_closed_isophote")]
+    found = result(run_of(*rows))
+    assert (found.verdict, found.met, found.failed, found.rows) == (DEPARTS, 1, 1, 2)
+    assert "1 of 2 rows" in found.cells["met"]
+
+
+def test_ratios_have_no_floor_and_other_rows_do_not_count():
+    def ratio(measured, law):
+        return {
+            "estimator": "cone_axis",
+            "setting": "r",
+            "laws": "axis_ratio",
+            "axis_ratio": measured,
+            "axis_ratio_law": law,
+        }
+
+    assert result(run_of(ratio(0.205, 0.2)), "axis_ratio").verdict == MET
+    assert result(run_of(ratio(0.207, 0.2)), "axis_ratio").verdict == DEPARTS
+    stranger = ratio(0.9, 0.2) | {"estimator": "circle_pose"}
+    unnamed = ratio(0.9, 0.2) | {"laws": None}
+    assert result(run_of(ratio(0.2, 0.2), stranger, unnamed), "axis_ratio").met == 1
+
+
+def test_the_branch_point_is_held_against_the_rows_own_ratio_and_a_slope_of_half():
+    def rows(power):
+        made = []
+        for sigma in (0.01, 0.02, 0.04):
+            for i, scatter in enumerate((0.9, 1.0, 1.1)):
+                delta = 0.5 * (scatter * sigma**power) ** 2
+                error = float(np.degrees(laws.branch_point_error(delta)))
+                made.append(
+                    {"estimator": "circle_pose", "setting": f"{sigma}", "realisation": i, "laws": "branch_point",
+                     "noise_sigma": sigma, "axis_ratio": 1 - delta, "error_oracle_deg": error}
+                )  # fmt: skip
+        return run_of(*made)
+
+    for power, verdict in ((0.5, MET), (1.0, DEPARTS)):
+        assert result(rows(power), "branch_point").verdict == MET
+        slope = result(rows(power), SLOPE)
+        assert slope.verdict == verdict
+        assert slope.measured[0] == pytest.approx(power, abs=1e-6)
+
+
+def test_runs_that_name_no_law_have_no_section(tmp_path):
+    assert laws_section(run_of(offset("s", 0.3, 0.3, laws=None)), tmp_path) is None
+    section, charts = laws_section(run_of(offset("s", 0.3, 0.3)), tmp_path)
+    assert (tmp_path / "laws.png").is_file()
+    assert len(section["table"]) == len(LAWS)
+    assert set(charts) == {"laws_angles", "laws_departures"}
+
+
+def test_the_experiment_tests_every_law():
+    named = {name for case in expand(load_experiment("laws")) for name in case.laws}
+    assert named == set(LAWS)
+
+
+def test_an_unknown_law_is_refused(tmp_path):
+    path = tmp_path / "e.toml"
+    path.write_text('[[groups]]\nscene = "plane"\nlaws = ["gravity"]\n')
+    with pytest.raises(InputError, match="gravity"):
+        load_experiment(path)
+
+
+# Pairs ---------------------------------------------------------------------------------------------------------------
+
+
+def answer(name, error, realisation=0, status="ok", label="a", true_id=0):
+    return {"estimator": name, "setting": label, "label": label, "realisation": realisation, "true_id": true_id,
+            "status": status, "error_deg": error}  # fmt: skip
+
+
+def test_pairs_are_over_the_highlights_that_both_answered():
+    rows = [answer("cone_axis", e, i) for i, e in enumerate((1.0, 1.2, 0.9, 1.1))]
+    rows += [answer("curved", e, i) for i, e in enumerate((2.0, 2.2, 1.9, 2.2))]
+    rows += [answer("cone_axis", None, 4, "no_peak"), answer("curved", 9.0, 4)]
+    rows += [answer("cone_axis", 50.0, 5, true_id=None), answer("curved", 0.0, 5, true_id=None)]
+    (pair,) = pairs(run_of(*rows))
+    assert (pair.label, pair.first, pair.second) == (ALL, "cone_axis", "curved")
+    assert (pair.n, pair.only_first, pair.only_second, pair.first_better) == (4, 0, 1, 4)
+    assert pair.difference == pytest.approx(-1.025)
+    # Student's t with 3 degrees of freedom; the differences' standard deviation is 0.05.
+    assert (pair.low, pair.high) == pytest.approx((-1.025 - 3.1824 * 0.025, -1.025 + 3.1824 * 0.025), abs=1e-4)
+    assert pair.better == "cone_axis"
+
+
+def test_pairs_say_so_where_chance_may_decide():
+    rows = [answer("cone_axis", e, i) for i, e in enumerate((1.0, 2.0))]
+    rows += [answer("curved", e, i) for i, e in enumerate((2.0, 1.0))]
+    (pair,) = pairs(run_of(*rows))
+    assert (pair.difference, pair.better) == (0.0, NONE)
+    (single,) = pairs(run_of(rows[0], rows[2]))
+    assert (single.n, single.low, single.interval, single.better) == (1, None, NONE, NONE)
+
+
+def test_pairs_come_label_by_label_too():
+    rows = [answer(name, 1.0, label=label) for label in "ab" for name in ("cone_axis", "curved", "bisector")]
+    made = pairs(run_of(*rows))
+    assert [pair.label for pair in made] == [ALL] * 3 + ["a"] * 3 + ["b"] * 3
+    assert pairs(run_of(answer("curved", 1.0))) == []
