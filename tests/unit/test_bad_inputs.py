@@ -15,7 +15,7 @@ from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct
 from simtest.spec import load_camera, load_experiment, load_scene, parse_settings, scene_from_dict
 from simtest.spec.surface import AnatomySurface
-from simtest.validation import runner
+from simtest.validation import runner, work
 from simtest.validation.cases import expand
 
 
@@ -155,7 +155,7 @@ def test_what_is_no_file(tmp_path, load):
     refused(lambda: load(pipe), f"{pipe}: ", "no such file" if load in NAMED else "is no plain file")
 
 
-NAMED = {load_scene: "anatomy, cylinder, plane", load_experiment: "anatomy, camera, colon, compare, curvature"}
+NAMED = {load_scene: "anatomy, cylinder, plane", load_experiment: "anatomy, anatomy_sensor, camera, colon, compare"}
 
 
 @pytest.mark.parametrize("load", NAMED)
@@ -270,7 +270,7 @@ def no_rendering(monkeypatch):
     def touched(*_):
         pytest.fail("the renderer was used")
 
-    monkeypatch.setattr(runner, "Session", touched)
+    monkeypatch.setattr(work, "Session", touched)
     monkeypatch.setattr(runner.backend, "load", touched)
 
 
