@@ -130,7 +130,10 @@ def decode_octahedral(u: Array, v: Array) -> Array:
     z = np.abs(u) + np.abs(v) - 1
     _fold(u, v, z > 0)
     scale = 1 / np.sqrt(u * u + v * v + z * z)
-    return np.stack([u * scale, v * scale, z * scale], axis=-1)
+    for coordinate in (u, v, z):
+        coordinate *= scale
+    # Three times as fast as NumPy's stack.
+    return np.asarray(cv2.merge([u, v, z]))
 
 
 def _fold(u: Array, v: Array, outer: Array) -> None:
@@ -185,7 +188,7 @@ def _decode_curvature(data: bytes, _: dict[str, Any]) -> Array:
     missing = counts == 0
     if missing.any():
         both[missing] = np.nan
-    return np.stack(np.split(both, 2, axis=0), axis=-1)
+    return np.asarray(cv2.merge(np.split(both, 2, axis=0)))
 
 
 # Pictures ------------------------------------------------------------------------------------------------------------
