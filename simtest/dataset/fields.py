@@ -126,7 +126,7 @@ def encode_octahedral(normal: Array) -> tuple[Array, Array]:
 
 
 def decode_octahedral(u: Array, v: Array) -> Array:
-    """Give the unit vectors, shape (..., 3), of two coordinates in [-1, 1]; they are changed on the way."""
+    """Give the unit vectors, shape (H, W, 3), of two coordinates in [-1, 1], shape (H, W), which are changed."""
     z = np.abs(u) + np.abs(v) - 1
     _fold(u, v, z > 0)
     scale = 1 / np.sqrt(u * u + v * v + z * z)
