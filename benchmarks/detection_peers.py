@@ -16,6 +16,9 @@ THRESHOLDS = (140, 160, 180, 200, 220, 240)
 """Tried for the fixed threshold; the one with the best Dice on the tuning frames is used."""
 
 T1, T2_ABS, T2_REL = 240.0, 190.0, 1.0
+TUNED_T2_REL = (1.0, 1.2, 1.5, 2.0, 3.0)
+"""Tried for the published method on the tuning frames, beside the article's 1.0."""
+
 MEDIAN_PX, N_MIN, T3 = 30, 5000, 5.0
 
 
@@ -26,7 +29,7 @@ def fixed_threshold(picture: Picture, threshold: int) -> Mask:
     return np.asarray((luma >= threshold) & (saturation < 0.4 * 255))
 
 
-def arnold(picture: Picture) -> Mask:
+def arnold(picture: Picture, t2_rel: float = T2_REL) -> Mask:
     """Detect as Arnold, Ghosh, Ameling and Lacey (EURASIP Journal on Image and Video Processing 2010, 814319) describe.
 
     Module 1 takes intense pixels: green, blue or luma above 240, green and blue weighed by how their 95th percentiles
@@ -52,7 +55,7 @@ def arnold(picture: Picture) -> Mask:
         channel = values[:, :, i]
         coefficient = float(channel.mean()) / max(float(channel.mean() + channel.std()), 1e-6)
         contrast = np.maximum(contrast, coefficient * channel / np.maximum(background, 1.0))
-    return _without_smooth_areas(intense(T1) | (contrast > T2_REL), luma)
+    return _without_smooth_areas(intense(T1) | (contrast > t2_rel), luma)
 
 
 def _fill_with_colour_around(values: npt.NDArray[np.float32], mask: Mask) -> npt.NDArray[np.float32]:
@@ -60,14 +63,13 @@ def _fill_with_colour_around(values: npt.NDArray[np.float32], mask: Mask) -> npt
     near = cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
     labels, count = ndimage.label(near)
     filled = values.copy()
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+    for number, box in enumerate(ndimage.find_objects(labels, count), start=1):
         wide = tuple(slice(max(part.start - 3, 0), part.stop + 3) for part in box)
         inside = labels[wide] == number
         ring = (cv2.dilate(inside.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0) & ~inside
         ring &= ~near[wide]
         if ring.any():
             filled[wide][inside] = values[wide][ring].mean(axis=0)
-    del count
     return filled
 
 

@@ -1,5 +1,6 @@
 """From a colour picture to normals: its own view mask, its specular light, its isolated highlights, the estimators."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from simtest.calibration import Calibration, Response
 from simtest.detection.blobs import Highlight
 from simtest.detection.colour import ColourDetection, detect_colour
 from simtest.detection.view_mask import View, find_view
-from simtest.estimators import Estimator, load_estimators
+from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.reconstruction import DEFAULT_ESTIMATORS, FrameCut, Specularity, check_frame, run_estimators
 
 Image = npt.NDArray[np.float32]
@@ -21,7 +22,8 @@ SMOOTHING_PX = 1.0
 """Highlights of real pictures are small, and 2 px would round them."""
 
 SMALL_RADIUS = 3.0
-"""A highlight whose radius at half height is below this many smoothing widths is rounded by them: flag ``small``."""
+"""A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
+estimates have the flag ``small``."""
 
 _LEVELS = 2**16
 """As many values as a picture can have; its response is looked up in a table of them."""
@@ -150,4 +152,20 @@ def reconstruct_colour(
     highlights = found.detection.isolated if isolated else found.detection.highlights
     patches = [(h.region, cut.patch(h.region.box, h.region.peak)) for h in highlights]
     made = run_estimators(patches, chosen, calibration, corrected.limited)
-    return ColourReconstruction(made, list(highlights), found)
+    specularities = [
+        _flagged_small(spot) if _radius_px(highlight) < SMALL_RADIUS * smoothing_px else spot
+        for spot, highlight in zip(made, highlights, strict=True)
+    ]
+    return ColourReconstruction(specularities, list(highlights), found)
+
+
+def _radius_px(highlight: Highlight) -> float:
+    return math.sqrt(highlight.area_px / math.pi)
+
+
+def _flagged_small(spot: Specularity) -> Specularity:
+    estimates = {
+        name: replace(result, flags=(*result.flags, "small")) if isinstance(result, Estimate) else result
+        for name, result in spot.estimates.items()
+    }
+    return replace(spot, estimates=estimates)

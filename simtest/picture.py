@@ -31,6 +31,10 @@ FRAME = "camera: x right, y down, z forward; normals are unit and face the camer
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
 
 
+MANY = 10
+"""Above so many specularities normals.json is written on one line: most of it are outlines."""
+
+
 @dataclass(frozen=True)
 class Extras:
     """What else a picture is reconstructed with.
@@ -176,7 +180,7 @@ def _write(
     spots = document["specularities"]
     make_folder(out)
     try:
-        write_json(files[0], document)
+        write_json(files[0], document, compact=len(spots) > MANY)
         write_atomically(files[1], lambda part: write_csv(part, rows(spots)))
         write_atomically(files[2], lambda part: part.write_text(ply(spots, camera, depth), encoding="ascii"))
         write_atomically(files[3], lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))

@@ -127,8 +127,8 @@ class _Run:
             try:
                 document = self._reconstruct(frame, stem)
             except InputError as error:
-                # The first frame tells of a wrong camera; later ones may be broken by themselves.
-                if not self.documents and self.source.is_video or "the size of the camera" in str(error) and not self.documents:
+                # The first frame tells of a wrong camera or estimator; a file that is no picture is passed over.
+                if not self.documents and self._calibration is not None:
                     raise
                 self.failed += 1
                 self.first_error = self.first_error or str(error)
@@ -156,7 +156,7 @@ class _Run:
                 for key in DRAWN:
                     result.pop(key, None)
         # Last: a frame whose JSON is there is done.
-        write_json(stem.with_suffix(".json"), document)
+        write_json(stem.with_suffix(".json"), document, compact=True)
         return document
 
     def _numbers(self, document: dict[str, Any], size: tuple[int, ...]) -> list[int]:
@@ -223,18 +223,20 @@ def tracks_of(documents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [tracks[number] for number in sorted(tracks)]
 
 
+def _frame_rows(document: dict[str, Any]) -> list[dict[str, Any]]:
+    spots = document["specularities"]
+    tracks = {spot["id"]: spot["track"] for spot in spots}
+    frame = {"frame": document["frame_index"], "time_s": document["time_s"]}
+    return [{**frame, "track": tracks[row["specularity"]], **row} for row in rows(spots)]
+
+
 def _write(out: Path, documents: list[dict[str, Any]]) -> list[Path]:
     files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
-    table = [
-        {"frame": document["frame_index"], "time_s": document["time_s"], "track": track_by_id[row["specularity"]], **row}
-        for document in documents
-        for track_by_id in [{spot["id"]: spot["track"] for spot in document["specularities"]}]
-        for row in rows(document["specularities"])
-    ]
+    table = [row for document in documents for row in _frame_rows(document)]
     tracks = tracks_of(documents)
     try:
         write_atomically(files[0], lambda part: write_csv(part, table, TIMELINE))
-        write_json(files[1], tracks)
+        write_json(files[1], tracks, compact=True)
         write_atomically(files[2], lambda part: write_sequence_page(part, documents, tracks))
     except OSError as error:
         raise InputError(f"--out {shown(out)}: cannot be written ({error.strerror})") from error

@@ -1,11 +1,13 @@
 """`simtest reconstruct`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from simtest.cli.options import Estimators, Out
+
+TABLE_WIDTH = 125
 
 
 def reconstruct(
@@ -100,6 +102,8 @@ def _print_table(file: Path) -> None:
 
     document = json.loads(file.read_text(encoding="utf-8"))
     console = Console()
+    # Narrower, normals would be cut off.
+    console.width = max(console.width, TABLE_WIDTH)
     if document["specularities"]:
         table = Table("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
         for spot in document["specularities"]:
@@ -120,7 +124,7 @@ def _pair(row: dict[str, float | None], mean: str, spread: str) -> str:
     return f"{row[mean]:.2f}" + ("" if row[spread] is None else f" ± {row[spread]:.2f}")
 
 
-def _cells(spot: dict) -> list[str]:  # type: ignore[type-arg]
+def _cells(spot: dict[str, Any]) -> list[str]:
     result = spot["estimates"].get(spot["best"]) or {}
     published = spot["estimates"].get("circle_pose") or {}
     x, y = spot["peak_px"] or (float("nan"), float("nan"))

@@ -22,8 +22,11 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
-MIN_AREA_PX = 5
-"""Fewer pixels are a speck: noise, or a highlight that no ellipse can be fitted to."""
+MIN_AREA_PX = 4
+"""Fewer pixels are a speck."""
+
+MIN_HALF_HEIGHT_PX = 3
+"""Least pixels above half height that give an ellipse, by interpolation between them."""
 
 SMOOTHING_PX = 0.7
 """Before the shape is judged; wider smoothing makes any small blob an ellipse."""
@@ -169,10 +172,7 @@ def highlights_of(
             found += _peaks(smoothed, inside, (x, y, width, height), clipped, seen)
     fits = _fit([part for spot in found for part in spot.sets])
     step = len(NESTED_ISOVALUES)
-    made = [
-        _judge(spot, fits[i * step : (i + 1) * step], linear, mask, light)
-        for i, spot in enumerate(found)
-    ]
+    made = [_judge(spot, fits[i * step : (i + 1) * step], linear, mask, light) for i, spot in enumerate(found)]
     return sorted(made, key=lambda highlight: -highlight.region.contrast)
 
 
@@ -241,9 +241,7 @@ def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
     return made
 
 
-def _judge(
-    spot: _Found, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight
-) -> Highlight:
+def _judge(spot: _Found, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight) -> Highlight:
     outline, box = _outline(spot, light.specular.shape)
     axis_ratio, residual, wander = _shape(spot, fits)
     tint, clutter = _around(spot, box, linear, mask, light)
@@ -254,7 +252,7 @@ def _judge(
         kind = Kind.BORDER
     elif tint < TINT:
         kind = Kind.INTER_REFLECTION
-    elif spot.area_px < MIN_AREA_PX:
+    elif spot.area_px < MIN_HALF_HEIGHT_PX:
         kind = Kind.SMALL
     elif spot.several or not (fine or long):
         kind = Kind.MERGED
@@ -321,7 +319,8 @@ def _quadratic(fitted: FittedConic) -> tuple[npt.NDArray[np.float64], npt.NDArra
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
     level = -(C[2, 2] + C[:2, 2] @ centre)
     T = fitted.normalised_from_image
-    return np.linalg.solve(T[:2, :2], centre - T[:2, 2]), T[:2, :2].T @ C[:2, :2] @ T[:2, :2] / level
+    Q = T[:2, :2].T @ C[:2, :2] @ T[:2, :2] / level
+    return np.asarray(np.linalg.solve(T[:2, :2], centre - T[:2, 2])), np.asarray(Q)
 
 
 def _around(spot: _Found, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Splits a colour frame into light off the tissue and light off its wet surface, by the tissue's own colour.
 
-What a glossy surface mirrors has the colour of the lamp, which a white-balanced camera shows as grey. It adds the same to
-all channels, so that the difference of the largest and the smallest channel is that of the tissue alone (dichromatic
+What a glossy surface mirrors has the colour of the lamp, which a white-balanced camera shows as grey. It adds the same
+to all channels, so that the difference of the largest and the smallest channel is that of the tissue alone (dichromatic
 model, Shafer 1985). Over the tissue around, mean over difference is nearly constant; times the difference it gives the
 tissue's part of each pixel, whatever the shading. The rest is specular.
 """

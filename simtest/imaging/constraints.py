@@ -12,9 +12,10 @@ from simtest.geometry.vectors import tangent_basis
 VERSION = 1
 
 ABOUT = (
-    "For constraint i the surface point on the ray depth * sightline[i] through pixel[i] has the unit normal normal[i], "
-    "which faces the camera. Camera frame: x right, y down, z forward; pixel centres at integer + 0.5. covariance[i] is "
-    "that of the normal, rad^2, in its tangent basis[i] (two unit vectors); NaN (null) where the estimator gives none. "
+    "For constraint i the surface point on the ray depth * sightline[i] through pixel[i] has the unit normal "
+    "normal[i], which faces the camera. Camera frame: x right, y down, z forward; pixel centres at integer + 0.5. "
+    "covariance[i] is that of the normal, rad^2, in its tangent basis[i] (two unit vectors); NaN (null) where the "
+    "estimator gives none. "
     "candidates[i] holds all normals that the data allow."
 )
 

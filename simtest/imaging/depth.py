@@ -127,7 +127,7 @@ def _read_npy(path: Path) -> npt.NDArray[np.generic]:
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{shown(path)}: cannot be read ({str(error).splitlines()[0][:120]})") from None
     if values.dtype.kind not in "iuf" or values.size > MAX_PIXELS:
-        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be numbers, at most {MAX_PIXELS}")
+        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be up to {MAX_PIXELS} numbers")
     return np.array(values)
 
 
@@ -174,7 +174,7 @@ def depth_normals(points: Array) -> Array:
     """
     window = np.arange(-RADIUS_PX, RADIUS_PX + 1, dtype=float)
     slope, mean = window / (window**2).sum(), np.full(len(window), 1 / len(window))
-    known = np.isfinite(points).all(axis=-1)
+    known = np.asarray(np.isfinite(points).all(axis=-1))
     values = np.where(known[..., None], points, 0.0)
     along_x = cv2.sepFilter2D(values, cv2.CV_64F, slope, mean, borderType=cv2.BORDER_REPLICATE)
     along_y = cv2.sepFilter2D(values, cv2.CV_64F, mean, slope, borderType=cv2.BORDER_REPLICATE)

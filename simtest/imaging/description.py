@@ -15,8 +15,8 @@ from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction import Specularity
 
 BEST = ("bisector", "curved", "cone_axis", "brightest_point")
-"""Estimators whose normal is the best one, in this order: that which knows the lights, that which follows the isophotes to
-the peak, that which averages them, and the one that needs none. `circle_pose` takes a curved surface for a plane."""
+"""Estimators whose normal is the best one, in this order: that which knows the lights, that which follows the isophotes
+to the peak, that which averages them, and the one that needs none. `circle_pose` takes a curved surface for a plane."""
 
 UNSOUND = frozenset({"saturated", "missing_isovalues", "ambiguous_light"})
 """With these flags `curved` and `bisector`, which follow the isophotes to the peak, give way to the next."""

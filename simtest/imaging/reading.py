@@ -38,11 +38,12 @@ def read_picture(path: Path) -> Image:
         If the file is missing, no picture, or too large.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
-    if picture.dtype not in (np.uint8, np.uint16):
+    largest = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}.get(picture.dtype.name)
+    if largest is None:
         raise InputError(f"{shown(path)}: pixels are {picture.dtype}; must be 8 or 16 bits")
     if picture.ndim == 3 and picture.shape[2] not in (1, 3, 4):
         raise InputError(f"{shown(path)}: has {picture.shape[2]} channels; must have 1, 3 or 4")
-    scaled = picture.astype(np.float32) / np.float32(np.iinfo(picture.dtype).max)
+    scaled: Image = np.asarray(picture, dtype=np.float32) / np.float32(largest)
     if scaled.ndim == 3 and scaled.shape[2] == 1:
         scaled = scaled[:, :, 0]
     return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, 2::-1])

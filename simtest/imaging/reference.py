@@ -45,11 +45,13 @@ class MeshReference:
         import igl
 
         rays = np.ascontiguousarray(camera.unproject(pixels))
-        known = np.isfinite(rays).all(axis=1)
+        known = np.asarray(np.isfinite(rays).all(axis=1))
         tree = igl.AABB()
         tree.init(self.vertices, self.faces)
         origins = np.zeros_like(rays)
-        face, _, weights = tree.intersect_ray_first(self.vertices, self.faces, origins, np.where(known[:, None], rays, 1))
+        face, _, weights = tree.intersect_ray_first(
+            self.vertices, self.faces, origins, np.where(known[:, None], rays, 1)
+        )
         hit = known & (face >= 0)
         u, v = np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:].T
         corners = self.normals[self.faces[np.where(hit, face, 0)]]
@@ -126,7 +128,9 @@ def place_mesh(
     """Move a mesh of the model frame into the camera frame by a rigid transform, shape (4, 4)."""
     R, t = camera_from_model[:3, :3], camera_from_model[:3, 3]
     placed = np.ascontiguousarray(vertices @ R.T + t)
-    return MeshReference(placed, np.ascontiguousarray(normals @ R.T), np.ascontiguousarray(faces, dtype=np.int64), source)
+    return MeshReference(
+        placed, np.ascontiguousarray(normals @ R.T), np.ascontiguousarray(faces, dtype=np.int64), source
+    )
 
 
 def read_pose(path: Path) -> Array:
@@ -203,7 +207,8 @@ def comparison(spots: Sequence[dict[str, Any]], camera: Camera, reference: Refer
         same of the better candidates.
     """
     placed = [spot for spot in spots if spot["peak_px"] is not None]
-    normals = reference.normals_at(np.array([s["peak_px"] for s in placed]).reshape(-1, 2), camera) if placed else []
+    peaks = np.array([spot["peak_px"] for spot in placed], dtype=float).reshape(-1, 2)
+    normals = reference.normals_at(peaks, camera) if placed else np.empty((0, 3))
     errors: dict[str, list[tuple[float, float]]] = {}
     missed = 0
     for spot, normal in zip(placed, normals, strict=True):

@@ -1,6 +1,5 @@
 """One picture: which detector, which estimators, and what is said of the result."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,9 @@ class PictureResult:
     detector: str
 
 
-def read_camera(camera_file: Path | None, fov_deg: float | None, size: tuple[int, int]) -> tuple[Calibration, list[str]]:
+def read_camera(
+    camera_file: Path | None, fov_deg: float | None, size: tuple[int, int]
+) -> tuple[Calibration, list[str]]:
     """Give the calibration of pictures of a size (width, height), from a file or a field of view, and what to mind.
 
     Raises
@@ -174,7 +175,6 @@ def describe_view(view: View) -> dict[str, Any] | None:
     if view.seen is None:
         return None
     contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    outline: Sequence[Any] = max(contours, key=len)[:, 0] if contours else np.empty((0, 2))
-    polygon = cv2.approxPolyDP(np.asarray(outline, dtype=np.int32).reshape(-1, 1, 2), 1.0, True)[:, 0] if len(outline) else []
+    polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
     circle = view.circle and {"cx": view.circle.cx, "cy": view.circle.cy, "radius": view.circle.radius}
     return {"circle": circle, "outline": [[float(x) + 0.5, float(y) + 0.5] for x, y in polygon]}

@@ -14,13 +14,13 @@ Bytes = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 SHORTEST_PX, CROWDED_PX = 900, 2000
-"""A picture whose longer side is shorter is enlarged, by a whole number, so that lines and numbers have room; the second
-where there are many."""
+"""A picture whose longer side is shorter is enlarged, by a whole number, so that lines and numbers have room; the
+second where there are many."""
 
 MANY = 40
 
 ARROW_SHARE = 0.09
-"""Length of a drawn normal over the picture's larger side, for a normal across the view; less where many stand close."""
+"""Length of a drawn normal over the picture's larger side, for a normal across the view; less where there are many."""
 
 ISOPHOTE: Colour = (0, 235, 255)
 NUMBER: Colour = (0, 255, 255)

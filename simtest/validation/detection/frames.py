@@ -36,6 +36,9 @@ WIDTH, HEIGHT = 640, 480
 COLOURS = {"colon": (0.80, 0.44, 0.36), "liver": (0.46, 0.16, 0.13)}
 """Linear colour of the tissue: mucosa, and the darker red of a liver; each frame's is drawn around it."""
 
+EXPOSED_PERCENTILE = 90.0
+"""This percentile of the tissue's strongest channel becomes full scale, divided by the exposure's gain."""
+
 WAVES = 10
 """Plane waves that a texture is made of."""
 
@@ -141,7 +144,7 @@ def _scene(recipe: Path, number: int, seed: int) -> Scene:
             "sensor": {
                 "point_spread_px": float(rng.uniform(0.6, 1.2)),
                 "vignetting": {"type": "cosine", "power": float(rng.uniform(1, 4))},
-                "exposure": {"percentile": 90.0, "gain": float(rng.uniform(0.25, 0.6))},
+                "exposure": {"percentile": EXPOSED_PERCENTILE, "gain": float(rng.uniform(0.25, 0.6))},
                 "full_well": float(np.exp(rng.uniform(math.log(2000), math.log(15000)))),
                 "read_noise": 8.0,
                 "response": {"type": "srgb"},
@@ -166,8 +169,8 @@ def _frame(session: Session, scene: Scene, kind: str, name: str, seed: int) -> S
         total[~seen] = 0
     lit = diffuse.max(axis=2)[diffuse.max(axis=2) > 0]
     # Exposed for the tissue, as an endoscope does: its highlights clip.
-    full_scale = float(np.percentile(lit, scene.sensor.exposure.percentile)) / scene.sensor.exposure.gain
     sensor = scene.sensor
+    full_scale = float(np.percentile(lit, EXPOSED_PERCENTILE)) / sensor.exposure.gain
     values = capture(total, full_scale, sensor, generator(seed, "detection", name, 0, Stage.SENSOR))
     other = diffuse.mean(axis=2) / full_scale
     noise = sensor.noise_model().at(np.clip(other + specular / full_scale, 0, 1), 3)
@@ -195,5 +198,3 @@ def _texture(position: Image, rng: np.random.Generator) -> Image:
     strength = np.array([0.25, 0.8, 0.7])
     factor = mottled * (1 - vessel[:, None] * strength)
     return np.asarray(factor, dtype=np.float32).reshape(*position.shape)
-
-
