@@ -53,7 +53,8 @@ class MeshReference:
             self.vertices, self.faces, origins, np.where(known[:, None], rays, 1)
         )
         hit = known & (face >= 0)
-        u, v = np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:].T
+        # What the tree gives for rays that miss is not set.
+        u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
         corners = self.normals[self.faces[np.where(hit, face, 0)]]
         normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
