@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,45 +23,73 @@ ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class MeshReference:
-    """A model placed in the camera frame.
+class Model:
+    """A mesh with a tree to cast rays on it.
 
     Parameters
     ----------
     vertices, normals : ndarray, shape (V, 3)
-        Camera frame; mm and unit.
+        Model frame; mm and unit.
     faces : ndarray of int, shape (F, 3)
-    source : str
-        The file.
     """
 
     vertices: Array
     normals: Array
-    faces: npt.NDArray[np.int64]
-    source: str
-    notes: tuple[str, ...] = ()
+    faces: npt.NDArray[np.integer]
 
-    def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Give the model's normals where the sightlines of pixels, shape (N, 2), meet it first; NaN where none does."""
+    @cached_property
+    def _tree(self) -> tuple[Any, Array, npt.NDArray[np.int64]]:
         import igl
 
-        rays = np.ascontiguousarray(camera.unproject(pixels))
-        known = np.asarray(np.isfinite(rays).all(axis=1))
+        vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces, dtype=np.int64)
         tree = igl.AABB()
-        tree.init(self.vertices, self.faces)
-        origins = np.zeros_like(rays)
-        face, _, weights = tree.intersect_ray_first(
-            self.vertices, self.faces, origins, np.where(known[:, None], rays, 1)
-        )
+        tree.init(vertices, faces)
+        return tree, vertices, faces
+
+    def cast(self, origin: Array, directions: Array) -> Array:
+        """Give the normals where rays from a point, shape (3,), along (N, 3), meet the mesh first, facing the rays.
+
+        NaN where none does, and for directions that are not finite.
+        """
+        tree, vertices, faces = self._tree
+        known = np.asarray(np.isfinite(directions).all(axis=1))
+        rays = np.ascontiguousarray(np.where(known[:, None], directions, 1.0))
+        origins = np.ascontiguousarray(np.broadcast_to(origin, rays.shape))
+        face, _, weights = tree.intersect_ray_first(vertices, faces, origins, rays)
         hit = known & (face >= 0)
         # What the tree gives for rays that miss is not set.
         u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
-        corners = self.normals[self.faces[np.where(hit, face, 0)]]
+        corners = self.normals[faces[np.where(hit, face, 0)]]
         normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         normal[np.einsum("ni,ni->n", normal, rays) > 0] *= -1
         normal[~hit] = np.nan
         return np.asarray(normal)
+
+
+@dataclass(frozen=True)
+class MeshReference:
+    """A model placed in the camera frame.
+
+    Parameters
+    ----------
+    model : Model
+        The mesh.
+    camera_from_model : ndarray, shape (4, 4)
+        Rigid.
+    source : str
+        The file.
+    """
+
+    model: Model
+    camera_from_model: Array
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def normals_at(self, pixels: Array, camera: Camera) -> Array:
+        """Give the model's normals where the sightlines of pixels, shape (N, 2), meet it first; NaN where none does."""
+        R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
+        return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
 
 
 @dataclass(frozen=True)
@@ -119,19 +148,8 @@ def load_reference(
     from simtest.anatomy.mesh import prepare
 
     camera_from_model = read_pose(pose)
-    prepared = prepare(path, 0)
-    return place_mesh(prepared.mesh.vertices, prepared.mesh.normals, prepared.mesh.faces, camera_from_model, str(path))
-
-
-def place_mesh(
-    vertices: Array, normals: Array, faces: npt.NDArray[np.integer], camera_from_model: Array, source: str = ""
-) -> MeshReference:
-    """Move a mesh of the model frame into the camera frame by a rigid transform, shape (4, 4)."""
-    R, t = camera_from_model[:3, :3], camera_from_model[:3, 3]
-    placed = np.ascontiguousarray(vertices @ R.T + t)
-    return MeshReference(
-        placed, np.ascontiguousarray(normals @ R.T), np.ascontiguousarray(faces, dtype=np.int64), source
-    )
+    mesh = prepare(path, 0).mesh
+    return MeshReference(Model(mesh.vertices, mesh.normals, mesh.faces), camera_from_model, str(path))
 
 
 def read_pose(path: Path) -> Array:
