@@ -8,7 +8,7 @@ from rich.table import Table
 
 from benchmarks.measuring import Figure
 
-NAMES = ("published", "rendering", "detection")
+NAMES = ("published", "rendering", "colour", "detection")
 """Modules of this package with a function `figures()`."""
 
 

@@ -26,14 +26,14 @@ from simtest.validation.matching import match
 from simtest.validation.realise import view
 
 VIEWS, SPECULARITIES = 5, 26
-TRIED = 30
+TRIED = 48
 DRAWS = 40
 TRANSLATIONS_MM = (0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 ROTATIONS_DEG = (0.0, 2.5, 5.0)
 ARTICLE_DEG = (7.11, 4.86)
 ESTIMATORS = ("circle_pose", "cone_axis", "curved")
 TRUTH = "true normals"
-RECIPE = {"relief_mm": 0.35, "relief_length_mm": 30.0}
+RECIPE = {"relief_mm": 0.5, "relief_length_mm": 20.0}
 
 
 @dataclass(frozen=True)
@@ -154,10 +154,10 @@ def draw(results: dict[tuple[float, float], dict[str, np.ndarray]], names: tuple
         mean, spread = ARTICLE_DEG
         ax.axhspan(mean - spread, mean + spread, color=NEUTRAL, alpha=0.15)
         ax.axhline(mean, color=NEUTRAL, ls="--", label=f"article: {mean} ± {spread} deg")
-        for name in names:
+        for i, name in enumerate(names):
             values = [results[length, turn][name] for length in TRANSLATIONS_MM]
             ax.errorbar(
-                TRANSLATIONS_MM, [v.mean() for v in values], [v.std(ddof=1) for v in values], color=palette[name],
+                np.array(TRANSLATIONS_MM) + 0.12 * i, [v.mean() for v in values], [v.std(ddof=1) for v in values], color=palette[name],
                 marker="o", ms=4, lw=1.3, elinewidth=0.6, capsize=2, label=name,
             )  # fmt: skip
         ax.set(xlabel="registration error: translation (mm)", title=f"and rotation {turn:g} deg", ylim=(0, None))

@@ -64,7 +64,7 @@ CLUTTER = 0.2
 """Most specular light, over the peak's, that nine tenths of the surroundings may show: instruments, pale folds and
 glistening patches show more."""
 
-LEAST_CONTRAST = 0.08
+LEAST_CONTRAST = 0.1
 """Least specular light at the peak of an isolated highlight, share of full scale."""
 
 EDGE_PX = 3

@@ -11,17 +11,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from simtest.detection.noise import estimate_noise
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-BLOCK_PX = 8
-"""The tissue's colour is asked for in blocks of so many pixels a side ..."""
+BLOCKS = 160
+"""The tissue's colour is asked for in square blocks, so many along the picture's longer side ..."""
 
-NEIGHBOURHOOD = 13
+NEIGHBOURHOOD = 25
 """... and is the median of so many by so many of them: wider than highlights, and narrower than organs."""
 
 LEAST_LIGHT = 0.01
@@ -29,6 +28,9 @@ LEAST_LIGHT = 0.01
 
 LEAST_COLOUR = 0.08
 """Least difference of the channels over their mean: greyer tissue cannot be told from a highlight by its colour."""
+
+_LOG_FACTORS = (float(np.log(1 / 3)), float(np.log(1 / LEAST_COLOUR)))
+"""Range of the logarithm of the mean over the difference of the channels."""
 
 CANDIDATE = 0.5
 """Where the specular light is this share of the tissue's, the latter is taken from around, not from the pixel."""
@@ -100,7 +102,8 @@ def split_light(linear: Image, clipped: Mask, seen: Mask | None = None) -> Split
 def _tissue_colour(intensity: Image, difference: Image, least: Image, sound: Mask) -> tuple[Image, Image]:
     """Give, at each pixel, the mean of the tissue's channels over their difference, and the least over the mean."""
     height, width = intensity.shape
-    size = (max(width // BLOCK_PX, 1), max(height // BLOCK_PX, 1))
+    block = max(height, width) / BLOCKS
+    size = (max(round(width / block), 1), max(round(height / block), 1))
     asked = sound & (intensity > LEAST_LIGHT)
     weight = asked.astype(np.float32)
     sums = [cv2.resize(v * weight, size, interpolation=cv2.INTER_AREA) for v in (intensity, difference, least, weight)]
@@ -109,10 +112,19 @@ def _tissue_colour(intensity: Image, difference: Image, least: Image, sound: Mas
     factor = np.where(known, mean / np.maximum(gap, LEAST_COLOUR * np.maximum(mean, 1e-9)), 0)
     floor = np.where(known, low / np.maximum(mean, 1e-9), 0)
     maps = []
-    for values in (factor, floor):
-        around = ndimage.median_filter(fill(values.astype(np.float32), known), NEIGHBOURHOOD, mode="nearest")
+    for values, low_end, high_end in ((np.log(np.maximum(factor, 1 / 3)), *_LOG_FACTORS), (floor, 0.0, 1.0)):
+        around = _median(fill(values.astype(np.float32), known), low_end, high_end)
         maps.append(cv2.resize(around, (width, height), interpolation=cv2.INTER_LINEAR))
-    return maps[0], maps[1]
+    return np.exp(maps[0]), maps[1]
+
+
+def _median(values: Image, low: float, high: float) -> Image:
+    """Give the median of each neighbourhood, in 255 steps between two ends: as fine as the tissue's colour is even."""
+    steps = np.rint((np.clip(values, low, high) - low) * (255 / (high - low))).astype(np.uint8)
+    edge = NEIGHBOURHOOD // 2
+    padded = cv2.copyMakeBorder(steps, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
+    around = cv2.medianBlur(padded, NEIGHBOURHOOD)[edge:-edge, edge:-edge]
+    return (low + around.astype(np.float32) * ((high - low) / 255)).astype(np.float32)
 
 
 def fill(values: Image, known: Mask) -> Image:

@@ -112,7 +112,7 @@ def default_estimators(calibration: Calibration) -> tuple[str, ...]:
     """Give the estimators that the calibration tells enough for."""
     known = calibration.known
     lights = len(known.lights) > 0 and known.distance_mm is not None
-    return (*DEFAULT_ESTIMATORS, "curved", *(("bisector",) if lights else ()))
+    return (*DEFAULT_ESTIMATORS, *(("bisector",) if lights else ()))
 
 
 def reconstruct_values(picture: Image, calibration: Calibration, options: Options) -> PictureResult:
