@@ -151,15 +151,15 @@ def draw(results: dict[tuple[float, float], dict[str, np.ndarray]], names: tuple
     palette = {**colours(ESTIMATORS), TRUTH: "black"}
     figure, axes = plt.subplots(1, len(ROTATIONS_DEG), figsize=(11, 4.2), sharey=True, layout="constrained")
     for ax, turn in zip(axes, ROTATIONS_DEG, strict=True):
-        mean, spread = ARTICLE_DEG
-        ax.axhspan(mean - spread, mean + spread, color=NEUTRAL, alpha=0.15)
-        ax.axhline(mean, color=NEUTRAL, ls="--", label=f"article: {mean} ± {spread} deg")
+        published, spread = ARTICLE_DEG
+        ax.axhspan(published - spread, published + spread, color=NEUTRAL, alpha=0.15)
+        ax.axhline(published, color=NEUTRAL, ls="--", label=f"article: {published} ± {spread} deg")
         for i, name in enumerate(names):
             values = [results[length, turn][name] for length in TRANSLATIONS_MM]
-            ax.errorbar(
-                np.array(TRANSLATIONS_MM) + 0.12 * i, [v.mean() for v in values], [v.std(ddof=1) for v in values], color=palette[name],
-                marker="o", ms=4, lw=1.3, elinewidth=0.6, capsize=2, label=name,
-            )  # fmt: skip
+            # A little apart, for what lies on top of each other.
+            x = np.array(TRANSLATIONS_MM) + 0.12 * i
+            mean, bars = [v.mean() for v in values], [v.std(ddof=1) for v in values]
+            ax.errorbar(x, mean, bars, color=palette[name], marker="o", ms=4, lw=1.3, elinewidth=0.6, label=name)
         ax.set(xlabel="registration error: translation (mm)", title=f"and rotation {turn:g} deg", ylim=(0, None))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("angle against the registered model (deg)")

@@ -20,7 +20,7 @@ from simtest.imaging.depth import depths_at
 from simtest.imaging.description import arrows_ply, ply, rows, write_csv
 from simtest.imaging.reading import read_picture
 from simtest.imaging.reference import Reference, comparison, load_reference
-from simtest.imaging.single import Options, completed, read_camera, reconstruct_values
+from simtest.imaging.single import Options, check_camera_given, completed, read_camera, reconstruct_values
 from simtest.report.overlay import draw_overlay
 from simtest.report.picture_page import write_picture_page
 from simtest.spec import describe_camera
@@ -112,6 +112,7 @@ def reconstruct_picture(
     """
     box = parse_roi(roi) if roi is not None else None
     options = Options(None if estimators is None else tuple(estimators), box, encoding, every, detector, smoothing_px)
+    check_camera_given(camera_file, fov_deg)
     picture = read_picture(image)
     height, width = picture.shape[:2]
     calibration, cautions = read_camera(camera_file, fov_deg, (width, height))

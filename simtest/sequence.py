@@ -13,7 +13,7 @@ from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.files import make_folder, write_atomically, write_json
 from simtest.imaging.description import COLUMNS, rows, write_csv
-from simtest.imaging.single import Options, completed, read_camera
+from simtest.imaging.single import Options, check_camera_given, completed, read_camera
 from simtest.imaging.sources import SequenceFrame, Source, open_source
 from simtest.imaging.tracking import Tracker
 from simtest.picture import picture_document
@@ -81,6 +81,7 @@ def reconstruct_sequence(
         If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
     options = options or Options()
+    check_camera_given(camera_file, fov_deg)
     source = open_source(path)
     folder = out / "frames"
     make_folder(folder)

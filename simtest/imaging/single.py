@@ -90,13 +90,18 @@ def read_camera(
     InputError
         If neither or both are given, or the file is malformed.
     """
-    if (camera_file is None) == (fov_deg is None):
-        raise InputError("--camera or --fov: exactly one of them must be given")
+    check_camera_given(camera_file, fov_deg)
     if camera_file is not None:
         return load_calibration(camera_file), []
     assert fov_deg is not None
     caution = f"no calibration: all angles depend on the field of view of {fov_deg:g} deg being right"
     return Calibration(Camera.from_fov(fov_deg, *size)), [caution]
+
+
+def check_camera_given(camera_file: Path | None, fov_deg: float | None) -> None:
+    """Raise `InputError` where neither a camera's file nor a field of view is given, or both."""
+    if (camera_file is None) == (fov_deg is None):
+        raise InputError("--camera or --fov: exactly one of them must be given")
 
 
 def completed(calibration: Calibration, encoding: str | None) -> Calibration:
