@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from simtest.conventions import SPECULAR_MIN_AREA_PX
 from simtest.validation.detection.truth import SpecularTruth
@@ -14,8 +14,6 @@ Mask = npt.NDArray[np.bool_]
 
 MATCH_IOU = 0.5
 """A detection is that highlight with which it shares at least this part of their union: there is one at most."""
-
-_AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -80,20 +78,21 @@ def score(detected: Mask, truth: SpecularTruth) -> Scores:
     -------
     Scores
     """
-    labels, count = ndimage.label(detected, _AROUND)
-    shared = np.zeros((count + 1, truth.count + 1), dtype=int)
-    np.add.at(shared, (labels.ravel(), truth.labels.ravel()), 1)
+    found, labels = cv2.connectedComponents(detected.astype(np.uint8), connectivity=8)
+    count, true = found - 1, truth.count
+    both = labels.ravel() * (true + 1) + truth.labels.ravel()
+    shared = np.bincount(both, minlength=found * (true + 1)).reshape(found, true + 1)
     area, true_area = shared.sum(axis=1)[1:], shared.sum(axis=0)[1:]
     common = shared[1:, 1:]
     union = area[:, None] + true_area[None] - common
     hits = int(np.count_nonzero(common >= MATCH_IOU * union))
-    on_unclear = np.bincount(labels.ravel(), weights=truth.unclear.ravel(), minlength=count + 1)[1:] > 0
+    on_unclear = np.bincount(labels.ravel(), weights=truth.unclear.ravel(), minlength=found)[1:] > 0
     free = (common.sum(axis=1) == 0) & (on_unclear | (area < SPECULAR_MIN_AREA_PX))
     pixel_hits = int(np.count_nonzero(detected & truth.mask))
     return Scores(
         hits,
         count - hits - int(np.count_nonzero(free)),
-        truth.count - hits,
+        true - hits,
         pixel_hits,
         int(np.count_nonzero(detected & ~truth.mask & ~truth.unclear)),
         int(np.count_nonzero(truth.mask)) - pixel_hits,

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from simtest.conventions import (
     HIGHLIGHT_CONTRAST_SIGMA,
@@ -19,8 +19,6 @@ Labels = npt.NDArray[np.int32]
 
 LEAST = 1e-4
 """Share of full scale below which specular light is none."""
-
-_AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -84,17 +82,22 @@ def specular_truth(
     if seen is not None:
         bright &= seen
     # A highlight's own peak is that of the pixels it hangs together with.
-    labels, count = ndimage.label(bright, _AROUND)
-    if not count:
-        return SpecularTruth(labels.astype(np.int32), bright)
-    index = np.arange(1, count + 1)
-    peaks = np.concatenate([[np.inf], ndimage.maximum(shown, labels, index)])
+    count, labels = cv2.connectedComponents(bright.astype(np.uint8), connectivity=8)
+    peaks = _largest(shown, labels, count)
     mask = bright & (shown >= peak_share * peaks[labels])
-    labels, count = ndimage.label(mask, _AROUND)
-    index = np.arange(1, count + 1)
-    area = ndimage.sum_labels(mask, labels, index)
-    clearness = ndimage.maximum(shown / np.maximum(noise, 1e-9), labels, index)
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    area = np.bincount(labels.ravel(), minlength=count)
+    clearness = _largest(shown / np.maximum(noise, 1e-9), labels, count)
     clear = (area >= SPECULAR_MIN_AREA_PX) & (clearness >= HIGHLIGHT_CONTRAST_SIGMA)
-    number = np.concatenate([[0], np.where(clear, np.cumsum(clear), 0)]).astype(np.int32)
-    kept = number[labels]
+    clear[0] = False
+    kept = np.where(clear, np.cumsum(clear), 0).astype(np.int32)[labels]
     return SpecularTruth(kept, mask & (kept == 0))
+
+
+def _largest(values: npt.NDArray[np.floating], labels: Labels, count: int) -> npt.NDArray[np.floating]:
+    """Give the largest value of each label, shape (count,); infinity for label 0, which is none."""
+    largest = np.zeros(count, dtype=values.dtype)
+    rows, columns = np.nonzero(labels)
+    np.maximum.at(largest, labels[rows, columns], values[rows, columns])
+    largest[0] = np.inf
+    return largest
