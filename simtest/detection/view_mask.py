@@ -90,8 +90,9 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     hull = cv2.convexHull(np.argwhere(inside)[:, ::-1].astype(np.int32).reshape(-1, 1, 2))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
     # Cut corners lie on a circle too, within a pixel or two: straight sides are looked for first.
-    circle = None if _is_polygon(inside, filled, hull) else _circle(border, tolerance)
-    if circle is None and not _is_polygon(inside, filled, hull):
+    polygon = _is_polygon(inside, filled, hull)
+    circle = None if polygon else _circle(border, tolerance)
+    if circle is None and not polygon:
         return WHOLE
     if circle is not None:
         x, y, radius = circle

@@ -250,3 +250,19 @@ def test_no_mark_on_instrument_or_border_of_a_real_laparoscopy(real):
         assert np.hypot(x - found.view.circle.cx, y - found.view.circle.cy) < found.view.circle.radius - 8
         # The jaws lie between (590, 100) and (740, 0).
         assert not (590 <= x <= 740 and abs(y - (100 - 0.66 * (x - 590))) < 22), (x, y)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (2, 3), (9, 9), (40, 17), (200, 8)])
+def test_pictures_of_any_size_and_content_are_borne(shape):
+    rng = np.random.default_rng(1)
+    for picture_ in (
+        np.zeros((*shape, 3)),
+        np.ones((*shape, 3)),
+        rng.random((*shape, 3)),
+        np.where(rng.random((*shape, 1)) < 0.2, 1.0, [0.5, 0.2, 0.2]),
+        np.broadcast_to(rng.random((shape[0], 1, 3)), (*shape, 3)),
+    ):
+        found = detect_in_picture(np.ascontiguousarray(picture_, dtype=np.float32))
+        assert found.detection.mask.shape == shape
+        assert np.isfinite(found.detection.light.specular).all()
+        assert all(0 <= highlight.score <= 1 for highlight in found.detection.highlights)
