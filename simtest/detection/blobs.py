@@ -265,7 +265,9 @@ def _judge(spot: _Found, fits: list[FittedConic | None], linear: Image, mask: Ma
     score = 0.0
     if axis_ratio is not None and residual is not None and wander is not None:
         height = spot.value / (spot.value + max(10 * light.noise, 1e-6))
-        score = float(np.exp(-((residual / RESIDUAL) ** 2 + (wander / WANDER) ** 2) / 4) * min(1, tint) * height)
+        score = float(
+            np.exp(-((residual / RESIDUAL) ** 2 + (wander / WANDER) ** 2) / 4) * min(max(tint, 0), 1) * height
+        )
     region = Region(box, spot.peak, spot.value)
     return Highlight(region, kind, round(score, 4), spot.area_px, axis_ratio, residual, wander, tint, clutter, outline)
 

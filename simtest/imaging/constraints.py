@@ -25,7 +25,7 @@ def constraints(document: dict[str, Any]) -> dict[str, Any]:
     made = []
     for spot in document["specularities"]:
         result = spot["estimates"].get(spot["best"]) if spot["best"] else None
-        if result is None or result["status"] != "ok" or spot["peak_px"] is None:
+        if result is None or result["status"] != "ok" or spot["sightline"] is None:
             continue
         published = spot["estimates"].get("circle_pose", {})
         made.append(

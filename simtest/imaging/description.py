@@ -41,8 +41,9 @@ def describe(
     results = {name: _entry(result, specularity, camera) for name, result in specularity.estimates.items()}
     peak = None if isinstance(specularity.patch, Failure) else specularity.patch.peak_px.tolist()
     entry = {"id": index, "box_px": list(specularity.region.box), "peak_px": peak}
-    if peak is not None:
-        entry["sightline"] = camera.unproject(peak).tolist()
+    sightline = None if peak is None else camera.unproject(peak)
+    # A lens sees no direction beyond its fold.
+    entry["sightline"] = None if sightline is None or not np.isfinite(sightline).all() else sightline.tolist()
     if highlight is not None:
         entry |= describe_highlight(highlight)
     return {**entry, "best": best_of(specularity.estimates), "estimates": results}
