@@ -1,6 +1,6 @@
 """Detection of specularities on rendered colon and liver frames, beside two other detectors on the same frames.
 
-`python -m benchmarks detection`: 200 frames of anatomies that were not used for tuning, about 4 minutes on 2 cores.
+`python -m benchmarks detection`: 200 frames of anatomies that were not used for tuning, about 5 minutes on 2 cores.
 """
 
 import sys
