@@ -52,3 +52,13 @@ noise is allowed for on top."""
 HIGHLIGHT_WIDTH_EXCESS = 0.03
 """Most that the isophote of an isolated highlight at t = 0.8 is wider than a Gaussian's of the same width at t = 0.5,
 as a share; noise is allowed for on top."""
+
+SPECULAR_PEAK_SHARE = 0.1
+"""A pixel shows a highlight where the direct specular light behind the sensor is at least this share of the highlight's
+own peak ..."""
+
+SPECULAR_DIFFUSE_RATIO = 1.0
+"""... and at least this many times the light from elsewhere at that pixel."""
+
+SPECULAR_MIN_AREA_PX = 12
+"""A highlight of fewer pixels is none that anyone need find: no ellipse can be fitted to it."""

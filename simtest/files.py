@@ -45,7 +45,8 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
         part.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically; NaN and infinity are refused, since JSON has none."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+def write_json(path: Path, value: Any, compact: bool = False) -> None:
+    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none."""
+    how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
+    text = json.dumps(value, allow_nan=False, **how) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

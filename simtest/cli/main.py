@@ -27,7 +27,7 @@ _COMMANDS = {
     "views": "Pick viewpoints of an anatomy that show isolated highlights.",
     "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
-    "reconstruct": "Reconstruct the normals at the specularities of a picture.",
+    "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
     "validate": "Run an experiment and write its report.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.rendering.frames import FloatImage
+from simtest.resources import shown
 
 
 def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None:
@@ -23,3 +25,19 @@ def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None
     mi = backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
     bitmap.write(str(path))
+
+
+def read_bitmap(path: Path, variant: str | None = None) -> FloatImage:
+    """Read an OpenEXR file as float32, shape (H, W) or (H, W, C).
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    mi = backend.load(variant)
+    try:
+        bitmap = mi.Bitmap(str(path))
+    except RuntimeError as error:
+        raise InputError(f"{shown(path)}: cannot be read ({shown(str(error).splitlines()[-1], 120)})") from None
+    return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32), dtype=np.float32)

@@ -1,0 +1,65 @@
+"""A colour frame of 1280 x 720 with 30 highlights: detection and all normals, against smoothing the frame."""
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.measuring import Figure, in_turns
+from simtest.calibration import Calibration, srgb_encode
+from simtest.colour import detect_in_picture, reconstruct_colour
+from simtest.geometry import Camera
+from simtest.imaging.single import default_estimators
+
+WIDTH, HEIGHT, HIGHLIGHTS = 1280, 720, 30
+ROUNDS = 9
+BLURS = 10
+LIMIT_S = 0.5
+
+
+def frame() -> npt.NDArray[np.float32]:
+    """Give a shaded, mottled tissue in a round view with 30 highlights of 2 to 9 px, 8 bits."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    shading = 0.35 + 0.2 * np.sin(x / 170) * np.cos(y / 130)
+    linear = shading[..., None] * np.array([0.55, 0.28, 0.22])
+    for i in range(HIGHLIGHTS):
+        column, row = 220 + 160 * (i % 6) + rng.uniform(-30, 30), 120 + 115 * (i // 6) + rng.uniform(-25, 25)
+        across, along = rng.uniform(2, 9, 2)
+        spot = np.exp(-0.5 * (((x - column) / across) ** 2 + ((y - row) / max(along, across / 2)) ** 2))
+        linear += rng.uniform(0.4, 1.2) * spot[..., None]
+    linear += rng.normal(0, 0.004, linear.shape)
+    linear[np.hypot(x - WIDTH / 2, y - HEIGHT / 2) > 560] = 0.002
+    return (np.rint(255 * srgb_encode(np.clip(linear, 0, 1))) / 255).astype(np.float32)
+
+
+def figures() -> list[Figure]:
+    """Give the figures."""
+    picture = frame()
+    calibration = Calibration(Camera.from_fov(70.0, WIDTH, HEIGHT))
+    names = default_estimators(calibration)
+
+    def blurs() -> None:
+        for _ in range(BLURS):
+            cv2.GaussianBlur(picture, (0, 0), 2.0)
+
+    found = reconstruct_colour(picture, calibration, names)
+    times = in_turns(
+        {
+            "blurs": blurs,
+            "detection": lambda: detect_in_picture(picture),
+            "all": lambda: reconstruct_colour(picture, calibration, names),
+        },
+        ROUNDS,
+    )
+    about = ", ".join(f"{name} {1e3 * seconds:.0f} ms" for name, seconds in times.items())
+    count = len(found.specularities)
+    return [
+        Figure(
+            f"1280 x 720, {count} highlights, detection over {BLURS} blurs",
+            times["detection"] / times["blurs"],
+            4.0,
+            about=about,
+        ),
+        Figure(f"1280 x 720, {count} highlights, all normals over {BLURS} blurs", times["all"] / times["blurs"], 8.0),
+        Figure(f"1280 x 720, {count} highlights, all normals", times["all"], LIMIT_S, unit="s"),
+    ]

@@ -1,0 +1,167 @@
+"""The part of a picture that the endoscope shows: round, or with cut corners; found in the picture itself."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.geometry import ViewMask
+from simtest.seeds import from_integer
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Points = npt.NDArray[np.float64]
+
+WORKING_PX = 480
+"""Longer side that the border is looked for at."""
+
+DARK = 0.1
+"""Encoded value below which the corners outside of a view lie: black level, noise and stray light."""
+
+TRIPLES = 300
+"""Circles that are tried through three points of the border."""
+
+INLIER_SHARE = 0.6
+"""Least share of the border that lies on the circle; the rest may be cut straight by the picture or be dark tissue."""
+
+TOLERANCE = 0.006
+"""What counts as on the border's curve, as a share of the working picture's longer side."""
+
+MAX_CORNERS = 10
+"""Eight cut by the border, and one or two where noise cuts a corner in two."""
+
+SIDE_PX = 1.5
+"""How far the lit part may be from straight sides, px of the working picture."""
+
+UNFILLED, FILLED = 0.01, 0.6
+"""Most of the picture that may be dark inside the sides; least that lies inside them."""
+
+MARGIN = 0.012
+"""Width of the rim that belongs to the border, as a share of the picture's longer side: bright edges, stray light."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a picture shows tissue.
+
+    Parameters
+    ----------
+    seen : ndarray of bool, shape (H, W), or None
+        Inside the border, its bright rim taken off; None where the whole picture is seen.
+    circle : ViewMask or None
+        The border, where it is round.
+    """
+
+    seen: Mask | None
+    circle: ViewMask | None = None
+
+
+WHOLE = View(None)
+
+
+def find_view(picture: npt.NDArray[np.floating]) -> View:
+    """Find the border of the view.
+
+    Parameters
+    ----------
+    picture : ndarray, shape (H, W) or (H, W, 3)
+        Values as encoded, in [0, 1].
+
+    Returns
+    -------
+    View
+        The whole picture where fewer than two of its corners are dark, or the dark part's border is neither round nor a
+        polygon of few corners: an organ before a dark background has no such border.
+    """
+    height, width = picture.shape[:2]
+    scale = min(1.0, WORKING_PX / max(height, width))
+    size = (max(round(width * scale), 8), max(round(height * scale), 8))
+    small = cv2.resize(np.ascontiguousarray(picture, dtype=np.float32), size, interpolation=cv2.INTER_AREA)
+    inside = _inside(small if small.ndim == 2 else small.max(axis=2))
+    if inside is None:
+        return WHOLE
+    border = _border(inside)
+    if len(border) < 30:
+        return WHOLE
+    tolerance = max(1.5, TOLERANCE * max(size))
+    ratio = np.array([width / size[0], height / size[1]])
+    hull = cv2.convexHull(np.argwhere(inside)[:, ::-1].astype(np.int32).reshape(-1, 1, 2))
+    filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
+    # Cut corners lie on a circle too, within a pixel or two: straight sides are looked for first.
+    polygon = _is_polygon(inside, filled, hull)
+    circle = None if polygon else _circle(border, tolerance)
+    if circle is None and not polygon:
+        return WHOLE
+    if circle is not None:
+        x, y, radius = circle
+        grid_x, grid_y = np.arange(size[0]) - x, np.arange(size[1]) - y
+        filled &= grid_x[None] ** 2 + grid_y[:, None] ** 2 <= radius**2
+        # Coordinates of the small picture are integer-centred.
+        cx, cy = (np.array([x, y]) + PIXEL_CENTRE) * ratio
+        found = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
+    else:
+        found = None
+    # The distance transform does not count the picture's own edges: there is no rim along them.
+    depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
+    depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
+    return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), found)
+
+
+def _inside(brightness: Image) -> Mask | None:
+    """Give the lit part of a small picture, its dark surroundings taken off; None where the corners are lit."""
+    smooth = cv2.blur(brightness, (3, 3))
+    corner = max(2, round(0.02 * max(smooth.shape)))
+    ends = (np.s_[:corner], np.s_[-corner:])
+    corners = [smooth[rows, columns] for rows in ends for columns in ends]
+    dark = [float(c.mean()) for c in corners if float(c.mean()) < DARK]
+    if len(dark) < 2:
+        return None
+    level = max(0.05, 1.5 * max(dark) + 0.02)
+    below = np.pad((smooth < level).astype(np.uint8), 1, constant_values=1)
+    cv2.floodFill(below, None, (0, 0), 2)
+    lit = (below[1:-1, 1:-1] != 2).astype(np.uint8)
+    lit = cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(lit)
+    if count < 2:
+        return None
+    return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _border(inside: Mask) -> Points:
+    """Give the border's points inside the picture, shape (N, 2), integer-centred."""
+    contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    points = max(contours, key=len)[:, 0].astype(float)
+    height, width = inside.shape
+    clear = (points >= 2).all(axis=1) & (points[:, 0] < width - 2) & (points[:, 1] < height - 2)
+    return np.asarray(points[clear])
+
+
+def _circle(points: Points, tolerance: float) -> tuple[float, float, float] | None:
+    """Fit a circle to the share of points that lie on one; gives centre and radius, or None."""
+    rng = from_integer(0)
+    a, b, c = points[rng.integers(0, len(points), (3, TRIPLES))]
+    A = 2 * np.stack([b - a, c - a], axis=1)
+    rhs = np.stack([(b**2 - a**2).sum(axis=1), (c**2 - a**2).sum(axis=1)], axis=1)
+    solvable = np.abs(np.linalg.det(A)) > 1e-6
+    centres = np.linalg.solve(A[solvable], rhs[solvable][:, :, None])[:, :, 0]
+    radii = np.linalg.norm(a[solvable] - centres, axis=1)
+    gaps = np.abs(np.linalg.norm(points[None] - centres[:, None], axis=2) - radii[:, None])
+    counts = (gaps <= tolerance).sum(axis=1)
+    if not len(counts) or counts.max() < INLIER_SHARE * len(points):
+        return None
+    on = points[gaps[int(counts.argmax())] <= tolerance]
+    solution, *_ = np.linalg.lstsq(np.column_stack([2 * on, np.ones(len(on))]), (on**2).sum(axis=1), rcond=None)
+    x, y, level = (float(v) for v in solution)
+    radius = float(np.sqrt(level + x * x + y * y))
+    # A flat arc has its centre anywhere: a view's border turns around the picture.
+    spread = np.ptp(on, axis=0)
+    return (x, y, radius) if radius <= 1.2 * float(np.hypot(*spread)) else None
+
+
+def _is_polygon(inside: Mask, filled: Mask, hull: npt.NDArray[np.int32]) -> bool:
+    """Tell whether the lit part is a convex polygon of few corners that fills most of the picture."""
+    if np.count_nonzero(filled & ~inside) > UNFILLED * filled.size or np.count_nonzero(filled) < FILLED * filled.size:
+        return False
+    return len(cv2.approxPolyDP(hull, SIDE_PX, True)) <= MAX_CORNERS

@@ -1,0 +1,1 @@
+"""How well specularities are detected in colour frames: rendered frames, their specular masks, scores."""

@@ -1,0 +1,268 @@
+import cv2
+import numpy as np
+import pytest
+
+from simtest.calibration import Calibration, srgb_encode
+from simtest.colour import detect_in_picture, reconstruct_colour
+from simtest.detection.blobs import Kind
+from simtest.detection.light_split import fill, split_light
+from simtest.detection.view_mask import find_view
+from simtest.estimators import Estimate
+from simtest.geometry import Camera
+from simtest.validation.detection.scores import Scores, score
+from simtest.validation.detection.truth import SpecularTruth, specular_truth
+
+WIDTH, HEIGHT = 320, 240
+TISSUE = np.array([0.55, 0.28, 0.22])
+
+
+def places():
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return x, y
+
+
+def lobe(x0, y0, across, along=None, turn=0.0, peak=1.0):
+    """A Gaussian highlight; widths in px."""
+    x, y = places()
+    u, v = x - x0, y - y0
+    c, s = np.cos(turn), np.sin(turn)
+    u, v = c * u + s * v, c * v - s * u
+    return peak * np.exp(-0.5 * ((u / across) ** 2 + (v / (along or across)) ** 2))
+
+
+def picture(specular, tissue=TISSUE, noise=0.004, seed=0):
+    """A shaded, mottled tissue under grey light, as an 8-bit sRGB picture."""
+    x, y = places()
+    rng = np.random.default_rng(seed)
+    shading = 0.35 + 0.2 * np.sin(x / 70) * np.cos(y / 50) + 0.15 * x / WIDTH
+    linear = shading[..., None] * tissue + np.asarray(specular)[..., None]
+    linear = np.clip(linear + rng.normal(0, noise, linear.shape), 0, 1)
+    return (np.rint(255 * srgb_encode(linear)) / 255).astype(np.float32)
+
+
+def kinds(specular, **how):
+    found = detect_in_picture(picture(specular, **how)).detection
+    return [(h.kind, np.array(h.region.peak) + 0.5) for h in found.highlights]
+
+
+def test_isolated_highlights_are_found_where_they_are_and_nothing_else():
+    spots = [(60, 50, 4.0), (160, 120, 8.0), (250, 180, 2.0)]
+    found = kinds(sum(lobe(x, y, width) for x, y, width in spots))
+    assert [kind for kind, _ in found] == [Kind.ISOLATED] * 3
+    for x, y, _ in spots:
+        assert min(np.hypot(*(place - [x, y])) for _, place in found) < 3
+
+
+@pytest.mark.parametrize("tissue", [TISSUE, np.array([0.35, 0.10, 0.08]), np.array([0.6, 0.45, 0.40])])
+def test_tissue_without_highlights_shows_none(tissue):
+    assert kinds(np.zeros((HEIGHT, WIDTH)), tissue=tissue) == []
+
+
+@pytest.mark.parametrize(
+    ("specular", "expected"),
+    [
+        (lobe(160, 120, 16.0, 2.5, 0.4), Kind.ELONGATED),
+        (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.MERGED),
+        (lobe(3, 120, 5.0), Kind.BORDER),
+        (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.MERGED),
+    ],
+)
+def test_other_kinds_are_told_apart(specular, expected):
+    found = kinds(specular)
+    assert found
+    assert found[0][0] is expected
+    assert not any(kind is Kind.ISOLATED for kind, _ in found)
+
+
+def test_light_that_met_tissue_before_is_no_isolated_highlight():
+    frame = picture(np.zeros((HEIGHT, WIDTH)))
+    linear = np.where(frame <= 0.04045, frame / 12.92, ((frame + 0.055) / 1.055) ** 2.4)
+    for colour, isolated in (((1.0, 1.0, 1.0), 1), ((1.0, 0.30, 0.22), 0)):
+        added = np.clip(linear + 0.6 * lobe(160, 120, 6.0)[..., None] * np.array(colour), 0, 1)
+        found = detect_in_picture(srgb_encode(added).astype(np.float32)).detection
+        assert len(found.isolated) == isolated
+
+
+def test_the_split_gives_the_specular_light_whatever_the_shading():
+    specular = 0.4 * lobe(100, 80, 6.0) + 0.2 * lobe(220, 150, 10.0)
+    frame = picture(specular, noise=0.002).astype(np.float64)
+    linear = np.where(frame <= 0.04045, frame / 12.92, ((frame + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    light = split_light(linear, np.zeros(linear.shape[:2], dtype=bool))
+    assert np.sqrt(np.mean((light.specular - specular) ** 2)) < 0.006
+    np.testing.assert_allclose(light.specular + light.tissue, light.intensity, atol=1e-6)
+
+
+def test_fill_keeps_what_is_known_and_is_smooth_between():
+    x, y = places()
+    values = (0.2 + x / WIDTH + 0.5 * y / HEIGHT).astype(np.float32)
+    known = np.ones(values.shape, dtype=bool)
+    known[90:150, 100:200] = False
+    filled = fill(np.where(known, values, 9.0).astype(np.float32), known)
+    np.testing.assert_allclose(filled[known], values[known], atol=1e-6)
+    assert np.abs(filled - values)[~known].max() < 0.12
+    assert not fill(values, np.zeros_like(known)).any()
+
+
+def test_normals_of_a_sphere_point_back_along_the_sightlines():
+    camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
+    made = reconstruct_colour(picture(lobe(90, 70, 5.0) + lobe(230, 160, 6.0, 4.0)), Calibration(camera))
+    assert len(made.specularities) == len(made.highlights) == 2
+    for spot in made.specularities:
+        estimate = spot.estimates["cone_axis"]
+        assert isinstance(estimate, Estimate)
+        angle = np.degrees(np.arccos(-estimate.normal @ camera.unproject(spot.patch.peak_px)))
+        assert angle < 0.3
+
+
+def test_small_highlights_are_flagged():
+    made = reconstruct_colour(
+        picture(lobe(100, 100, 1.3) + lobe(220, 100, 6.0)), Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
+    )
+    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
+    assert "small" in flags[100]
+    assert "small" not in flags[220]
+
+
+# The view's border ------------------------------------------------------------------------------------------------
+
+
+def framed(inside):
+    frame = picture(np.zeros((HEIGHT, WIDTH))) + 0.15
+    frame[~inside] = 0.02
+    return np.clip(frame, 0, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize(("cx", "cy", "radius"), [(160, 120, 110), (150, 125, 135), (160, 120, 150)])
+def test_a_round_border_is_found(cx, cy, radius):
+    x, y = places()
+    inside = (x - cx) ** 2 + (y - cy) ** 2 <= radius**2
+    view = find_view(framed(inside))
+    assert view.circle is not None
+    np.testing.assert_allclose([view.circle.cx, view.circle.cy, view.circle.radius], [cx, cy, radius], atol=1.5)
+    assert not (view.seen & ~inside).any()
+    assert np.count_nonzero(view.seen) > 0.9 * np.count_nonzero(inside)
+
+
+def test_cut_corners_are_found():
+    x, y = places()
+    inside = np.minimum(x, WIDTH - x) + np.minimum(y, HEIGHT - y) > 50
+    view = find_view(framed(inside))
+    assert view.circle is None
+    assert not (view.seen & ~inside).any()
+    assert np.count_nonzero(view.seen) > 0.9 * np.count_nonzero(inside)
+
+
+def test_whole_pictures_and_organs_before_the_dark_have_no_border():
+    assert find_view(picture(lobe(160, 120, 6.0))).seen is None
+    x, y = places()
+    angle, away = np.arctan2(y - 120, x - 160), np.hypot(x - 160, y - 120)
+    organ = away < 70 + 18 * np.cos(3 * angle) + 9 * np.sin(5 * angle)
+    assert find_view(framed(organ)).seen is None
+    assert find_view(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)).seen is None
+
+
+def test_a_bright_rim_is_no_highlight():
+    x, y = places()
+    away = np.hypot(x - 160, y - 120)
+    frame = framed(away <= 110)
+    frame[(away > 108) & (away <= 110)] = 1.0
+    assert detect_in_picture(frame).detection.isolated == []
+
+
+# The study's truth and scores -------------------------------------------------------------------------------------
+
+
+def test_the_true_mask_keeps_to_both_thresholds():
+    specular, other = lobe(100, 100, 8.0, peak=0.5).astype(np.float32), np.full((HEIGHT, WIDTH), 0.02, dtype=np.float32)
+    truth = specular_truth(specular, other, 0.001)
+    np.testing.assert_array_equal(truth.mask, specular >= 0.05)
+    brighter = np.full_like(other, 0.1)
+    np.testing.assert_array_equal(specular_truth(specular, brighter, 0.001).mask, specular >= 0.1)
+    np.testing.assert_array_equal(specular_truth(specular, other, 0.001, peak_share=0.2).mask, specular >= 0.1)
+    # Where the tissue alone is above half of full scale, what is left of it cannot exceed it.
+    assert specular_truth(10 * specular, np.full_like(other, 0.6), 0.001).count == 0
+
+
+def test_faint_and_tiny_highlights_are_unclear():
+    specular = (lobe(80, 80, 5.0, peak=0.05) + lobe(200, 80, 0.5, peak=0.5)).astype(np.float32)
+    truth = specular_truth(specular, np.zeros_like(specular) + 0.001, 0.01)
+    assert truth.count == 0
+    assert truth.unclear[80, 80]
+    assert truth.unclear[79, 199]
+    assert score(truth.unclear, truth) == Scores()
+
+
+def test_scores_count_highlights_and_pixels():
+    labels = np.zeros((40, 60), dtype=np.int32)
+    labels[5:15, 5:15], labels[20:30, 30:40] = 1, 2
+    truth = SpecularTruth(labels, np.zeros(labels.shape, dtype=bool))
+    detected = np.zeros(labels.shape, dtype=bool)
+    detected[5:15, 6:15] = True  # nine tenths of the first
+    detected[33:38, 2:8] = True  # nothing there
+    detected[2, 50:52] = True  # too few pixels to count
+    found = score(detected, truth)
+    assert (found.hits, found.false, found.missed) == (1, 1, 1)
+    assert (found.pixel_hits, found.pixel_false, found.pixel_missed) == (90, 32, 110)
+    assert (found + found).hits == 2
+    assert found.f1 == pytest.approx(0.5)
+    assert found.dice == pytest.approx(180 / (180 + 32 + 110))
+    assert np.isnan(Scores().f1)
+
+
+# Real frames ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def real(shared_data):
+    def read(name):
+        values = cv2.imread(str(shared_data / "frames" / name), cv2.IMREAD_UNCHANGED)
+        scaled = values[:, :, 2::-1].astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+        return detect_in_picture(np.ascontiguousarray(scaled))
+
+    return read
+
+
+def test_a_colon_without_highlights_shows_none(real):
+    assert real("no_highlight_simcol_0001.png").detection.isolated == []
+
+
+def test_the_turbinate_s_highlight_is_found_and_the_bright_rim_is_not(real):
+    found = real("sinus_00004598.jpg")
+    (spot,) = found.detection.isolated
+    assert np.hypot(spot.region.peak[0] - 886, spot.region.peak[1] - 682) < 15
+    assert found.view.circle.radius == pytest.approx(527, abs=5)
+
+
+def test_highlights_of_a_real_colonoscopy(real):
+    found = real("fig7_a.bmp").detection.isolated
+    # Marked by eye: some that stand alone, each within 3 px.
+    by_eye = [(287, 248), (309, 237), (324, 228), (296, 133), (310, 124), (329, 110), (57, 77), (42, 57), (355, 196)]
+    for x, y in by_eye:
+        assert min(np.hypot(s.region.peak[0] - x, s.region.peak[1] - y) for s in found) <= 3, (x, y)
+
+
+def test_no_mark_on_instrument_or_border_of_a_real_laparoscopy(real):
+    found = real("laparoscopy_0.png")
+    assert len(found.detection.isolated) > 60
+    assert found.view.circle.radius == pytest.approx(568.5, abs=5)
+    for spot in found.detection.isolated:
+        x, y = spot.region.peak
+        assert np.hypot(x - found.view.circle.cx, y - found.view.circle.cy) < found.view.circle.radius - 8
+        # The jaws lie between (590, 100) and (740, 0).
+        assert not (590 <= x <= 740 and abs(y - (100 - 0.66 * (x - 590))) < 22), (x, y)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (2, 3), (9, 9), (40, 17), (200, 8)])
+def test_pictures_of_any_size_and_content_are_borne(shape):
+    rng = np.random.default_rng(1)
+    for picture_ in (
+        np.zeros((*shape, 3)),
+        np.ones((*shape, 3)),
+        rng.random((*shape, 3)),
+        np.where(rng.random((*shape, 1)) < 0.2, 1.0, [0.5, 0.2, 0.2]),
+        np.broadcast_to(rng.random((shape[0], 1, 3)), (*shape, 3)),
+    ):
+        found = detect_in_picture(np.ascontiguousarray(picture_, dtype=np.float32))
+        assert found.detection.mask.shape == shape
+        assert np.isfinite(found.detection.light.specular).all()
+        assert all(0 <= highlight.score <= 1 for highlight in found.detection.highlights)

@@ -1,0 +1,434 @@
+import csv
+import json
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image as PillowImage
+from test_colour_detection import HEIGHT, WIDTH, lobe, picture
+
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.imaging.constraints import arrays
+from simtest.imaging.depth import depth_normals, depth_points, depths_at, judge_depth, read_depth
+from simtest.imaging.reading import is_coloured, read_picture
+from simtest.imaging.reference import load_reference, read_pose
+from simtest.imaging.single import Options
+from simtest.imaging.sources import open_source
+from simtest.imaging.tracking import Tracker
+from simtest.picture import Extras, reconstruct_picture
+from simtest.sequence import reconstruct_sequence
+
+SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
+FOV = 60.0
+CAMERA = Camera.from_fov(FOV, WIDTH, HEIGHT)
+
+
+def frame(shift=0.0):
+    return picture(sum(lobe(x + shift, y, width, peak=0.5) for x, y, width in SPOTS))
+
+
+def save(path, values):
+    """Write RGB values in [0, 1] as 8 bits."""
+    cv2.imwrite(str(path), np.rint(255 * values[:, :, ::-1]).astype(np.uint8))
+    return path
+
+
+@pytest.fixture
+def shot(tmp_path):
+    return save(tmp_path / "shot.png", frame())
+
+
+def told(run, *fragments):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(InputError) as caught:
+            run()
+    message = str(caught.value)
+    assert "\n" not in message
+    for fragment in fragments:
+        assert fragment in message, message
+
+
+def by_fov(path, out, **how):
+    return reconstruct_picture(path, out, fov_deg=FOV, **how)
+
+
+def quietly(path, out, **how):
+    with pytest.warns(UserWarning, match="angles depend on the field of view of 60 deg"):
+        return by_fov(path, out, **how)
+
+
+# A picture --------------------------------------------------------------------------------------------------------
+
+
+def test_a_picture_gives_all_files(shot, tmp_path):
+    count, files = quietly(shot, tmp_path / "out")
+    assert count == 2
+    assert [file.name for file in files] == [
+        "normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
+        "constraints.npz", "index.html",
+    ]  # fmt: skip
+    document = json.loads(files[0].read_text())
+    assert document["detector"] == "colour"
+    for spot in document["specularities"]:
+        assert spot["kind"] == "isolated"
+        assert len(spot["estimates"]["circle_pose"]["candidates"]) == 2
+        best = spot["estimates"][spot["best"]]
+        assert np.array(best["covariance"]).shape == (2, 2)
+        assert np.dot(best["normal"], spot["sightline"]) == pytest.approx(-1, abs=1e-3)
+    rows = list(csv.DictReader(files[1].read_text().splitlines()))
+    assert {row["best"] for row in rows} == {"0", "1"}
+    assert len(trimesh.load(files[4]).faces) == 2 * 30
+    overlay = cv2.imread(str(files[3]))
+    assert overlay.shape[1] == 3 * WIDTH
+    page = files[7].read_text()
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
+
+
+def test_constraints_as_arrays(shot, tmp_path):
+    _, files = quietly(shot, tmp_path / "out")
+    described, stored = json.loads(files[5].read_text()), np.load(files[6], allow_pickle=False)
+    for name, values in arrays(described).items():
+        np.testing.assert_array_equal(stored[name], values)
+    assert stored["normal"].shape == (2, 3)
+    np.testing.assert_allclose(stored["basis"] @ stored["normal"][:, :, None], 0, atol=1e-12)
+    np.testing.assert_allclose(stored["sightline"], CAMERA.unproject(stored["pixel"]))
+    np.testing.assert_allclose(stored["K"], CAMERA.K)
+
+
+def test_a_depth_places_the_points(shot, tmp_path):
+    _, files = quietly(shot, tmp_path / "out", extras=Extras(depth="50"))
+    vertices = [line.split() for line in files[2].read_text().split("end_header\n")[1].splitlines()]
+    assert {float(v[2]) for v in vertices} == {50.0}
+    told(lambda: depths_at("-3", [], (4, 4), None), "--depth -3", "positive number of mm")
+
+
+@pytest.mark.parametrize("detector", ["auto", "peaks"])
+def test_grey_pictures_keep_to_peaks(tmp_path, detector):
+    values = np.clip(0.05 + 0.9 * lobe(160, 120, 8.0), 0, 1)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.rint(65535 * values).astype(np.uint16))
+    count, files = quietly(tmp_path / "grey.png", tmp_path / "out", detector=detector)
+    assert count == 1
+    assert json.loads(files[0].read_text())["detector"] == "peaks"
+    told(lambda: by_fov(tmp_path / "grey.png", tmp_path / "o", detector="colour"), "the picture is grey")
+
+
+# Bad pictures -----------------------------------------------------------------------------------------------------
+
+
+def test_files_that_are_no_pictures(tmp_path):
+    (tmp_path / "text.png").write_text("this is no picture\n")
+    (tmp_path / "empty.png").write_bytes(b"")
+    told(lambda: by_fov(tmp_path / "text.png", tmp_path / "o"), "text.png: no picture (19 bytes)")
+    told(lambda: by_fov(tmp_path / "empty.png", tmp_path / "o"), "empty.png: no picture (0 bytes)")
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path):
+    PillowImage.new("1", (20000, 20000)).save(tmp_path / "huge.png")
+    told(lambda: read_picture(tmp_path / "huge.png"), "huge.png", "400000000 pixels", "at most 100000000 px")
+    PillowImage.new("1", (12000, 9000)).save(tmp_path / "large.png")
+    told(lambda: read_picture(tmp_path / "large.png"), "12000 x 9000 px", "at most 100000000 px")
+
+
+def test_other_depths_and_channels_are_read(tmp_path):
+    values = frame()
+    wide = np.rint(65535 * values[:, :, ::-1]).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "wide.png"), wide)
+    cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([wide >> 8, np.full(wide.shape[:2], 7)]).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "grey.png"), (wide[:, :, 0] >> 8).astype(np.uint8))
+    np.testing.assert_allclose(read_picture(tmp_path / "wide.png"), values, atol=1e-5)
+    assert read_picture(tmp_path / "alpha.png").shape == (HEIGHT, WIDTH, 3)
+    assert read_picture(tmp_path / "grey.png").shape == (HEIGHT, WIDTH)
+    assert is_coloured(read_picture(tmp_path / "alpha.png"))
+    assert not is_coloured(np.repeat(read_picture(tmp_path / "grey.png")[:, :, None], 3, axis=2))
+    for name in ("wide", "alpha"):
+        assert quietly(tmp_path / f"{name}.png", tmp_path / name)[0] == 2
+
+
+def test_a_camera_of_another_size(shot, tmp_path):
+    (tmp_path / "camera.toml").write_text("width = 640\nheight = 480\nfx = 500.0\nfy = 500.0\n")
+    told(
+        lambda: reconstruct_picture(shot, tmp_path / "o", tmp_path / "camera.toml"),
+        "320 x 240 px: must be 640 x 480, the size of the camera's calibration",
+    )
+
+
+# Folders and videos -----------------------------------------------------------------------------------------------
+
+
+def run(path, out, progress=None, **options):
+    with pytest.warns(UserWarning, match="angles depend"):
+        return reconstruct_sequence(path, out, fov_deg=FOV, options=Options(**options), progress=progress)
+
+
+def noted(path, out):
+    """Give the result and the texts of all warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = reconstruct_sequence(path, out, fov_deg=FOV)
+    return result, " ".join(str(w.message) for w in caught)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for i in (1, 2, 10):
+        save(pictures / f"frame{i}.png", frame(3.0 * min(i, 3)))
+    return pictures
+
+
+def test_a_folder_gives_tracks_and_a_table_over_time(folder, tmp_path):
+    result = run(folder, tmp_path / "out")
+    assert (result.frames, result.failed, result.specularities, result.tracks) == (3, 0, 6, 2)
+    rows = list(csv.DictReader((tmp_path / "out" / "timeline.csv").read_text().splitlines()))
+    assert [row["track"] for row in rows if row["estimator"] == "cone_axis" and row["frame"] == "0"] == ["0", "1"]
+    for track in json.loads((tmp_path / "out" / "tracks.json").read_text()):
+        assert track["frames"] == [0, 1, 2]
+        x = [peak[0] for peak in track["peaks_px"]]
+        np.testing.assert_allclose(np.diff(x), 3.0, atol=0.3)
+    assert cv2.imread(str(tmp_path / "out" / "frames" / "000002.jpg")) is not None
+    assert "frames/000001.jpg" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_stopped_run_goes_on(folder, tmp_path):
+    def stop(done, total, what):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, tmp_path / "out", progress=stop)
+    kept = tmp_path / "out" / "frames" / "000000.json"
+    before = kept.stat().st_mtime_ns
+    (tmp_path / "out" / "frames" / "000001.json").write_text("{half a fi")
+    run(folder, tmp_path / "out")
+    assert kept.stat().st_mtime_ns == before
+    run(folder, tmp_path / "whole")
+    for name in ("timeline.csv", "tracks.json"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    other = Options(every=True)
+    again = lambda: reconstruct_sequence(folder, tmp_path / "out", fov_deg=FOV, options=other)  # noqa: E731
+    told(again, "holds a run with another every")
+
+
+def test_a_broken_picture_in_a_folder_is_told_and_passed_over(folder, tmp_path):
+    (folder / "frame5.png").write_text("no picture")
+    save(folder / "frame7.png", frame()[:100])
+    result, texts = noted(folder, tmp_path / "out")
+    assert "frame 2: " in texts
+    assert "no picture (10 bytes)" in texts
+    assert "must be 320 x 240" in texts
+    assert (result.frames, result.failed, result.tracks) == (5, 2, 2)
+
+
+def video(path, count):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (WIDTH, HEIGHT))
+    if not writer.isOpened():
+        pytest.skip("OpenCV writes no MJPG here")
+    for i in range(count):
+        writer.write(np.rint(255 * frame(float(i))[:, :, ::-1]).astype(np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_video_that_stops_half_way_keeps_what_was_read(tmp_path):
+    path = video(tmp_path / "whole.avi", 6)
+    assert open_source(path).count == 6
+    broken = tmp_path / "broken.avi"
+    broken.write_bytes(path.read_bytes()[: path.stat().st_size * 55 // 100])
+    result, texts = noted(broken, tmp_path / "out")
+    assert 1 <= result.frames < 6
+    assert result.specularities >= 2 * (result.frames - 1)
+    assert "ends after" in texts
+    assert "what was read is kept" in texts
+    assert (tmp_path / "out" / "timeline.csv").stat().st_size > 1000
+
+
+def test_what_is_no_sequence(tmp_path):
+    (tmp_path / "clip.mp4").write_text("no video")
+    (tmp_path / "none.avi").write_bytes(b"")
+    (tmp_path / "nothing").mkdir()
+    told(lambda: open_source(tmp_path / "clip.mp4"), "clip.mp4: no video that can be read (8 bytes)")
+    told(lambda: open_source(tmp_path / "none.avi"), "none.avi: no video that can be read (0 bytes)")
+    told(lambda: open_source(tmp_path / "nothing"), "holds no pictures")
+    told(lambda: open_source(tmp_path / "missing.mp4"), "no such file")
+
+
+def test_tracks_cross_gaps_and_do_not_jump():
+    tracker = Tracker((640, 480))
+    assert tracker.update([(100, 100), (300, 200)]) == [0, 1]
+    assert tracker.update([(305, 203), (104, 100)]) == [1, 0]
+    assert tracker.update([(108, 100)]) == [0]
+    assert tracker.update([(111, 101), (310, 206)]) == [0, 1]
+    assert tracker.update([(500, 400)]) == [2]
+    assert tracker.update([]) == []
+
+
+# References -------------------------------------------------------------------------------------------------------
+
+
+def pose_file(path, matrix):
+    path.write_text(f"matrix = {np.asarray(matrix).tolist()}\n")
+    return path
+
+
+def rotation(axis, angle):
+    return cv2.Rodrigues(np.array(axis, dtype=float) / np.linalg.norm(axis) * angle)[0]
+
+
+def test_a_registered_sphere_gives_its_normals(shot, tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=40.0)
+    ball.export(tmp_path / "ball.ply")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation([1, 2, 3], 0.7), [3.0, -2.0, 100.0]
+    reference = load_reference(tmp_path / "ball.ply", pose_file(tmp_path / "pose.toml", pose), CAMERA)
+    pixels = np.array([[160.0, 120.0], [180.0, 100.0], [2.0, 2.0]])
+    normals = reference.normals_at(pixels, CAMERA)
+    rays, centre = CAMERA.unproject(pixels), pose[:3, 3]
+    for ray, normal in zip(rays[:2], normals[:2], strict=True):
+        along = ray @ centre - np.sqrt((ray @ centre) ** 2 - centre @ centre + 1600)
+        np.testing.assert_allclose(normal, (along * ray - centre) / 40, atol=4e-3)
+    assert np.isnan(normals[2]).all()
+
+
+def test_comparison_with_a_reference(shot, tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=60.0)
+    ball.apply_translation([0, 0, 100])
+    ball.export(tmp_path / "ball.ply")
+    pose = pose_file(tmp_path / "pose.toml", np.eye(4))
+    _, files = quietly(shot, tmp_path / "out", extras=Extras(tmp_path / "ball.ply", pose))
+    document = json.loads(files[0].read_text())
+    table = document["reference"]
+    assert table["compared"] == 2
+    assert table["missed"] == 0
+    for name, row in table["estimators"].items():
+        angles = [spot["reference"]["errors"][name]["error_deg"] for spot in document["specularities"]]
+        assert row["mean_deg"] == pytest.approx(np.mean(angles))
+        assert row["std_deg"] == pytest.approx(np.std(angles, ddof=1))
+        assert row["mean_oracle_deg"] <= row["mean_deg"] + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        (f"matrix = {(2 * np.eye(4)).tolist()}", ("last row",)),
+        (f"matrix = {np.diag([1.1, 1.0, 1.0, 1.0]).tolist()}", ("no rotation", "R^T R")),
+        (f"matrix = {np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()}", ("no rotation", "mirror image")),
+        ("rotation = [[1, 0], [0, 1]]\ntranslation_mm = [0, 0, 0]", ("rotation", "must be 3 x 3 finite numbers")),
+        ("rotation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]", ("translation_mm: missing",)),
+        ("pose = 3", ("pose: unknown key", "allowed: matrix, rotation, translation_mm")),
+        (f"matrix = {np.eye(4).tolist()}\ntranslation_mm = [0, 0, 0]", ("excludes",)),
+    ],
+)
+def test_poses_that_are_none(tmp_path, text, fragments):
+    (tmp_path / "pose.toml").write_text(text + "\n")
+    told(lambda: read_pose(tmp_path / "pose.toml"), "pose.toml", *fragments)
+
+
+def test_references_without_or_with_too_much(shot, tmp_path):
+    trimesh.creation.icosphere(radius=40.0).export(tmp_path / "ball.ply")
+    told(lambda: by_fov(shot, tmp_path / "o", extras=Extras(tmp_path / "ball.ply")), "needs --camera-from-model")
+    pose = pose_file(tmp_path / "pose.toml", np.eye(4))
+    told(lambda: by_fov(shot, tmp_path / "o", extras=Extras(pose=pose)), "needs --reference")
+    np.save(tmp_path / "depth.npy", np.ones((HEIGHT, WIDTH)))
+    told(lambda: load_reference(tmp_path / "depth.npy", pose, CAMERA), "leave it out")
+
+
+# Depth maps -------------------------------------------------------------------------------------------------------
+
+
+def plane_depth(normal, offset=80.0, camera=CAMERA):
+    """z of a plane's points; its unit normal faces the camera."""
+    rays = camera.unproject(camera.pixel_centres())
+    along = -offset / (rays @ normal)
+    return along * rays[..., 2]
+
+
+@pytest.mark.parametrize("tilt", [0.0, 20.0, 50.0])
+def test_normals_of_a_plane_are_exact(tilt):
+    normal = np.array([np.sin(np.radians(tilt)), 0.1, -np.cos(np.radians(tilt))])
+    normal /= np.linalg.norm(normal)
+    found = depth_normals(depth_points(plane_depth(normal), CAMERA))[5:-5, 5:-5].reshape(-1, 3)
+    np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
+
+
+def test_distance_along_the_ray_is_told_apart():
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    normals = depth_normals(depth_points(np.full((HEIGHT, WIDTH), 30.0), CAMERA, "distance"))[5:-5, 5:-5]
+    np.testing.assert_allclose(normals, -rays[5:-5, 5:-5], atol=2e-4)
+
+
+def test_edges_and_holes_have_no_normal():
+    depth = np.full((HEIGHT, WIDTH), 50.0)
+    depth[:, 160:] = 80.0
+    depth[100, 50] = np.nan
+    normals = depth_normals(depth_points(depth, CAMERA))
+    assert np.isnan(normals[60, 158:162]).all()
+    assert np.isnan(normals[98:103, 48:53]).all()
+    assert np.isfinite(normals[60, 100]).all()
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "npy", "exr"])
+def test_depth_maps_of_all_formats(tmp_path, suffix):
+    depth = plane_depth(np.array([0.3, 0.1, -0.9]) / np.linalg.norm([0.3, 0.1, -0.9]))
+    path, scale = tmp_path / f"depth.{suffix}", 0.005
+    if suffix in ("png", "tiff"):
+        cv2.imwrite(str(path), np.rint(depth / scale).astype(np.uint16))
+    elif suffix == "npy":
+        np.save(path, depth)
+    else:
+        from simtest.rendering.bitmap import write_exr
+
+        write_exr(path, depth.astype(np.float32))
+    integers = suffix in ("png", "tiff")
+    found = read_depth(path, scale if integers else None)
+    np.testing.assert_allclose(found, depth, atol=0.6 * scale if integers else 1e-4)
+    verdict = judge_depth(found, depth_normals(depth_points(found, CAMERA)), CAMERA)
+    assert verdict.problems == ()
+    if integers:
+        told(lambda: read_depth(path), "--depth-scale must say how many mm one step is")
+
+
+def test_degenerate_and_coarse_maps_are_told():
+    def problems(depth):
+        return judge_depth(depth, depth_normals(depth_points(depth, CAMERA)), CAMERA).problems
+
+    assert "degenerate" in problems(np.full((HEIGHT, WIDTH), 50.0))[0]
+    slanted = plane_depth(np.array([0.5, 0.0, -0.8]) / np.hypot(0.5, 0.8))
+    coarse = 1.0 * np.round(slanted / 1.0)
+    assert any("degenerate" in text or "too coarse" in text for text in problems(coarse))
+    assert any("too coarse for highlights: steps of" in text for text in problems(2.0 * np.round(slanted / 2.0)))
+    rng = np.random.default_rng(0)
+    rough = slanted + rng.normal(0, 0.3, slanted.shape)
+    assert any("normals turn by" in text for text in problems(rough))
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "fragments"),
+    [
+        ("depth.jpg", lambda p: p.write_bytes(b"x"), ("unknown suffix .jpg",)),
+        ("depth.npy", lambda p: p.write_text("text"), ("cannot be read",)),
+        ("depth.npy", lambda p: np.save(p, np.array([{}], dtype=object), allow_pickle=True), ("cannot be read",)),
+        ("depth.npy", lambda p: np.save(p, np.zeros((4, 4))), ("no positive depth",)),
+        ("depth.npy", lambda p: np.save(p, np.zeros((4, 4, 4, 4))), ("must be (H, W)",)),
+        ("depth.exr", lambda p: p.write_text("text"), ("cannot be read",)),
+        ("depth.png", lambda p: cv2.imwrite(str(p), np.dstack([np.eye(9)] * 2 + [np.ones((9, 9))])), ("channels",)),
+    ],
+)
+def test_depth_maps_that_are_none(tmp_path, name, write, fragments):
+    write(tmp_path / name)
+    told(lambda: read_depth(tmp_path / name, 1.0), name, *fragments)
+
+
+def test_a_depth_map_as_reference(shot, tmp_path):
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    # A sphere around the camera: its normals point back along the sightlines, as do those of highlights.
+    np.save(tmp_path / "depth.npy", 30.0 * rays[..., 2])
+    _, files = quietly(shot, tmp_path / "out", extras=Extras(tmp_path / "depth.npy"))
+    row = json.loads(files[0].read_text())["reference"]["estimators"]["cone_axis"]
+    assert row["n"] == 2
+    assert row["mean_deg"] < 0.3
