@@ -14,7 +14,6 @@ from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.checked import run
-from simtest.estimators.circle_pose import circle_pose, circle_poses
 from simtest.geometry import Camera, Patch, smooth
 from simtest.resources import shown
 
@@ -180,24 +179,17 @@ def run_estimators(
     patches = [
         _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
     ]
-    results = {name: _run_on_all(made, patches, calibration) for name, made in estimators.items()}
     return [
-        Specularity(region, patch, {name: _flagged(made[i], patch, limited) for name, made in results.items()})
-        for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))
+        Specularity(
+            region,
+            patch,
+            {
+                name: _flagged(run(made, patch, calibration.camera, calibration.known), patch, limited)
+                for name, made in estimators.items()
+            },
+        )
+        for (region, _), patch in zip(found, patches, strict=True)
     ]
-
-
-def _run_on_all(
-    estimator: Estimator, patches: Sequence[Patch | Failure], calibration: Calibration
-) -> list[Estimate | Failure]:
-    """Run an estimator on patches; circle_pose on all at once, which gives the same for less."""
-    if estimator is circle_pose and len(patches) > 1:
-        try:
-            return circle_poses(patches, calibration.camera)
-        except Exception:
-            # One by one each tells its own failure.
-            pass
-    return [run(estimator, patch, calibration.camera, calibration.known) for patch in patches]
 
 
 def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:
