@@ -523,3 +523,16 @@ def test_commands(made, tmp_path, monkeypatch, capsys):
     code, said = run("verify", "made", "--repair")
     assert (code, said[-1]) == (0, "mended")
     assert contents(tmp_path / "made") == contents(made)
+
+
+def test_a_dataset_of_another_version_is_sound_as_well(copy):
+    manifest = read_manifest(copy)
+    manifest.origin["source"] = "that of an older version"
+    manifest.save(copy)
+    table = pl.read_parquet(copy / ESTIMATES)
+    table.drop(table.columns[-1]).write_parquet(copy / ESTIMATES)
+    new_card(copy)
+    honest(copy, ESTIMATES)
+    assert verify(copy) == []
+    edit(ESTIMATES, lambda t: t.with_columns(error_deg=pl.col("error_deg") / 2))(copy)
+    assert [fault.file for fault in verify(copy)] == [ESTIMATES]
