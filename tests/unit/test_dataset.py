@@ -21,6 +21,7 @@ from simtest.dataset.shard import BrokenShardError, finish, samples, write_sampl
 from simtest.dataset.verify import mend, verify
 from simtest.dataset.writer import write_dataset
 from simtest.engines import make_engine
+from simtest.engines.cluster import cores_each
 from simtest.errors import InputError, SimtestError
 from simtest.spec import load_dataset, scene_from_dict
 from simtest.spec.dataset import Dataset, Distribution
@@ -461,6 +462,14 @@ def test_damage_is_mended(made, copy):
         mend(copy, verify(copy), make_engine())
 
 
+def test_mending_leaves_a_strange_folder_alone(copy):
+    (copy / "mine").mkdir()
+    (copy / "mine" / "notes.txt").write_text("mine")
+    DAMAGE["foreign file"][0](copy)
+    assert [fault.file for fault in mend(copy, verify(copy), make_engine())] == ["mine"]
+    assert (copy / "mine" / "notes.txt").read_text() == "mine"
+
+
 def test_shards_that_are_no_tar_are_told(tmp_path):
     for data in (b"", b"x" * 700, bytes(512)):
         (tmp_path / "a.tar").write_bytes(data)
@@ -481,7 +490,7 @@ def test_engines_are_checked():
 
 
 def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
-    from tests.unit.engine_tasks import dies_once, fails, square
+    from tests.unit.engine_tasks import dies_once, fails, meets_a_full_disk, square
 
     told = []
     got = dict(make_engine(workers=2).run(square, range(5), lambda: told.append(1)))
@@ -491,6 +500,17 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
     assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
     with pytest.raises(SimtestError, match=r"no such number: [12]"):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
+    with pytest.raises(SimtestError, match=r"a worker failed \(OSError: .*No space left on device"):
+        list(make_engine(workers=2).run(meets_a_full_disk, [1, 2], lambda: None))
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "each"),
+    [((8,), 1, 8), ((8,), 4, 2), ((4, 4), 1, 4), ((16, 4), 2, 10), ((None, 4), 3, 1), ((2,), 8, 1), ((), 1, 1)],
+)
+def test_no_task_asks_a_cluster_for_more_cores_than_a_node_has(cores, workers, each):
+    nodes = [{"memory": 1e9} if count is None else {"CPU": float(count)} for count in cores]
+    assert cores_each(nodes, workers) == each
 
 
 # Command line -------------------------------------------------------------------------------------------------------
@@ -519,7 +539,7 @@ def test_commands(made, tmp_path, monkeypatch, capsys):
     flip(tmp_path / "made" / TAR, 0.5)
     code, said = run("verify", "made")
     assert code == 1
-    assert said[-1] == "1 faults"
+    assert said[-1] == "1 fault"
     code, said = run("verify", "made", "--repair")
     assert (code, said[-1]) == (0, "mended")
     assert contents(tmp_path / "made") == contents(made)
