@@ -70,6 +70,7 @@ def test_a_window_without_a_display_is_refused(content, monkeypatch):
         show(content)
 
 
+@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 @pytest.mark.parametrize("target", [["--screenshot", "nowhere/view.png"], ["--screenshot", "view.jpg"], []])
 def test_the_command_refuses_before_it_renders(monkeypatch, tmp_path, capsys, target):
     from simtest import viewer
