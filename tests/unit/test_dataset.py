@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.again import compare, sample_again
+from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES
-from simtest.dataset.manifest import NAME, read_manifest
+from simtest.dataset.manifest import NAME, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.verify import mend, verify
@@ -24,9 +25,10 @@ from simtest.engines import make_engine
 from simtest.engines.cluster import cores_each
 from simtest.errors import InputError, SimtestError
 from simtest.spec import load_dataset, scene_from_dict
-from simtest.spec.dataset import Dataset, Distribution
+from simtest.spec.dataset import Dataset, Distribution, Splits
 from simtest.spec.reading import validate
 
+ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}
 
 
@@ -284,6 +286,20 @@ def test_reader_names_what_it_does_not_know(made, tmp_path):
         read(tmp_path)
     with pytest.raises(InputError, match="must be 0 to 5"):
         sample_again(made, 6, tmp_path / "x")
+
+
+def test_the_card_says_where_surfaces_come_from():
+    def card(dataset):
+        plan = Plan(dataset)
+        return make_card(plan, new_manifest(plan, "llvm_ad_rgb"))
+
+    assert "No patient's data" in card(tiny())
+    values = {"surface.path": str(ROOT / "meshes" / "colon_40mm.ply"), "samples": 6, "samples_per_anatomy": 1}
+    mesh = load_dataset("endoscopy", values)
+    family = mesh.families[0].model_copy(update={"seeds": None, "per_anatomy": {}})
+    text = card(mesh.model_copy(update={"families": (family,), "splits": Splits(train=1.0, validation=0.0, test=0.0)}))
+    assert "meshes: colon_40mm.ply" in text
+    assert "No patient's data" not in text
 
 
 # Damage -------------------------------------------------------------------------------------------------------------
