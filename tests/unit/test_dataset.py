@@ -101,6 +101,21 @@ def test_draws_lie_in_their_range(low, factor, log, integer, seed):
     assert isinstance(drawn, int) == integer
 
 
+def colons(**more):
+    return {"scene": "anatomy", "seeds": {"high": 9}} | more
+
+
+def test_families_may_have_different_seeds_of_one_recipe():
+    def plan(low):
+        families = [colons(), colons(seeds={"low": low, "high": 19})]
+        data = tiny().model_dump(mode="json", exclude_unset=True)
+        return Plan(validate(Dataset, data | {"families": families, "per_sample": {}, "name": "two"}, "two"))
+
+    assert {plan(10).anatomy(i).seed // 10 for i in range(12)} == {0, 1}
+    with pytest.raises(InputError, match=r"families.1: .* must have seeds that do not overlap"):
+        plan(9)
+
+
 BAD = {
     "samples = 0": ("samples", 0, "samples = 0: must be greater than or equal to 1"),
     "families": ("families", [], "families = "),
@@ -116,6 +131,16 @@ BAD = {
     "weights": ("per_sample", {"sensor.seed": {"choose": [1, 2], "weights": [1]}}, "must be as many"),
     "twice": ("per_sample", {"surface.radius_mm": {"low": 5, "high": 6}}, "drawn twice"),
     "seeds": ("families", [{"scene": "plane", "seeds": {"high": 4}}], "has no seed; leave it out"),
+    "anatomy of a sample": (
+        "families",
+        [colons(per_sample={"surface.seed": {"low": 0, "high": 9, "integer": True}})],
+        "surface.seed is drawn for each sample",
+    ),
+    "both": (
+        "families",
+        [colons(per_anatomy={"surface.tilt_deg": {"low": 0.0, "high": 1.0}})],
+        "surface.tilt_deg is drawn for each sample too",
+    ),
 }
 
 
