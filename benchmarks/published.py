@@ -1,5 +1,6 @@
 """The published protocol: its speed against making and blurring the noise alone."""
 
+import multiprocessing
 import subprocess
 import sys
 import tempfile
@@ -21,8 +22,7 @@ from simtest.validation.cases import Case, expand
 from simtest.validation.paper.pipeline import kernel_radius
 from simtest.validation.paper.protocol import draw_light, picture
 from simtest.validation.paper.rows import paper_rows, pipeline_with
-from simtest.validation.pool import Pool
-from simtest.validation.runner import PAPER_CHUNK
+from simtest.validation.work import PAPER_CHUNK
 
 WORKERS = 2
 CONICS, POINTS = 1000, 100
@@ -94,11 +94,11 @@ def _floor(cases: list[Case]) -> float:
     for case in cases:
         for first in range(0, case.realisations, PAPER_CHUNK):
             tasks.append((case.paper_setting(), list(range(first, min(first + PAPER_CHUNK, case.realisations)))))
-    with Pool(WORKERS) as pool:
+    with multiprocessing.get_context("spawn").Pool(WORKERS, cv2.setNumThreads, (1,)) as pool:
         # The workers start before the clock does.
-        list(pool.map(floor, [(PaperSetting(), [0])] * WORKERS))
+        pool.starmap(floor, [(PaperSetting(), list(range(20)))] * (4 * WORKERS), chunksize=1)
         start = time.perf_counter()
-        list(pool.map(floor, tasks))
+        pool.starmap(floor, tasks, chunksize=1)
         return time.perf_counter() - start
 
 

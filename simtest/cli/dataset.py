@@ -5,11 +5,13 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Address, EngineName, Seed, Settings, Variant, Workers, whole_number
+from simtest.cli.options import Address, EngineName, Seed, Workers, replacing, whole_number
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
 
 Folder = Annotated[Path, Parameter(help="The dataset's folder.")]
+Settings = Annotated[list[str] | None, replacing("samples_per_anatomy=5 or sensor.noise_sigma=0")]
+Variant = Annotated[str | None, Parameter(help="Mitsuba variant, such as cuda_ad_rgb; default llvm_ad_rgb.")]
 Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
 
 
@@ -32,7 +34,7 @@ def make(
     Parameters
     ----------
     described : str
-        A dataset file, or the name of a shipped one: endoscopy, tiny.
+        A dataset file, or the name of a shipped one: endoscopy, learning, tiny.
     """
     from simtest.cli.progress import progress_bar
     from simtest.dataset.writer import SHARDS_PER_PROCESS, write_dataset
@@ -55,7 +57,9 @@ def verify(
     folder: Folder,
     /,
     *,
-    repair: Annotated[bool, Parameter(negative="", help="Make again what is broken.")] = False,
+    repair: Annotated[
+        bool, Parameter(negative="", help="Make again what is broken; remove files that do not belong.")
+    ] = False,
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
@@ -74,9 +78,9 @@ def verify(
         if faults and repair:
             left = mend(folder, faults, make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS), progress)
             print(*(f"still broken: {fault}" for fault in left), sep="\n", end="\n" * bool(left))
-            print("mended" if not left else f"{len(left)} faults are left")
+            print("mended" if not left else f"left: {len(left)}")
             return 1 if left else 0
-    print(f"{len(faults)} faults" if faults else "sound")
+    print(f"{len(faults)} fault{'s' * (len(faults) > 1)}" if faults else "sound")
     return 1 if faults else 0
 
 
@@ -87,7 +91,7 @@ def sample(
     /,
     *,
     out: Annotated[Path | None, Parameter(help="Folder for the files; default sample-INDEX.")] = None,
-    variant: Variant = None,
+    variant: Annotated[str | None, Parameter(help="Mitsuba variant; default the dataset's own.")] = None,
 ) -> int:
     """Make one sample of a dataset again, alone; exit 1 if it differs from the stored one.
 

@@ -6,10 +6,12 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Seed, Settings
+from simtest.cli.options import replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
+Settings = Annotated[list[str] | None, replacing("length_mm=40")]
+Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)]
 Edge = Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")]
 File = Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
 Recipe = Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")]

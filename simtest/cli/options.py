@@ -15,12 +15,13 @@ def whole_number(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"{tokens[0].value} is not a whole number") from None
 
 
-Settings = Annotated[
-    list[str] | None,
-    Parameter(
-        name="--set", negative="", help="Replace a value: key=value, such as surface.radius_mm=5; may be repeated."
-    ),
-]
+def replacing(example: str) -> Parameter:
+    """Give the option that replaces values of a file, with an example of one."""
+    told = f"Replace a value: key=value, such as {example}; may be repeated."
+    return Parameter(name="--set", negative="", help=told)
+
+
+Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
     str | None, Parameter(help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono.")
 ]

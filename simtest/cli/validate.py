@@ -31,12 +31,14 @@ def validate(
     Parameters
     ----------
     experiment : str
-        An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, reflectance,
-        sensor, camera, rig, interreflection, anatomy, paper, paper_limits.
+        An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, laws, compare,
+        known_light, sensor, reflectance, interreflection, rig, camera, anatomy, anatomy_sensor, colon, liver, mesh,
+        paper, paper_limits.
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
     from simtest.engines import make_engine
+    from simtest.rendering.backend import requested_variant
     from simtest.spec import load_experiment, parse_settings
 
     values = parse_settings(settings or [])
@@ -46,6 +48,6 @@ def validate(
     command = shlex.join(["simtest", *sys.argv[1:]])
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
-        chosen = make_engine(engine, workers, address, gpu=bool(variant and variant.startswith("cuda")))
+        chosen = make_engine(engine, workers, address, gpu=requested_variant(variant).startswith("cuda"))
         page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
     print(page)

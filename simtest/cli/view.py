@@ -26,9 +26,11 @@ def view(
         A scene file, or the name of a shipped scene.
     """
     from simtest.spec import load_scene, parse_settings
-    from simtest.viewer import make_content, save_screenshot, show
+    from simtest.viewer import check_target, make_content, save_screenshot, show
 
-    content = make_content(load_scene(scene, parse_settings(settings or [])), variant)
+    described = load_scene(scene, parse_settings(settings or []))
+    check_target(screenshot)
+    content = make_content(described, variant)
     if screenshot is None:
         show(content)
     else:

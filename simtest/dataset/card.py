@@ -9,7 +9,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import FIELDS
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
-from simtest.dataset.plan import Plan
+from simtest.dataset.plan import Plan, spec_files
 from simtest.files import write_atomically
 from simtest.spec.dataset import Distribution
 
@@ -40,6 +40,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         fields=[field for field in FIELDS if field.name != "radiance" or dataset.radiance],
         draws=list(_draws(plan)),
         tables=(SAMPLES, HIGHLIGHTS, ESTIMATES),
+        meshes=sorted({path.name for path in spec_files(dataset) if path.suffix != ".toml"}),
         isovalue=HIGHLIGHT_ISOVALUE,
         versions=manifest.origin["versions"],
         variant=manifest.origin["variant"],

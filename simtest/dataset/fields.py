@@ -226,7 +226,8 @@ _CURVATURE = (
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
-          "the sensor's frame, R G B, as its response encodes it", "8-bit PNG", *_plain(_NOISY)),
+          "the sensor's frame, R G B: as its response and bits encode it, or sRGB-encoded where it has neither",
+          "8-bit PNG", *_plain(_NOISY)),
     Field("depth", "depth.png", "(H, W)", "float32", "mm",
           "distance from the camera centre along the pixel's ray (not z); NaN where there is no surface",
           "16-bit PNG; count times the sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),

@@ -17,6 +17,9 @@ from simtest.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.dataset import Dataset, Distribution, Family
 
+ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
+"""What tells one anatomy from the next."""
+
 BYTES_PER_PIXEL = 4.5
 """Of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
 
@@ -105,6 +108,7 @@ class Plan:
         self._bases = [self._base(k, family) for k, family in enumerate(dataset.families)]
         for k, family in enumerate(dataset.families):
             self._check(k, family)
+        self._check_shared()
         load_estimators(dataset.estimators)
         self._blocks = self._lay_out()
         self._splits = self._assign()
@@ -122,12 +126,45 @@ class Plan:
         scene = scene_from_dict(self._bases[number], where)
         if family.seeds is not None and not isinstance(scene.surface, AnatomySurface):
             raise InputError(f"{where}.seeds: surface.type = {scene.surface.type} has no seed; leave it out")
+        for path in (*family.per_sample, *self.dataset.per_sample):
+            if isinstance(scene.surface, AnatomySurface) and path.startswith(ANATOMY_KEYS):
+                raise InputError(
+                    f"{where}: {path} is drawn for each sample, which makes anatomies that may be in two splits; "
+                    "must be drawn by seeds or per_anatomy"
+                )
+        if twice := sorted({*family.per_anatomy} & {*family.per_sample, *self.dataset.per_sample}):
+            raise InputError(f"{where}.per_anatomy: {twice[0]} is drawn for each sample too; must be in one of them")
         alone = [{path: value} for path, one in drawn.items() for value in one.ends]
         together = [{path: one.ends[end] for path, one in drawn.items()} for end in (0, -1)]
         for values in (*alone, *together):
             tried = scene_from_dict(apply_settings(self._bases[number], values, where), where)
             if isinstance(tried.surface, AnatomySurface) and (file := tried.surface.file()).suffix == ".toml":
                 load_recipe(file, tried.surface.recipe_values)
+
+    def _check_shared(self) -> None:
+        """Refuse families that may have an anatomy in common, which might then be in two splits."""
+        held: list[tuple[int, Path, range | None]] = []
+        for number, family in enumerate(self.dataset.families):
+            surface = scene_from_dict(self._bases[number], f"families.{number}").surface
+            if not isinstance(surface, AnatomySurface):
+                continue
+            file, seeds = surface.file(), None
+            if file.suffix == ".toml" and family.seeds is not None:
+                seeds = range(family.seeds.low, family.seeds.high + 1)
+            elif file.suffix == ".toml" and surface.seed is not None:
+                seeds = range(surface.seed, surface.seed + 1)
+            for other, its_file, its_seeds in held:
+                apart = (
+                    seeds is not None
+                    and its_seeds is not None
+                    and (max(seeds.start, its_seeds.start) >= min(seeds.stop, its_seeds.stop))
+                )
+                if file == its_file and not apart:
+                    raise InputError(
+                        f"families.{number}: has surface.path = {file.name} in common with families.{other}, and an "
+                        "anatomy might be in two splits; must have seeds that do not overlap"
+                    )
+            held.append((number, file, seeds))
 
     # Anatomies and splits ------------------------------------------------------------------------------------------
 

@@ -141,7 +141,7 @@ def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
 
 
 def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
-    """Make broken files again, remove what does not belong, and check once more.
+    """Make broken files again, remove files that do not belong, and check once more.
 
     Parameters
     ----------
@@ -170,9 +170,10 @@ def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress |
     now = new_manifest(manifest.plan(), str(manifest.origin["variant"]))
     check_same(folder, manifest, now)
     known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD}
-    foreign = [fault.file for fault in faults if fault.file not in known]
-    for name in foreign:
-        (folder / name).unlink(missing_ok=True)
+    # A folder may hold anything: it stays, and is named again.
+    foreign = [folder / fault.file for fault in faults if fault.file not in known]
+    for path in (path for path in foreign if path.is_symlink() or not path.is_dir()):
+        path.unlink(missing_ok=True)
     repair(folder, manifest, [fault.file for fault in faults if fault.file in known], engine, progress)
     return verify(folder, progress)
 
@@ -251,6 +252,7 @@ def _surface(record: dict[str, Any], camera: Camera) -> Iterator[str]:
         return
     if (there != np.isfinite(normal[..., 0])).any():
         yield "normals and depth are not there at the same pixels"
+        return
     rays = camera.unproject(camera.pixel_centres().reshape(-1, 2)).reshape(*depth.shape, 3)
     facing = np.sum(rays * normal, axis=-1)
     # An octahedral normal is rounded by 1e-4.

@@ -2,7 +2,7 @@
 
 import os
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from simtest.engines.base import MAX_DEATHS, Task, Tell
@@ -10,7 +10,6 @@ from simtest.errors import InputError, SimtestError
 
 POLL_S = 1.0
 """How long one wait lasts; between two of them Ctrl-C is answered."""
-
 
 ANSWER_S = 5.0
 """How long a cluster's head may take to answer."""
@@ -72,13 +71,16 @@ class RayEngine:
                 ray.init(address=self._address, log_to_driver=False, logging_level="ERROR")
         except (ConnectionError, RuntimeError, ValueError) as error:
             said = str(error).splitlines()[0][:160]
-            raise InputError(f"--address {self._address}: no Ray cluster can be joined ({said})") from error
+            tried = (
+                "--engine ray: no cluster can be started"
+                if self._address is None
+                else (f"--address {self._address}: no Ray cluster can be joined")
+            )
+            raise InputError(f"{tried} ({said})") from error
 
     def _run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
         ray = self._ray
-        nodes = [node for node in ray.nodes() if node["Alive"]]
-        cores = sum(node["Resources"].get("CPU", 1) for node in nodes)
-        each = max(1, int(cores // self._workers))
+        each = cores_each([node["Resources"] for node in ray.nodes() if node["Alive"]], self._workers)
         remote = ray.remote(
             num_cpus=each, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=self._renew_after or 0
         )(_work)
@@ -107,6 +109,25 @@ class RayEngine:
         except ray.exceptions.RayError as error:
             said = str(error).splitlines()[0][:160]
             raise SimtestError(f"the cluster lost a task ({said}); what is finished is kept") from error
+
+
+def cores_each(nodes: Sequence[Mapping[str, float]], workers: int) -> int:
+    """Give a task's cores: its share of all, but no more than one node has, or it would wait forever.
+
+    Parameters
+    ----------
+    nodes : sequence of dict
+        The resources of each node that is alive; one that offers no cores names none.
+    workers : int
+        How many tasks run at once.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    cores = [node.get("CPU", 0.0) for node in nodes]
+    return max(1, int(min(sum(cores) // workers, max(cores, default=0.0))))
 
 
 def _check_address(address: str) -> None:

@@ -158,14 +158,19 @@ def _work(pipe: Connection, task: Task, threads: int) -> None:
     cv2.setNumThreads(threads)
     try:
         while True:
-            argument = pipe.recv()
-            pipe.send(("done", task(argument, lambda: pipe.send(("step", None)))))
+            pipe.send(_answer(pipe, task, pipe.recv()))
     except (EOFError, OSError):
+        # The pipe closed; what goes wrong in a task, which may be an OSError too, is an answer.
         return
+
+
+def _answer(pipe: Connection, task: Task, argument: Any) -> tuple[str, Any]:
+    try:
+        return "done", task(argument, lambda: pipe.send(("step", None)))
     except SimtestError as error:
-        pipe.send(("error", error))
+        return "error", error
     except Exception as error:
-        pipe.send(("error", SimtestError(f"a worker failed ({type(error).__name__}: {error})")))
+        return "error", SimtestError(f"a worker failed ({type(error).__name__}: {error})")
 
 
 def _die_with_parent() -> None:

@@ -18,6 +18,7 @@ from simtest.geometry import (
     fit_arc,
     fit_ellipses,
 )
+from simtest.geometry.arc_fit import MIN_ARC_RAD, angular_extent
 from simtest.geometry.ellipse_fit import MIN_POINTS
 from simtest.geometry.fitting_planes import FORWARD, fitting_planes
 from simtest.geometry.pose_region import PoseRegion
@@ -197,7 +198,8 @@ def fit_cut_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIso
     Returns
     -------
     FittedIsophote or Failure
-        A Failure, too, where what is seen is no part of an ellipse, as where the region of interest lies on a slope.
+        A Failure, too, where what is seen is no part of an ellipse around the peak, as where the region of interest
+        lies on a slope, or a wide isophote shows in one corner of the frame alone.
     """
     points = patch.arc(isovalue)
     if len(points) < MIN_POINTS:
@@ -210,6 +212,12 @@ def fit_cut_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIso
         return Failure(Reason.NOT_AN_ELLIPSE, f"the arc misses its ellipse by {fitted.residual:.2g} of the radius")
     plane_from_camera = planes.plane_from_camera if planes.plane_from_camera.ndim == 2 else planes.plane_from_camera[0]
     cone = cone_of_conic(fitted.conic, plane_from_camera)
+    peak = camera.unproject(patch.peak_px)
+    # Inside, s^T C s has the sign of the one eigenvalue that differs from the other two.
+    if not float(peak @ cone @ peak) * float(np.linalg.det(cone)) > 0:
+        return Failure(Reason.NOT_AN_ELLIPSE, "the arc's ellipse does not enclose the peak")
+    if (seen := angular_extent(points - patch.peak_px)) < MIN_ARC_RAD:
+        return Failure(Reason.TOO_FEW_POINTS, f"an arc of {np.degrees(seen):.0f} deg around the peak")
     in_image = fitted.conic if camera.distortion is None else None
     return FittedIsophote(isovalue, points, in_image, cone, planes.sightlines[0], cut=True)
 

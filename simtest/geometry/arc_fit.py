@@ -87,6 +87,12 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
     return _concluded(xy, found.x, T, float(np.sqrt(np.mean(found.fun**2))))
 
 
+def angular_extent(vectors: Array) -> float:
+    """Give how far around the origin vectors, shape (N, 2), reach: all around but for their largest gap, rad."""
+    phases = np.sort(np.arctan2(vectors[:, 1], vectors[:, 0]))
+    return 2 * np.pi - float(np.max(np.diff(phases, append=phases[0] + 2 * np.pi)))
+
+
 def _residuals(xy: Array, parameters: Array) -> tuple[Array, Array]:
     """Give F / |grad F| of each point, shape (N,), and its derivatives, shape (N, 5)."""
     L = np.array([[parameters[2], 0.0], [parameters[3], parameters[4]]])
@@ -113,8 +119,7 @@ def _concluded(xy: Array, parameters: Array, T: Array, rms: float) -> FittedArc 
     if not (np.isfinite(centre).all() and low > 0 and high <= MAX_AXIS_RATIO**2 * low):
         return Failure(Reason.NOT_AN_ELLIPSE, "the arc's conic is no ellipse")
     u = (xy - centre) @ L
-    phases = np.sort(np.arctan2(u[:, 1], u[:, 0]))
-    arc = 2 * np.pi - float(np.max(np.diff(phases, append=phases[0] + 2 * np.pi)))
+    arc = angular_extent(u)
     if arc < MIN_ARC_RAD:
         least = np.degrees(MIN_ARC_RAD)
         return Failure(Reason.TOO_FEW_POINTS, f"an arc of {np.degrees(arc):.0f} deg; at least {least:.0f} are needed")

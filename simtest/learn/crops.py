@@ -19,6 +19,7 @@ from simtest.dataset.reader import Record, read
 from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.spec.camera import CameraSpec
+from simtest.spec.sensor import Sensor
 
 Array = npt.NDArray[Any]
 
@@ -111,7 +112,10 @@ def read_crops(folder: str | Path, split: str) -> Crops:
 def _rows(record: Record) -> Iterator[dict[str, Any]]:
     meta = record["meta"]
     camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
-    linear = srgb_decode(record["image"].astype(np.float32) / 255).mean(axis=2, dtype=np.float32)
+    sensor = Sensor.model_validate(meta["scene"]["sensor"])
+    # As simtest.dataset.sample writes it: what the sensor itself encoded, or else sRGB.
+    decode = sensor.response.model().decode if sensor.encodes else srgb_decode
+    linear = decode(record["image"].astype(np.float32) / 255).mean(axis=2, dtype=np.float32)
     by_detection: dict[int, dict[str, Any]] = {}
     for row in meta["estimates"]:
         if "specularity" in row and "true_id" in row:

@@ -101,7 +101,9 @@ def run_experiment(
     # All that may be refused is refused before the folder is touched.
     cases = expand(experiment)
     load_estimators(experiment.estimators)
-    digest = _fingerprint(experiment, cases, backend.requested_variant(variant))
+    # Chosen here: a worker on another machine may have another environment.
+    variant = backend.requested_variant(variant)
+    digest = _fingerprint(experiment, cases, variant)
     _check_folder(folder)
     finished = _finished(folder, digest, len(cases))
     if finished is not None:
@@ -110,7 +112,7 @@ def run_experiment(
     resumed = _work(experiment, cases, folder, variant, engine or make_engine(), progress)
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
     run = {
-        "variant": backend.requested_variant(variant),
+        "variant": variant,
         "llvm": backend.library_in_use(),
         "fingerprint": digest,
         "seed": experiment.seed,

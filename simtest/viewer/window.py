@@ -27,6 +27,18 @@ LIGHT = "#f2c500"
 DONE = "simtest view: drawn"
 
 
+def check_target(path: Path | None) -> None:
+    """Raise `InputError` where it is plain before anything is rendered that a PNG, or a window, cannot be had."""
+    if path is None:
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise InputError("no display (DISPLAY is not set); --screenshot FILE draws without one")
+        return
+    if path.suffix.lower() != ".png":
+        raise InputError(f"--screenshot {path}: suffix {path.suffix!r}; must be .png")
+    if not path.parent.is_dir():
+        raise InputError(f"--screenshot {path}: no such folder")
+
+
 def save_screenshot(content: Content, path: Path) -> None:
     """Draw to a PNG without a display.
 
@@ -35,10 +47,7 @@ def save_screenshot(content: Content, path: Path) -> None:
     InputError
         If the suffix is not .png, the file cannot be written, or this machine has no way to draw off-screen.
     """
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--screenshot {path}: suffix {path.suffix!r}; must be .png")
-    if not path.parent.is_dir():
-        raise InputError(f"--screenshot {path}: no such folder")
+    check_target(path)
     said = ""
     with tempfile.TemporaryDirectory() as folder:
         stored = Path(folder) / "content.npz"
@@ -47,7 +56,10 @@ def save_screenshot(content: Content, path: Path) -> None:
         for window in OFF_SCREEN:
             done, said = _draw([str(stored), str(picture)], {"VTK_DEFAULT_OPENGL_WINDOW": window}, TIMEOUT_S)
             if done and picture.is_file():
-                write_atomically(path, functools.partial(shutil.copyfile, picture))
+                try:
+                    write_atomically(path, functools.partial(shutil.copyfile, picture))
+                except OSError as error:
+                    raise InputError(f"--screenshot {path}: cannot be written ({error.strerror})") from error
                 return
     raise InputError(
         "--screenshot: nothing here draws without a display; install libegl1 (with libgl1-mesa-dri) or libosmesa6"
@@ -63,8 +75,7 @@ def show(content: Content) -> None:
     InputError
         If no window can be opened.
     """
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("no display (DISPLAY is not set); --screenshot FILE draws without one")
+    check_target(None)
     with tempfile.TemporaryDirectory() as folder:
         stored = Path(folder) / "content.npz"
         content.save(stored)

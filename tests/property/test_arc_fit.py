@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
-from simtest.geometry import FittedArc, Patch, ellipse_of_conic, fit_arc, fit_ellipse
+from simtest.estimators.base import FittedIsophote, fit_cut_isophote
+from simtest.geometry import Camera, FittedArc, Patch, ellipse_of_conic, fit_arc, fit_ellipse, smooth
 from simtest.geometry.arc_fit import _residuals
 
 
@@ -79,3 +80,18 @@ def test_a_cut_isophote_is_the_whole_one_away_from_the_cut():
     outline = part.inside(0.5, cut=True)
     assert outline[40, 51]
     assert not outline[2, 51]
+
+
+@pytest.mark.parametrize(("noise", "radius", "seed"), [(0.004, 120, 4), (0.02, 115, 0), (0.02, 120, 0), (0.02, 120, 1)])
+def test_an_isophote_seen_in_one_far_corner_alone_is_refused(noise, radius, seed):
+    # A wide lobe over a bright base: at t = 0.4 its isophote passes through one corner of the frame, and what is seen
+    # of it there fits streaks whose axis is off by 20 to 30 deg.
+    side = 160
+    camera = Camera(side, side, 160.0, 160.0, 80.0, 80.0)
+    y, x = np.mgrid[:side, :side] + 0.5
+    squared = ((x - 56) ** 2 + (y - 66) ** 2) / radius**2
+    light = 0.35 + 0.65 * np.exp(squared * np.log(0.05 / 0.65))
+    light += np.random.default_rng(seed).normal(0, noise, light.shape)
+    patch = Patch.cut(smooth(light, 2.0), (0, 0, side, side))
+    assert isinstance(fit_cut_isophote(patch, camera, 0.4), Failure)
+    assert isinstance(fit_cut_isophote(patch, camera, 0.6), FittedIsophote)

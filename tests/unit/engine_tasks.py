@@ -23,3 +23,7 @@ def dies_once(argument, tell):
 
 def fails(number, tell):
     raise InputError(f"no such number: {number}")
+
+
+def meets_a_full_disk(number, tell):
+    raise OSError(28, "No space left on device")

@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -17,6 +19,7 @@ from simtest.cli import main as command_line
 from simtest.spec import load_experiment
 from simtest.validation import runner
 
+ROOT = Path(__file__).resolve().parents[2]
 MAIN = "from simtest.cli.main import main; main()"
 SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "plotly"}
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
@@ -103,6 +106,28 @@ def test_the_installed_command_answers():
     assert point.load() is command_line.main
     done = child("--version")
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, version("simtest"), "")
+
+
+def shipped(kind):
+    return sorted(file.stem for file in (ROOT / "scenes" / kind).glob("*.toml"))
+
+
+@pytest.mark.parametrize(("command", "kind", "page"), [("validate", "experiments", "experiments.md"),
+                                                       ("dataset", "datasets", "datasets.md")])  # fmt: skip
+def test_help_and_pages_name_all_that_is_shipped(here, command, kind, page):
+    code, output, _ = here(command, "--help")
+    assert code == 0
+    told = " ".join(output.replace("│", " ").split())
+    listed = re.search(r"shipped one: ([\w, ]+)\.", told).group(1).split(", ")
+    assert sorted(listed) == shipped(kind)
+    for text in ((ROOT / "README.md").read_text(), (ROOT / "docs" / page).read_text()):
+        assert not [name for name in listed if not re.search(rf"\b{name}\b", text)]
+
+
+def test_the_readme_lists_all_commands_and_pages():
+    text = (ROOT / "README.md").read_text()
+    assert set(re.findall(r"^\| `simtest (\w+)", text, re.MULTILINE)) == set(command_line._COMMANDS)
+    assert set(re.findall(r"\(docs/(\w+)\.md\)", text)) == {page.stem for page in (ROOT / "docs").glob("*.md")}
 
 
 # Bad use ---------------------------------------------------------------------------------------------------------

@@ -14,18 +14,21 @@ from hypothesis import strategies as st
 from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.again import compare, sample_again
+from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES
-from simtest.dataset.manifest import NAME, read_manifest
+from simtest.dataset.manifest import NAME, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.verify import mend, verify
 from simtest.dataset.writer import write_dataset
 from simtest.engines import make_engine
+from simtest.engines.cluster import cores_each
 from simtest.errors import InputError, SimtestError
 from simtest.spec import load_dataset, scene_from_dict
-from simtest.spec.dataset import Dataset, Distribution
+from simtest.spec.dataset import Dataset, Distribution, Splits
 from simtest.spec.reading import validate
 
+ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}
 
 
@@ -98,6 +101,21 @@ def test_draws_lie_in_their_range(low, factor, log, integer, seed):
     assert isinstance(drawn, int) == integer
 
 
+def colons(**more):
+    return {"scene": "anatomy", "seeds": {"high": 9}} | more
+
+
+def test_families_may_have_different_seeds_of_one_recipe():
+    def plan(low):
+        families = [colons(), colons(seeds={"low": low, "high": 19})]
+        data = tiny().model_dump(mode="json", exclude_unset=True)
+        return Plan(validate(Dataset, data | {"families": families, "per_sample": {}, "name": "two"}, "two"))
+
+    assert {plan(10).anatomy(i).seed // 10 for i in range(12)} == {0, 1}
+    with pytest.raises(InputError, match=r"families.1: .* must have seeds that do not overlap"):
+        plan(9)
+
+
 BAD = {
     "samples = 0": ("samples", 0, "samples = 0: must be greater than or equal to 1"),
     "families": ("families", [], "families = "),
@@ -113,6 +131,16 @@ BAD = {
     "weights": ("per_sample", {"sensor.seed": {"choose": [1, 2], "weights": [1]}}, "must be as many"),
     "twice": ("per_sample", {"surface.radius_mm": {"low": 5, "high": 6}}, "drawn twice"),
     "seeds": ("families", [{"scene": "plane", "seeds": {"high": 4}}], "has no seed; leave it out"),
+    "anatomy of a sample": (
+        "families",
+        [colons(per_sample={"surface.seed": {"low": 0, "high": 9, "integer": True}})],
+        "surface.seed is drawn for each sample",
+    ),
+    "both": (
+        "families",
+        [colons(per_anatomy={"surface.tilt_deg": {"low": 0.0, "high": 1.0}})],
+        "surface.tilt_deg is drawn for each sample too",
+    ),
 }
 
 
@@ -283,6 +311,20 @@ def test_reader_names_what_it_does_not_know(made, tmp_path):
         read(tmp_path)
     with pytest.raises(InputError, match="must be 0 to 5"):
         sample_again(made, 6, tmp_path / "x")
+
+
+def test_the_card_says_where_surfaces_come_from():
+    def card(dataset):
+        plan = Plan(dataset)
+        return make_card(plan, new_manifest(plan, "llvm_ad_rgb"))
+
+    assert "No patient's data" in card(tiny())
+    values = {"surface.path": str(ROOT / "meshes" / "colon_40mm.ply"), "samples": 6, "samples_per_anatomy": 1}
+    mesh = load_dataset("endoscopy", values)
+    family = mesh.families[0].model_copy(update={"seeds": None, "per_anatomy": {}})
+    text = card(mesh.model_copy(update={"families": (family,), "splits": Splits(train=1.0, validation=0.0, test=0.0)}))
+    assert "meshes: colon_40mm.ply" in text
+    assert "No patient's data" not in text
 
 
 # Damage -------------------------------------------------------------------------------------------------------------
@@ -461,6 +503,14 @@ def test_damage_is_mended(made, copy):
         mend(copy, verify(copy), make_engine())
 
 
+def test_mending_leaves_a_strange_folder_alone(copy):
+    (copy / "mine").mkdir()
+    (copy / "mine" / "notes.txt").write_text("mine")
+    DAMAGE["foreign file"][0](copy)
+    assert [fault.file for fault in mend(copy, verify(copy), make_engine())] == ["mine"]
+    assert (copy / "mine" / "notes.txt").read_text() == "mine"
+
+
 def test_shards_that_are_no_tar_are_told(tmp_path):
     for data in (b"", b"x" * 700, bytes(512)):
         (tmp_path / "a.tar").write_bytes(data)
@@ -481,7 +531,7 @@ def test_engines_are_checked():
 
 
 def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
-    from tests.unit.engine_tasks import dies_once, fails, square
+    from tests.unit.engine_tasks import dies_once, fails, meets_a_full_disk, square
 
     told = []
     got = dict(make_engine(workers=2).run(square, range(5), lambda: told.append(1)))
@@ -491,6 +541,17 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
     assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
     with pytest.raises(SimtestError, match=r"no such number: [12]"):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
+    with pytest.raises(SimtestError, match=r"a worker failed \(OSError: .*No space left on device"):
+        list(make_engine(workers=2).run(meets_a_full_disk, [1, 2], lambda: None))
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "each"),
+    [((8,), 1, 8), ((8,), 4, 2), ((4, 4), 1, 4), ((16, 4), 2, 10), ((None, 4), 3, 1), ((2,), 8, 1), ((), 1, 1)],
+)
+def test_no_task_asks_a_cluster_for_more_cores_than_a_node_has(cores, workers, each):
+    nodes = [{"memory": 1e9} if count is None else {"CPU": float(count)} for count in cores]
+    assert cores_each(nodes, workers) == each
 
 
 # Command line -------------------------------------------------------------------------------------------------------
@@ -519,7 +580,7 @@ def test_commands(made, tmp_path, monkeypatch, capsys):
     flip(tmp_path / "made" / TAR, 0.5)
     code, said = run("verify", "made")
     assert code == 1
-    assert said[-1] == "1 faults"
+    assert said[-1] == "1 fault"
     code, said = run("verify", "made", "--repair")
     assert (code, said[-1]) == (0, "mended")
     assert contents(tmp_path / "made") == contents(made)

@@ -226,3 +226,18 @@ def test_a_refused_number_of_workers_touches_no_folder(tmp_path):
     with pytest.raises(InputError, match="workers = 0"):
         simtest.validate("overview", tmp_path, workers=0)
     assert (parts / "case-00000.parquet").read_bytes() == b"half of a run"
+
+
+def test_workers_are_told_the_variant_that_is_recorded(tmp_path, monkeypatch):
+    class Elsewhere:
+        """An engine whose workers have another environment."""
+
+        def run(self, task, arguments, tell):
+            self.variants = {part.variant for part in arguments}
+            raise InputError("enough")
+
+    engine = Elsewhere()
+    monkeypatch.setenv("SIMTEST_VARIANT", "llvm_ad_rgb")
+    with pytest.raises(InputError, match="enough"):
+        run_experiment(load_experiment("curvature"), tmp_path / "run", engine=engine)
+    assert engine.variants == {"llvm_ad_rgb"}

@@ -75,3 +75,14 @@ def test_crops_hold_the_truth_and_a_network_learns_it(made):
     assert np.abs(ratio - crops.axis_ratio).mean() < 0.5 * untaught
     # The same seed gives the same network.
     assert np.array_equal(propose(train(crops, epochs=2), crops)[0], propose(train(crops, epochs=2), crops)[0])
+
+
+def test_crops_are_linear_whatever_the_response(tmp_path):
+    crops = []
+    for name, response in (("srgb", {}), ("encoded", {"sensor.response": {"type": "gamma", "gamma": 1.2}})):
+        values = {"samples": 6, "samples_per_anatomy": 1, "sensor.noise_sigma": 0.0, **response}
+        write_dataset(load_dataset("tiny", values), tmp_path / name, make_engine())
+        crops.append(read_crops(tmp_path / name, "train"))
+    assert len(crops[0]) >= 2
+    # A value's step is 1/255; taken for sRGB the second ones would differ by a third.
+    assert np.abs(crops[0].images - crops[1].images).max() < 0.03

@@ -1,11 +1,14 @@
 """The wheel holds the scenes, experiments and recipes, and they are found by name from any folder."""
 
+import importlib
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+
+from benchmarks.__main__ import NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,3 +48,8 @@ def test_data_are_found_by_name_from_another_folder(wheel, tmp_path):
     )
     assert child.returncode == 0, child.stderr
     assert str(site) in child.stdout
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_benchmarks_fit_the_package(name):
+    assert callable(importlib.import_module(f"benchmarks.{name}").figures)

@@ -68,3 +68,21 @@ def test_a_window_without_a_display_is_refused(content, monkeypatch):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(InputError, match="--screenshot"):
         show(content)
+
+
+@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+@pytest.mark.parametrize("target", [["--screenshot", "nowhere/view.png"], ["--screenshot", "view.jpg"], []])
+def test_the_command_refuses_before_it_renders(monkeypatch, tmp_path, capsys, target):
+    from simtest import viewer
+    from simtest.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(window.sys, "platform", "linux")
+    monkeypatch.setattr(viewer, "make_content", lambda *_: pytest.fail("rendered"))
+    monkeypatch.setattr("sys.argv", ["simtest", "view", "plane", *target])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "--screenshot" in capsys.readouterr().err
