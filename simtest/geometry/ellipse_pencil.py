@@ -47,20 +47,21 @@ def _rayleigh(M: Array, q: Array) -> Array:
     return np.asarray(np.einsum("ni,nij,nj->n", q, M, q) / (4 * q[:, 0] * q[:, 2] - q[:, 1] ** 2))
 
 
+# Entries, in a flattened matrix, of the cross products of rows 1 and 2, 2 and 0, 0 and 1: all of them at once, since
+# of few matrices each call costs more than the products.
+_FIRST = np.array([[4, 5, 3, 7, 8, 6, 1, 2, 0], [5, 3, 4, 8, 6, 7, 2, 0, 1]])
+_SECOND = np.array([[8, 6, 7, 2, 0, 1, 5, 3, 4], [7, 8, 6, 1, 2, 0, 4, 5, 3]])
+
+
 def _null_vector(M: Array, root: Array) -> Array:
     """Give the null vectors of M - l C, unit, shape (B, 3): of the cross products of two rows the longest."""
     N = M.copy()
     N[:, 0, 2] -= 2 * root
     N[:, 2, 0] -= 2 * root
     N[:, 1, 1] += root
-    crosses = np.stack([_cross(N[:, 1], N[:, 2]), _cross(N[:, 2], N[:, 0]), _cross(N[:, 0], N[:, 1])])
-    lengths = np.sqrt((crosses**2).sum(axis=2))
-    best, each = lengths.argmax(axis=0), np.arange(len(M))
-    length = lengths[best, each]
-    return np.asarray(crosses[best, each] / length[:, None])
-
-
-def _cross(u: Array, v: Array) -> Array:
-    """Give cross products, shapes (B, 3); numpy's is several times slower on few."""
-    (a, b, c), (d, e, f) = u.T, v.T
-    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=1)
+    rows = N.reshape(-1, 9)
+    crosses = rows[:, _FIRST[0]] * rows[:, _SECOND[0]] - rows[:, _FIRST[1]] * rows[:, _SECOND[1]]
+    crosses = crosses.reshape(-1, 3, 3)
+    lengths = np.sqrt((crosses * crosses).sum(axis=2))
+    best, each = lengths.argmax(axis=1), np.arange(len(M))
+    return np.asarray(crosses[each, best] / lengths[each, best][:, None])
