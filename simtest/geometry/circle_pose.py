@@ -157,5 +157,7 @@ _HUGE = 1e100
 
 def _pair(across: Array, along: Array) -> Array:
     """Give the unit vectors along -(+-across + along), shape (N, 2, 3)."""
-    both = -np.stack([along + across, along - across], axis=1)
-    return np.asarray(both / np.linalg.norm(both, axis=2, keepdims=True))
+    both = np.empty((len(along), 2, 3))
+    np.add(along, across, out=both[:, 0])
+    np.subtract(along, across, out=both[:, 1])
+    return np.asarray(both / -np.sqrt((both * both).sum(axis=2, keepdims=True)))

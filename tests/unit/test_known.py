@@ -136,7 +136,7 @@ def test_moments_of_a_gaussian_are_those_before_smoothing():
 
 def test_crossings_move_as_their_sensitivities_say():
     patch, t, change = lobe(), 0.5, 1e-8
-    moved = patch.sensitivities(t)
+    moved = patch.sensitivities([t], [False])
     before, bump = patch.crossings(t), change * np.random.default_rng(1).standard_normal(patch.values.shape)
     column, row = patch.peak_pixel
     value = float(patch.values[row, column] + bump[row, column])
