@@ -74,15 +74,16 @@ def raw_moves(
     -------
     ndarray, shape (K, P)
     """
-    rows, columns = np.divmod(pixels, width)
-    (top, bottom), (left, right) = (rows.min(), rows.max() + 1), (columns.min(), columns.max() + 1)
+    rows = pixels // width
+    columns = pixels - rows * width
+    top, bottom, left, right = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
     margin = int(np.ceil(KERNEL_SIGMAS * smoothing_px))
     wide, high = right - left + 2 * margin, bottom - top + 2 * margin
     place = (rows - (top - margin)) * wide + (columns - (left - margin))
     level = np.pad(noise[top:bottom, left:right], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
     raw = np.empty((len(moves), high, wide))
     for image, each in zip(raw, moves, strict=True):
-        summed = np.bincount(place, each, high * wide).reshape(high, wide)
+        summed = np.bincount(place, each, high * wide).astype(float, copy=False).reshape(high, wide)
         _smooth_transposed(summed, smoothing_px, margin, image)
     raw *= level
     return raw.reshape(len(raw), -1)

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
-from simtest.estimators.propagation import conics_by_crossings, raw_moves
+from simtest.estimators.spot_crossings import SpotCrossings
 from simtest.estimators.top import Top, fit_top
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
-from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2, Sensitivities
+from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_basis
 
 Array = npt.NDArray[np.float64]
@@ -39,9 +39,6 @@ LEAST_VARIANCE_PX2 = 4.0
 
 NOISE_FACTOR = 2.0
 """How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
-
-STEP_PX = 0.1
-"""Step of the central differences of sightlines."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +68,13 @@ class Spot:
     @cached_property
     def axis(self) -> Array:
         """Mean of the cones' axes, unit, shape (3,), camera frame."""
-        axis = np.mean([pose.axis for pose in self.poses], axis=0)
+        axis = sum(pose.axis for pose in self.poses)
         return np.asarray(axis / np.linalg.norm(axis))
 
     @property
     def axis_ratio(self) -> float:
         """Mean of the cones' axis ratios, as they are."""
-        return float(np.mean([pose.axis_ratio for pose in self.poses]))
+        return sum(pose.axis_ratio for pose in self.poses) / len(self.poses)
 
     @cached_property
     def basis(self) -> Array:
@@ -85,13 +82,16 @@ class Spot:
         return np.concatenate(tangent_basis(-self.axis[None]))
 
     @cached_property
+    def _crossings(self) -> SpotCrossings:
+        return SpotCrossings(self.patch, self.camera, self.isophotes, np.concatenate([self.basis, self.axis[None]]))
+
+    @cached_property
     def levels(self) -> Array:
         """-ln t of each isophote, t over the lobe's peak, shape (K,).
 
         The highest pixel that isovalues are relative to is too high where the top is flat and noisy.
         """
-        t = np.array([isophote.isovalue for isophote in self.isophotes])
-        return -np.log(t * self.patch.peak_value / self._top.value)
+        return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._top.value))
 
     @cached_property
     def _top(self) -> Top:
@@ -193,67 +193,24 @@ class Spot:
         by_conic[:, :2, 3:] = by_linear / len(by_linear)
         if self.can_extrapolate:
             by_conic[:, 2:, 3:] = by_linear * (self._weights - 1 / len(by_linear))[:, None, None]
-        return self._by_noise(by_conic, np.zeros(4))
+        return self._crossings.moved_by_noise(by_conic, (np.zeros(4), self._top))
 
     @cached_property
     def _moments_by_noise(self) -> Array:
         """How the moments 11, 12, 22 move with the raw pixels' noise, shape (3, P)."""
-        # The levels move with the top that was fitted, and against the peak's pixel.
         step = 1e-4
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
-        return self._by_noise(self._moments_by_conic, by_shift)
-
-    def _by_noise(self, by_conic: Array, by_shift: Array | None = None) -> Array:
-        """Give how quantities move with the raw pixels' noise.
-
-        Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
-        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
-
-        Parameters
-        ----------
-        by_conic : ndarray, shape (K, Q, 5)
-            How each quantity moves with each isophote's conic.
-        by_shift : ndarray, shape (Q,), optional
-            How it moves with the levels.
-
-        Returns
-        -------
-        ndarray, shape (Q, P)
-        """
-        noise, moved = self.patch.noise, self._sensitivities
-        assert noise is not None
-        by_moment, moments = self._conics_by_crossings
-        by_crossing = np.concatenate(
-            [each @ moments[:, part] for each, part in zip(by_conic @ by_moment, self._parts, strict=True)], axis=1
-        )
-        isovalues = np.repeat([isophote.isovalue for isophote in self.isophotes], self._counts)
-        by_peak = by_crossing @ (moved.level * isovalues)
-        shares = (by_crossing[:, :, None] * moved.weights).reshape(len(by_peak), -1)
-        width, (column, row) = self.patch.values.shape[1], self.patch.peak_pixel
-        moves, pixels = [shares], [self._pixels]
-        if by_shift is not None:
-            by_peak = by_peak - by_shift / self.patch.peak_value
-            moves.append(np.outer(by_shift, self._top.weights))
-            pixels.append(self._top.pixels)
-        flat = np.concatenate([*pixels, np.array([row * width + column])])
-        moves.append(by_peak[:, None])
-        return raw_moves(flat, np.concatenate(moves, axis=1), width, noise, self.patch.smoothing_px)
-
-    @cached_property
-    def _pixels(self) -> npt.NDArray[np.intp]:
-        """Places in the flattened patch of the crossings' two pixels each."""
-        pixels = self._sensitivities.pixels
-        return np.asarray(pixels[..., 1] * self.patch.values.shape[1] + pixels[..., 0]).ravel()
+        return self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._top))
 
     def conic(self, k: int) -> Array:
         """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
-        return self._conics[k]
+        return self._crossings.conics[k]
 
     def conic_covariance(self, k: int) -> Array:
         """Give its covariance by noise, shape (5, 5); the noise must be known."""
         by_conic = np.zeros((len(self.isophotes), 5, 5))
         by_conic[k] = np.eye(5)
-        raw = self._by_noise(by_conic)
+        raw = self._crossings.moved_by_noise(by_conic)
         return np.asarray(raw @ raw.T)
 
     def widening(self, k: int = 0) -> Array:
@@ -295,54 +252,9 @@ class Spot:
         share = PEAK_SHARE + (smoothing / float(self.levels.mean())) ** 2 / 2
         return np.asarray(noise + share * self.drift_excess * np.eye(2))
 
-    @cached_property
-    def _counts(self) -> npt.NDArray[np.intp]:
-        """Points of each isophote, shape (K,)."""
-        return np.array([len(isophote.points) for isophote in self.isophotes])
-
-    @cached_property
-    def _parts(self) -> list[slice]:
-        """Where each isophote's points are among those of all."""
-        ends = np.cumsum(self._counts).tolist()
-        return [slice(end - count, end) for end, count in zip(ends, self._counts.tolist(), strict=True)]
-
-    @cached_property
-    def _points(self) -> Array:
-        """Points of all isophotes, shape (N, 2), px. All at once: a call for each would cost more than the work."""
-        return np.concatenate([isophote.points for isophote in self.isophotes])
-
-    @cached_property
-    def _places(self) -> Array:
-        """Their tangents in the basis, shape (2, N)."""
-        return np.ascontiguousarray(self.tangents(self._points).T)
-
-    @cached_property
-    def _sensitivities(self) -> Sensitivities:
-        """How they move along their lines with the patch's pixels."""
-        isophotes = self.isophotes
-        return self.patch.sensitivities([i.isovalue for i in isophotes], [i.cut for i in isophotes])
-
-    @cached_property
-    def _conics_by_crossings(self) -> tuple[Array, Array]:
-        vertical = self._sensitivities.vertical
-        step = STEP_PX * np.array([~vertical, vertical]).T
-        ahead, behind = np.split(self.tangents(np.concatenate([self._points + step, self._points - step])), 2)
-        moves = (ahead - behind).T / (2 * STEP_PX)
-        cut = [isophote.cut for isophote in self.isophotes]
-        return conics_by_crossings(self._places, self._misses[1], moves, self._parts, cut)
-
     def tangents(self, points: Array) -> Array:
         """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
-        right, down, along = np.concatenate([self.basis, self.axis[None]]) @ self.camera.unproject(points).T
-        return np.array([right, down]).T / along[:, None]
-
-    @cached_property
-    def _misses(self) -> tuple[Array, Array]:
-        """What each point makes of its conic's left side less 1, shape (N,), and the gradient there, shape (2, N)."""
-        x, y = self._places
-        a, b, c, d, e = np.repeat(self._conics.T, self._counts, axis=1)
-        ax, by, bx, cy = a * x, b * y, b * x, c * y
-        return (ax + by + d) * x + (cy + e) * y - 1, np.array([2 * ax + by + d, bx + 2 * cy + e])
+        return self._crossings.tangents(points).T
 
     @cached_property
     def is_bent(self) -> bool:
@@ -350,36 +262,23 @@ class Spot:
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
-        F, (by_x, by_y) = self._misses
-        squares = F * F / (by_x * by_x + by_y * by_y)
-        mean = np.add.reduceat(squares, [part.start for part in self._parts]) / self._counts
-        a, b, c = self._conics.T[:3]
-        residuals = np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25
         # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
-        isovalues = np.array([isophote.isovalue for isophote in self.isophotes])
+        isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
-        return bool((residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
-
-    @cached_property
-    def _conics(self) -> Array:
-        """(a, b, c, d, e) of each isophote, the constant -1, shape (K, 5)."""
-        frame = np.concatenate([self.basis, self.axis[None]])
-        C = frame @ np.array([isophote.cone for isophote in self.isophotes]) @ frame.T
-        C = C / -C[:, 2:, 2:]
-        return np.array([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]]).T
+        return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
 
     @property
     def _by_linear(self) -> Array:
         """Tell how each cone's axis moves with (d, e) of its conic, shape (K, 2, 2)."""
         # The cone's axis is its third eigenvector, near the basis' own: -(A + I)^-1 (d, e) / 2.
-        a, b, c = self._conics.T[:3]
+        a, b, c = self._crossings.conics.T[:3]
         determinant = (a + 1) * (c + 1) - b * b / 4
         return np.asarray((np.array([[c + 1, -b / 2], [-b / 2, a + 1]]) / (-2 * determinant)).transpose(2, 0, 1))
 
     @property
     def _moments_by_conic(self) -> Array:
         """Tell how the moments move with the conic of each isophote, shape (K, 3, 5)."""
-        a, b, c = self._conics.T[:3]
+        a, b, c = self._crossings.conics.T[:3]
         made = np.zeros((len(self.isophotes), 3, 5))
         # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
         p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)

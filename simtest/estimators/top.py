@@ -55,18 +55,18 @@ def fit_top(patch: Patch) -> Top:
     inside = _region(patch)
     pixels = np.flatnonzero(inside)
     values = patch.values.ravel()[pixels].astype(float)
-    if len(pixels) < MIN_PIXELS or values.min() <= 0 or inside.all():
+    if len(pixels) < MIN_PIXELS or values.min() <= 0 or len(pixels) == inside.size:
         return fallback
-    rows, columns = np.divmod(pixels, patch.values.shape[1])
-    x, y = (columns - columns.mean()) / max(np.ptp(columns), 1), (rows - rows.mean()) / max(np.ptp(rows), 1)
-    design = np.array([np.ones_like(x), x, y, x * x, x * y, y * y]).T
-    normal = design.T @ design
+    rows = pixels // patch.values.shape[1]
+    x, y = _centred(pixels - rows * patch.values.shape[1]), _centred(rows)
+    design = np.array([np.ones_like(x), x, y, x * x, x * y, y * y])
+    normal = design @ design.T
     # The eigenvalues tell the condition and, with the vectors, solve for both right sides.
     spread, vectors = np.linalg.eigh(normal)
     if not spread[0] * 1e12 > spread[-1]:
         return fallback
     inverse = (vectors / spread) @ vectors.T
-    f, d, e, a, b, c = (inverse @ (design.T @ np.log(values))).tolist()
+    f, d, e, a, b, c = (inverse @ (design @ np.log(values))).tolist()
     if not (a < 0 and 4 * a * c > b * b):
         return fallback
     determinant = 4 * a * c - b * b
@@ -76,7 +76,12 @@ def fit_top(patch: Patch) -> Top:
     if u * u + v * v > 1:
         return fallback
     # At the apex the value does not move with the place.
-    return Top(value, pixels, design @ (inverse @ apex) / values)
+    return Top(value, pixels, (inverse @ apex) @ design / values)
+
+
+def _centred(places: npt.NDArray[np.intp]) -> Array:
+    """Give places about their mean, over their range."""
+    return np.asarray((places - places.mean()) / max(places.max() - places.min(), 1))
 
 
 def _region(patch: Patch) -> Mask:

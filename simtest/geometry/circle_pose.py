@@ -141,7 +141,8 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
         cone = Failure(Reason.DEGENERATE_CONIC, detail)
         failures[index] = cone if finite[index] else Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
     # The values of a round cone stand in for those that are none.
-    l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
+    if failures:
+        l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
     e1, e3 = vectors[:, :, 0], vectors[:, :, 2]
     g, h = np.sqrt((l1 - l2) / (l1 - l3)), np.sqrt((l2 - l3) / (l1 - l3))
     normals = _pair(e1 * g[:, None], e3 * h[:, None])

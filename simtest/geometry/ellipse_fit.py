@@ -88,13 +88,20 @@ class _Failures:
     """The first failure of each contour."""
 
     def __init__(self) -> None:
-        self.found: dict[int, Failure] = {}
+        self._noted: list[tuple[npt.NDArray[np.bool_], Reason, str]] = []
 
     def add(self, which: npt.NDArray[np.bool_], reason: Reason, detail: str) -> None:
-        if not which.any():
-            return
-        for index in np.flatnonzero(which):
-            self.found.setdefault(int(index), Failure(reason, detail))
+        self._noted.append((which, reason, detail))
+
+    @property
+    def found(self) -> dict[int, Failure]:
+        found: dict[int, Failure] = {}
+        # As a rule there are none: one look at all then does.
+        if np.array([which for which, _, _ in self._noted]).any():
+            for which, reason, detail in self._noted:
+                for index in np.flatnonzero(which).tolist():
+                    found.setdefault(index, Failure(reason, detail))
+        return found
 
 
 def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
@@ -221,8 +228,8 @@ def _fit_together(contours: list[Array]) -> FittedConics:
     extent = np.maximum.reduceat(np.abs(batch.points), batch.first, axis=1).max(axis=0)
     failures.add(~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity")
     failures.add(extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
-    if failures.found:
-        batch.points[:, batch.spread(np.isin(np.arange(len(contours)), list(failures.found)))] = 0.0
+    if found := failures.found:
+        batch.points[:, batch.spread(np.isin(np.arange(len(contours)), list(found)))] = 0.0
     transforms = _normalise(batch, failures)
     conics = _fit_normalised(batch, failures)
     _check(conics, failures)
@@ -265,11 +272,14 @@ _QUARTIC, _CUBIC, _QUADRATIC = [0, 1, 2, 1, 2, 3, 2, 3, 4], [5, 6, 6, 7, 7, 8], 
 """Where in the table of moments those of (x^2, x y, y^2) with themselves, with (x, y) and with 1 are."""
 
 
+_CIRCLE = np.eye(3)
+
+
 def _moments(batch: _Batch) -> Array:
     """Sum up x^4, x^3 y, x^2 y^2, x y^3, y^4, x^3, x^2 y, x y^2, y^3, x^2, x y, y^2; shape (B, 12)."""
     x, y = batch.points
     table = np.empty((12, len(x)))
-    xx, xy, yy = table[_QUADRATIC]
+    xx, yy = table[9], table[11]
     np.multiply(x, batch.points, out=table[9:11])
     np.multiply(y, y, out=yy)
     np.multiply(xx, table[_QUADRATIC], out=table[0:3])
@@ -298,19 +308,19 @@ def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     M = S1 - S2 @ linear - S3[:, :, None] * constant[:, None, :]
     M = (M + M.transpose(0, 2, 1)) / 2
     # One eigenvalue of M is 0 on an exact ellipse; where two are, as on four points, many conics fit.
-    trace, rounding = np.trace(M, axis1=1, axis2=2), _RANK * np.trace(S1, axis1=1, axis2=2)
-    minors = (trace**2 - (M**2).sum(axis=(1, 2))) / 2
+    trace, rounding = np.einsum("nii->n", M), _RANK * np.einsum("nii->n", S1)
+    minors = (trace * trace - (M * M).sum(axis=(1, 2))) / 2
     many = ~((trace > rounding) & (minors > rounding * trace))
     failures.add(many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse")
     # A circle's problem stands in for those without a solution.
-    M[many | on_line] = np.eye(3)
+    M[many | on_line] = _CIRCLE
     quadratic = constrained_minimum(M)
     a, b, c = quadratic.T
     d, e = -(linear @ quadratic[:, :, None])[:, :, 0].T
     f = -(constant * quadratic).sum(axis=1)
     # In rows: the order of the norm's sum hangs on the layout.
     conics = np.ascontiguousarray(np.array([a, b / 2, d / 2, b / 2, c, e / 2, d / 2, e / 2, f]).T)
-    conics *= (np.where(a + c < 0, -1.0, 1.0) / np.linalg.norm(conics, axis=1))[:, None]
+    conics *= (np.where(a + c < 0, -1.0, 1.0) / np.sqrt((conics * conics).sum(axis=1)))[:, None]
     return np.asarray(conics.reshape(-1, 3, 3))
 
 

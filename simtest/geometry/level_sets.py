@@ -160,17 +160,19 @@ def crossings(sets: Sequence[LevelSet]) -> Crossings:
         In the order of the sets.
     """
     (x, y), crossed = _crossed_lines(sets)
-    width = crossed.shape[3]
-    numbers, pixels = np.divmod(np.flatnonzero(crossed), crossed[0, 0].size)
-    number, vertical = numbers >> 1, (numbers & 1).astype(bool)
-    row, column = np.divmod(pixels, width)
-    first = np.array([column + x, row + y]).T
+    height, width = crossed.shape[2:]
+    places = np.flatnonzero(crossed)
+    # Floor division by one number is several times faster than divmod.
+    rows = places // width
+    planes = rows // height
+    number, vertical = planes >> 1, (planes & 1).astype(bool)
+    first = np.array([places - rows * width + x, rows - planes * height + y]).T
     # A copy of the sets' part of the array alone: it may be that of a whole frame. The margin is never crossed.
-    part = sets[0].values[max(y, 0) : y + crossed.shape[2], max(x, 0) : x + width]
+    part = sets[0].values[max(y, 0) : y + height, max(x, 0) : x + width]
     place = (first[:, 1] - max(y, 0)) * part.shape[1] + first[:, 0] - max(x, 0)
     values = part.ravel()
-    start = values.take(place).astype(float)
-    rise = values.take(place + np.where(vertical, part.shape[1], 1)).astype(float) - start
+    start, end = values.take([place, place + np.where(vertical, part.shape[1], 1)]).astype(float)
+    rise = end - start
     share = (np.array([each.level for each in sets]).take(number) - start) / rise
     # Rounding too can put a crossing onto a pixel.
     at_pixel = np.abs(share - 0.5) > _AT_PIXEL
