@@ -89,6 +89,12 @@ def raw_moves(
     return raw.reshape(len(raw), -1)
 
 
+def gram(rows: Array) -> Array:
+    """Give the products of few long rows, shape (K, P), with each other, shape (K, K)."""
+    # A product of the matrix with its own transpose takes a routine that is several times slower on so few rows.
+    return np.asarray((rows[:, None, None] @ rows[:, :, None])[:, :, 0, 0])
+
+
 def _smooth_transposed(image: Array, sigma_px: float, margin: int, smoothed: Array) -> None:
     """Smooth an image that is 0 in a margin of the kernel's half-width into another."""
     if sigma_px <= 0:

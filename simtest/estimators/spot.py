@@ -7,7 +7,7 @@ both are followed to t -> 1 by a straight line (theory.md section 3, items 3 and
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.propagation import gram
 from simtest.estimators.spot_crossings import SpotCrossings
 from simtest.estimators.top import Top, fit_top
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
@@ -169,21 +170,21 @@ class Spot:
         if self.patch.noise is None:
             return None
         raw = np.concatenate([self._axes_by_noise, self._moments_by_noise])
-        return np.asarray(raw @ raw.T)
+        return gram(raw)
 
     @cached_property
     def axes_covariance(self) -> Array | None:
         """That of mean axis and drift alone, shape (4, 4)."""
         if self.patch.noise is None:
             return None
-        return np.asarray(self._axes_by_noise @ self._axes_by_noise.T)
+        return gram(self._axes_by_noise)
 
     @cached_property
     def moments_covariance(self) -> Array | None:
         """That of the moments alone, shape (3, 3)."""
         if self.patch.noise is None:
             return None
-        return np.asarray(self._moments_by_noise @ self._moments_by_noise.T)
+        return gram(self._moments_by_noise)
 
     @cached_property
     def _axes_by_noise(self) -> Array:
@@ -208,10 +209,8 @@ class Spot:
 
     def conic_covariance(self, k: int) -> Array:
         """Give its covariance by noise, shape (5, 5); the noise must be known."""
-        by_conic = np.zeros((len(self.isophotes), 5, 5))
-        by_conic[k] = np.eye(5)
-        raw = self._crossings.moved_by_noise(by_conic)
-        return np.asarray(raw @ raw.T)
+        alone = replace(self._crossings, isophotes=self.isophotes[k : k + 1])
+        return gram(alone.moved_by_noise(np.eye(5)[None]))
 
     def widening(self, k: int = 0) -> Array:
         """Give what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""

@@ -129,10 +129,14 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
     """
     C = np.asarray(cones, dtype=float)
     finite = np.isfinite(C).all(axis=(1, 2))
-    C = np.where(finite[:, None, None], C, _ROUND)
+    if not finite.all():
+        C = np.where(finite[:, None, None], C, _ROUND)
     # The scale means nothing, and squares of very large or small entries would leave the range of numbers.
     size = np.abs(C).max(axis=(1, 2), keepdims=True)
-    values, vectors = _ordered(C / np.where((size > _HUGE) | (size < 1 / _HUGE), size + (size == 0), 1.0), sightlines)
+    extreme = (size > _HUGE) | (size < 1 / _HUGE)
+    if extreme.any():
+        C = C / np.where(extreme, size + (size == 0), 1.0)
+    values, vectors = _ordered(C, sightlines)
     l1, l2, l3 = values.T
     sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
     failures = {}

@@ -144,7 +144,7 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
         If a contour is no numbers of shape (N, 2).
     """
     count = len(contours)
-    normalised, transforms = np.tile(np.eye(3), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1))
+    normalised, transforms = np.zeros((2, count, 3, 3)) + np.eye(3)
     failures: dict[int, Failure] = {}
     arrays = [_points(points, index) for index, points in enumerate(contours)]
     long_enough = []
@@ -261,7 +261,7 @@ def _normalise(batch: _Batch, failures: _Failures) -> Array:
     transforms = np.zeros((len(counts), 3, 3))
     transforms[:, 0, 0] = transforms[:, 1, 1] = cos
     transforms[:, 0, 1], transforms[:, 1, 0] = sin, -sin
-    transforms[:, :2, 2] = -(transforms[:, :2, :2] @ centre.T[:, :, None])[:, :, 0]
+    transforms[:, 0, 2], transforms[:, 1, 2] = -cos * centre[0] - sin * centre[1], sin * centre[0] - cos * centre[1]
     transforms[:, 2, 2] = 1.0
     cos, sin = batch.spread(np.array([cos, sin]))
     points[:] = cos * x + sin * y, cos * y - sin * x

@@ -187,17 +187,19 @@ def _crossed_lines(sets: Sequence[LevelSet]) -> tuple[tuple[int, int], Mask]:
     """Tell which lines right and down from the pixels of a box are crossed, shape (K, 2, h, w), and the box' corner."""
     x, y = (min(each.corner[axis] for each in sets) for axis in (0, 1))
     width, height = (max(each.corner[axis] + each.inside.shape[1 - axis] for each in sets) for axis in (0, 1))
-    crossed = np.zeros((len(sets), 2, height - y, width - x), dtype=bool)
-    for each, (right, down) in zip(sets, crossed, strict=True):
+    inside = np.zeros((len(sets), height - y, width - x), dtype=bool)
+    boxes = [np.s_[each.corner[1] - y :, each.corner[0] - x :] for each in sets]
+    for each, layer, box in zip(sets, inside, boxes, strict=True):
         rows, columns = each.inside.shape
-        left, top = each.corner[0] - x, each.corner[1] - y
-        across = right[top : top + rows, left : left + columns - 1]
-        along = down[top : top + rows - 1, left : left + columns]
-        np.not_equal(each.inside[:, 1:], each.inside[:, :-1], out=across)
-        np.not_equal(each.inside[1:], each.inside[:-1], out=along)
+        layer[box][:rows, :columns] = each.inside
+    crossed = np.zeros((len(sets), 2, height - y, width - x), dtype=bool)
+    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[:, 0, :, :-1])
+    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[:, 1, :-1])
+    for each, (right, down), box in zip(sets, crossed, boxes, strict=True):
         if each.sound is not None:
-            across &= each.sound[:, 1:] & each.sound[:, :-1]
-            along &= each.sound[1:] & each.sound[:-1]
+            rows, columns = each.sound.shape
+            right[box][:rows, : columns - 1] &= each.sound[:, 1:] & each.sound[:, :-1]
+            down[box][: rows - 1, :columns] &= each.sound[1:] & each.sound[:-1]
     return (x, y), crossed
 
 
