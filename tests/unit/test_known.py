@@ -160,6 +160,13 @@ def test_the_covariance_is_that_of_realisations():
     np.testing.assert_allclose(np.var(made, axis=0, ddof=1), stated, rtol=0.3)
 
 
+def test_covariances_of_parts_are_those_of_the_whole():
+    spot = fit_spot(lobe(0.02), CAMERA, ISOVALUES)
+    np.testing.assert_allclose(spot.axes_covariance, spot.covariance[:4, :4], rtol=1e-12)
+    np.testing.assert_allclose(spot.moments_covariance, spot.covariance[4:, 4:], rtol=1e-12)
+    assert np.abs(spot.covariance[:4, 4:]).max() > 0
+
+
 def test_the_top_is_not_the_highest_pixel():
     tops, peaks = [], []
     for seed in range(20):
