@@ -111,7 +111,7 @@ def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None 
         A Failure where an isophote does not close or no ellipse fits.
     """
     clean, left = _at_own_scale(patch)
-    contours = [clean.crossings(t) for t in (HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE)]
+    contours = clean.crossings_of((HIGHLIGHT_ISOVALUE, RESIDUAL_ISOVALUE, TOP_ISOVALUE))
     fits = []
     for contour in contours:
         fitted = contour if isinstance(contour, Failure) else fit_ellipse(contour)

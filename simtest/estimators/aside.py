@@ -40,8 +40,10 @@ def with_known_lights(estimate: Estimate, known: Known) -> Estimate:
         holds, where a distance is known, the mean square over the lights of half their angle at the surface point,
         and is None where it is not: the error may then be anything.
     """
+    if not known.lights_mm:
+        return estimate
     across = known.lights @ np.stack([basis[0] for basis in tangent_basis(estimate.normal[None])]).T
-    if not len(across) or np.linalg.norm(across, axis=1).max() < AT_CAMERA_MM:
+    if np.linalg.norm(across, axis=1).max() < AT_CAMERA_MM:
         return estimate
     flagged = replace(estimate, flags=(*estimate.flags, "light_aside"))
     if known.distance_mm is None:

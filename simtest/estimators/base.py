@@ -178,7 +178,7 @@ def fit_isophotes(
     patch: Patch, camera: Camera, isovalues: Sequence[float]
 ) -> tuple[list[FittedIsophote], list[Failure]]:
     """Fit several isophotes (see `fit_isophote`); gives those that succeeded and the failures of the others."""
-    results = _fit(isovalues, [patch.crossings(t) for t in isovalues], camera)
+    results = _fit(isovalues, patch.crossings_of(isovalues), camera)
     fitted = [result for result in results if isinstance(result, FittedIsophote)]
     return fitted, [result for result in results if isinstance(result, Failure)]
 

@@ -88,7 +88,7 @@ def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool
     values, vectors = np.linalg.eigh(spot.moments)
     if values[0] <= 0:
         return Failure(Reason.DEGENERATE_CONIC, f"moments at the peak {values[0]:.3g}, {values[1]:.3g} rad^2")
-    shrunk, is_round = _without_noise(values, spot.covariance)
+    shrunk, is_round = _without_noise(values, spot.moments_covariance)
     # The longer axis lies along the smaller gain.
     stiffness = 1 / shrunk[::-1]
     directions = vectors.T[::-1] @ spot.basis
@@ -112,7 +112,7 @@ def _without_noise(values: Array, covariance: Array | None) -> tuple[Array, bool
     """
     if covariance is None:
         return values, False
-    (aa, _, ac), (_, bb, _), (_, _, cc) = covariance[4:, 4:]
+    (aa, _, ac), (_, bb, _), (_, _, cc) = covariance
     noise = float(aa + cc - 2 * ac + 4 * bb)
     mean, difference = float(values.mean()), float(values[1] - values[0])
     kept = max(difference - noise / difference, 0.0) if difference > 0 else 0.0

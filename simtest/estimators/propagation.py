@@ -1,4 +1,6 @@
-"""Noise of a frame's pixels in what is linear in its smoothed pixels."""
+"""Noise of a frame's pixels in what hangs on the crossings of isophotes."""
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,12 +12,50 @@ KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
 
 
-def covariance_of(
+def conics_by_crossings(
+    tangents: Array, gradient: Array, steps: Array, parts: Sequence[slice], weighted: Sequence[bool]
+) -> tuple[Array, Array]:
+    """Tell how fitted conics a x^2 + b x y + c y^2 + d x + e y = 1 move with their points.
+
+    To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the conic's
+    gradient where the fit is gradient-weighted.
+
+    Parameters
+    ----------
+    tangents, gradient, steps : ndarray, shape (2, N)
+        The points of all conics, the conic's gradient there, and how each moves per unit along its line.
+    parts : sequence of slice
+        Points of each conic.
+    weighted : sequence of bool
+        Whether each fit is gradient-weighted.
+
+    Returns
+    -------
+    by_moment : ndarray, shape (K, 5, 5)
+    moments : ndarray, shape (5, N)
+        Conic k moves by by_moment[k] @ moments[:, parts[k]] with its points.
+    """
+    (x, y), (by_x, by_y) = tangents, gradient
+    design = np.array([x * x, x * y, y * y, x, y])
+    moments = design
+    if any(weighted):
+        counts = [part.stop - part.start for part in parts]
+        moments = design / np.where(np.repeat(weighted, counts), by_x**2 + by_y**2, 1.0)
+    normal = np.array([moments[:, part] @ design[:, part].T for part in parts])
+    # Powers of small tangents differ by orders of magnitude: the equations are solved with a diagonal of 1.
+    scale = 1 / np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
+    scales = scale[:, :, None] * scale[:, None, :]
+    by_moment = -scales * np.linalg.inv(normal * scales)
+    return by_moment, moments * (by_x * steps[0] + by_y * steps[1])
+
+
+def raw_moves(
     pixels: npt.NDArray[np.intp], moves: Array, width: int, noise: float | npt.NDArray[np.float32], smoothing_px: float
 ) -> Array:
-    """Give the covariance by noise of K quantities, shape (K, K).
+    """Give what the noise's standard deviation in each raw pixel moves K quantities by, shape (K, P).
 
-    What hangs on the smoothed pixels does on the raw ones, whose noise is independent, by the transpose of smoothing.
+    What hangs on the smoothed pixels does on the raw ones, whose noise is independent, by the transpose of smoothing:
+    the product of the result with its transpose is the quantities' covariance.
 
     Parameters
     ----------
@@ -32,28 +72,33 @@ def covariance_of(
 
     Returns
     -------
-    ndarray, shape (K, K)
+    ndarray, shape (K, P)
     """
-    images, box = _images(pixels, moves, width)
+    rows = pixels // width
+    columns = pixels - rows * width
+    top, bottom, left, right = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
     margin = int(np.ceil(KERNEL_SIGMAS * smoothing_px))
-    level = np.pad(noise[box], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-    smoothed = [_transposed_smoothing(image, smoothing_px, margin) * level for image in images]
-    raw = np.stack(smoothed).reshape(len(smoothed), -1)
-    return np.asarray(raw @ raw.T)
+    wide, high = right - left + 2 * margin, bottom - top + 2 * margin
+    place = (rows - (top - margin)) * wide + (columns - (left - margin))
+    level = np.pad(noise[top:bottom, left:right], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
+    raw = np.empty((len(moves), high, wide))
+    for image, each in zip(raw, moves, strict=True):
+        summed = np.bincount(place, each, high * wide).astype(float, copy=False).reshape(high, wide)
+        _smooth_transposed(summed, smoothing_px, margin, image)
+    raw *= level
+    return raw.reshape(len(raw), -1)
 
 
-def _images(flat: npt.NDArray[np.intp], moves: Array, width: int) -> tuple[Array, tuple[slice, slice]]:
-    """Sum weights, shape (7, N), at their pixels of a patch; gives the images, cut to where they are, and the cut."""
-    rows, columns = np.divmod(flat, width)
-    top, left, high, wide = rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1
-    place = (rows - top) * wide + columns - left
-    images = np.array([np.bincount(place, each, high * wide).reshape(high, wide) for each in moves], dtype=float)
-    return images, (slice(top, top + high), slice(left, left + wide))
+def gram(rows: Array) -> Array:
+    """Give the products of few long rows, shape (K, P), with each other, shape (K, K)."""
+    # A product of the matrix with its own transpose takes a routine that is several times slower on so few rows.
+    return np.asarray((rows[:, None, None] @ rows[:, :, None])[:, :, 0, 0])
 
 
-def _transposed_smoothing(image: Array, sigma_px: float, margin: int) -> Array:
+def _smooth_transposed(image: Array, sigma_px: float, margin: int, smoothed: Array) -> None:
+    """Smooth an image that is 0 in a margin of the kernel's half-width into another."""
     if sigma_px <= 0:
-        return image
-    padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0.0)
-    side = 2 * margin + 1
-    return np.asarray(cv2.GaussianBlur(padded, (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT))
+        smoothed[:] = image
+    else:
+        side = 2 * margin + 1
+        cv2.GaussianBlur(image, (side, side), sigma_px, dst=smoothed, borderType=cv2.BORDER_CONSTANT)

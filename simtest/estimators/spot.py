@@ -7,7 +7,7 @@ both are followed to t -> 1 by a straight line (theory.md section 3, items 3 and
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,8 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
-from simtest.estimators.propagation import covariance_of
+from simtest.estimators.propagation import gram
+from simtest.estimators.spot_crossings import SpotCrossings
 from simtest.estimators.top import Top, fit_top
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
@@ -39,9 +40,6 @@ LEAST_VARIANCE_PX2 = 4.0
 
 NOISE_FACTOR = 2.0
 """How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
-
-STEP_PX = 0.1
-"""Step of the central differences of sightlines."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +69,22 @@ class Spot:
     @cached_property
     def axis(self) -> Array:
         """Mean of the cones' axes, unit, shape (3,), camera frame."""
-        axis = np.mean([pose.axis for pose in self.poses], axis=0)
+        axis = sum(pose.axis for pose in self.poses)
         return np.asarray(axis / np.linalg.norm(axis))
 
     @property
     def axis_ratio(self) -> float:
         """Mean of the cones' axis ratios, as they are."""
-        return float(np.mean([pose.axis_ratio for pose in self.poses]))
+        return sum(pose.axis_ratio for pose in self.poses) / len(self.poses)
 
     @cached_property
     def basis(self) -> Array:
         """Two unit vectors across the axis, shape (2, 3): ``tangent_basis`` of the normal that is its reverse."""
-        return np.stack([vector[0] for vector in tangent_basis(-self.axis[None])])
+        return np.concatenate(tangent_basis(-self.axis[None]))
+
+    @cached_property
+    def _crossings(self) -> SpotCrossings:
+        return SpotCrossings(self.patch, self.camera, self.isophotes, np.concatenate([self.basis, self.axis[None]]))
 
     @cached_property
     def levels(self) -> Array:
@@ -90,8 +92,7 @@ class Spot:
 
         The highest pixel that isovalues are relative to is too high where the top is flat and noisy.
         """
-        t = np.array([isophote.isovalue for isophote in self.isophotes])
-        return -np.log(t * self.patch.peak_value / self._top.value)
+        return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._top.value))
 
     @cached_property
     def _top(self) -> Top:
@@ -121,7 +122,7 @@ class Spot:
     @cached_property
     def drift_is_real(self) -> bool:
         """Whether the drift is more than noise; not known, and taken as not, where the noise is not known."""
-        covariance = self.covariance
+        covariance = self.axes_covariance
         if covariance is None or not self.can_extrapolate:
             return False
         noise = covariance[2:4, 2:4]
@@ -163,52 +164,53 @@ class Spot:
         J = self.basis @ (ahead - behind).T
         return np.asarray(J @ J.T)
 
-    @cached_property
+    @property
     def covariance(self) -> Array | None:
-        """Covariance by noise of (mean axis, drift, moments 11, 12, 22), shape (7, 7); None without known noise.
-
-        Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
-        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
-        """
-        noise = self.patch.noise
-        if noise is None:
+        """Covariance by noise of (mean axis, drift, moments 11, 12, 22), shape (7, 7); None without known noise."""
+        if self.patch.noise is None:
             return None
-        width = self.patch.values.shape[1]
-        column, row = self.patch.peak_pixel
-        # The levels move with the top that was fitted, and against the peak's pixel.
+        raw = np.concatenate([self._axes_by_noise, self._moments_by_noise])
+        return gram(raw)
+
+    @cached_property
+    def axes_covariance(self) -> Array | None:
+        """That of mean axis and drift alone, shape (4, 4)."""
+        if self.patch.noise is None:
+            return None
+        return gram(self._axes_by_noise)
+
+    @cached_property
+    def moments_covariance(self) -> Array | None:
+        """That of the moments alone, shape (3, 3)."""
+        if self.patch.noise is None:
+            return None
+        return gram(self._moments_by_noise)
+
+    @cached_property
+    def _axes_by_noise(self) -> Array:
+        """How mean axis and drift move with the raw pixels' noise, shape (4, P)."""
+        by_linear = self._by_linear
+        by_conic = np.zeros((len(by_linear), 4, 5))
+        by_conic[:, :2, 3:] = by_linear / len(by_linear)
+        if self.can_extrapolate:
+            by_conic[:, 2:, 3:] = by_linear * (self._weights - 1 / len(by_linear))[:, None, None]
+        return self._crossings.moved_by_noise(by_conic, (np.zeros(4), self._top))
+
+    @cached_property
+    def _moments_by_noise(self) -> Array:
+        """How the moments 11, 12, 22 move with the raw pixels' noise, shape (3, P)."""
         step = 1e-4
-        by_shift = np.zeros(7)
-        by_shift[4:] = ((self._moments_at(step) - self._moments_at(-step)) / (2 * step))[_UPPER]
-        outputs = self._outputs
-        by_peak, pixels, shares = -by_shift / self.patch.peak_value, [], []
-        for k, isophote in enumerate(self.isophotes):
-            moved = self.patch.sensitivities(isophote.isovalue, isophote.cut)
-            assert not isinstance(moved, Failure)
-            by_crossing = outputs[k] @ self._conic_by_crossing(k, moved.vertical)
-            by_peak = by_peak + by_crossing @ moved.level * isophote.isovalue
-            pixels.append((moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel())
-            shares.append((by_crossing[:, :, None] * moved.weights).reshape(7, -1))
-        pixels += [self._top.pixels, np.array([row * width + column])]
-        flat, moves = np.concatenate(pixels), [*shares, np.outer(by_shift, self._top.weights), by_peak[:, None]]
-        return covariance_of(flat, np.concatenate(moves, axis=1), width, noise, self.patch.smoothing_px)
+        by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
+        return self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._top))
 
     def conic(self, k: int) -> Array:
         """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
-        return self._conics[k]
+        return self._crossings.conics[k]
 
     def conic_covariance(self, k: int) -> Array:
         """Give its covariance by noise, shape (5, 5); the noise must be known."""
-        isophote, (column, row) = self.isophotes[k], self.patch.peak_pixel
-        width = self.patch.values.shape[1]
-        moved = self.patch.sensitivities(isophote.isovalue)
-        assert not isinstance(moved, Failure)
-        by_crossing = self._conic_by_crossing(k, moved.vertical)
-        by_peak = by_crossing @ moved.level * isophote.isovalue
-        flat = (moved.pixels[..., 1] * width + moved.pixels[..., 0]).ravel()
-        moves = np.column_stack([(by_crossing[:, :, None] * moved.weights).reshape(5, -1), by_peak])
-        noise = self.patch.noise
-        assert noise is not None
-        return covariance_of(np.append(flat, row * width + column), moves, width, noise, self.patch.smoothing_px)
+        alone = replace(self._crossings, isophotes=self.isophotes[k : k + 1])
+        return gram(alone.moved_by_noise(np.eye(5)[None]))
 
     def widening(self, k: int = 0) -> Array:
         """Give what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
@@ -221,7 +223,7 @@ class Spot:
     @property
     def axis_covariance(self) -> Array | None:
         """Covariance of the mean axis in the basis, rad^2, shape (2, 2): noise, and drift that is more than noise."""
-        covariance = self.covariance
+        covariance = self.axes_covariance
         if covariance is None:
             return None
         # In which direction the peak really lies from here the drift tells only roughly.
@@ -230,7 +232,7 @@ class Spot:
     @cached_property
     def drift_excess(self) -> float:
         """Squared drift beyond noise, rad^2; 0 where it is not more than noise, or the noise is not known."""
-        covariance = self.covariance
+        covariance = self.axes_covariance
         if covariance is None or not self.drift_is_real:
             return 0.0
         return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
@@ -238,49 +240,20 @@ class Spot:
     @property
     def peak_covariance(self) -> Array | None:
         """Covariance of the axis at t -> 1 in the basis, rad^2, shape (2, 2): noise, and what the line leaves open."""
-        if self.covariance is None:
+        covariance = self.axes_covariance
+        if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        noise = both @ self.covariance[:4, :4] @ both.T
+        noise = both @ covariance @ both.T
         # What smoothing moves a lopsided peak by is the drift over a level of about 2 s^2 / v, v the lobe's variance.
         values = np.linalg.eigvals(np.linalg.solve(self._px2, self.moments)).real
         smoothing = self.patch.smoothing_px**2 * float(np.sum(1 / np.maximum(values, LEAST_VARIANCE_PX2)))
         share = PEAK_SHARE + (smoothing / float(self.levels.mean())) ** 2 / 2
         return np.asarray(noise + share * self.drift_excess * np.eye(2))
 
-    def _conic_by_crossing(self, k: int, vertical: npt.NDArray[np.bool_]) -> Array:
-        """Tell how the conic a x^2 + b x y + c y^2 + d x + e y = 1 in the basis moves with its crossings, shape (5, N).
-
-        To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the
-        conic's gradient where the fit is gradient-weighted.
-        """
-        (x, y), by_column, by_row = self._crossings[k]
-        dx, dy = np.where(vertical, by_row, by_column)
-        a, b, c, d, e = self._conics[k]
-        by_x, by_y = 2 * a * x + b * y + d, b * x + 2 * c * y + e
-        design = np.array([x * x, x * y, y * y, x, y])
-        design /= (scale := np.abs(design).max(axis=1))[:, None]
-        weighted = design / (by_x**2 + by_y**2) if self.isophotes[k].cut else design
-        inverse = np.linalg.solve(weighted @ design.T, weighted) / scale[:, None]
-        return np.asarray(-inverse * (by_x * dx + by_y * dy))
-
-    @cached_property
-    def _crossings(self) -> list[tuple[Array, Array, Array]]:
-        """Tangents of each isophote's points and how they move per px to the right and down, shapes (2, N)."""
-        counts = np.cumsum([len(isophote.points) for isophote in self.isophotes])
-        points = np.concatenate([isophote.points for isophote in self.isophotes])
-        right, down = np.array([STEP_PX, 0.0]), np.array([0.0, STEP_PX])
-        # All at once: a call for each would cost more than the work.
-        places = self.tangents(np.concatenate([points, points + right, points - right, points + down, points - down]))
-        here, *sides = np.split(places.T, 5, axis=1)
-        moves = [(sides[i] - sides[i + 1]) / (2 * STEP_PX) for i in (0, 2)]
-        parts = [np.split(table, counts[:-1], axis=1) for table in (here, *moves)]
-        return list(zip(*parts, strict=True))
-
     def tangents(self, points: Array) -> Array:
         """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
-        rays = self.camera.unproject(points)
-        return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
+        return self._crossings.tangents(points).T
 
     @cached_property
     def is_bent(self) -> bool:
@@ -288,42 +261,28 @@ class Spot:
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
-        for k, isophote in enumerate(self.isophotes):
-            a, b, c, d, e = self._conics[k]
-            x, y = self._crossings[k][0]
-            F = a * x * x + b * x * y + c * y * y + d * x + e * y - 1
-            slope = np.hypot(2 * a * x + b * y + d, b * x + 2 * c * y + e)
-            residual = np.sqrt(np.mean((F / slope) ** 2)) * max(a * c - b * b / 4, 0.0) ** 0.25
-            # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
-            by_noise = left / (-2 * isophote.isovalue * np.log(isophote.isovalue))
-            if residual > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise):
-                return True
-        return False
-
-    @cached_property
-    def _conics(self) -> Array:
-        """(a, b, c, d, e) of each isophote, the constant -1, shape (K, 5)."""
-        frame = np.concatenate([self.basis, self.axis[None]])
-        C = frame @ np.array([isophote.cone for isophote in self.isophotes]) @ frame.T
-        C = C / -C[:, 2:, 2:]
-        return np.stack([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]], axis=1)
+        # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
+        isovalues = self._crossings.isovalues
+        by_noise = left / (-2 * isovalues * np.log(isovalues))
+        return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
 
     @property
-    def _outputs(self) -> Array:
-        """Tell how mean axis, drift and moments move with the conic of each isophote, shape (K, 7, 5)."""
-        a, b, c = self._conics.T[:3]
-        count, to_peak = len(self.isophotes), self._weights
-        made = np.zeros((count, 7, 5))
+    def _by_linear(self) -> Array:
+        """Tell how each cone's axis moves with (d, e) of its conic, shape (K, 2, 2)."""
         # The cone's axis is its third eigenvector, near the basis' own: -(A + I)^-1 (d, e) / 2.
+        a, b, c = self._crossings.conics.T[:3]
         determinant = (a + 1) * (c + 1) - b * b / 4
-        by_linear = np.array([[c + 1, -b / 2], [-b / 2, a + 1]]).transpose(2, 0, 1) / (-2 * determinant[:, None, None])
-        made[:, 0:2, 3:] = by_linear / count
-        if self.can_extrapolate:
-            made[:, 2:4, 3:] = by_linear * (to_peak - 1 / count)[:, None, None]
+        return np.asarray((np.array([[c + 1, -b / 2], [-b / 2, a + 1]]) / (-2 * determinant)).transpose(2, 0, 1))
+
+    @property
+    def _moments_by_conic(self) -> Array:
+        """Tell how the moments move with the conic of each isophote, shape (K, 3, 5)."""
+        a, b, c = self._crossings.conics.T[:3]
+        made = np.zeros((len(self.isophotes), 3, 5))
         # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
         p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)
         dE = -np.array([[p * p, p * q, q * q], [p * q, (p * r + q * q) / 2, q * r], [q * q, q * r, r * r]])
-        made[:, 4:, :3] = dE.transpose(2, 0, 1) * (to_peak / (2 * self.levels))[:, None, None]
+        made[:, :, :3] = (dE * (self._weights / (2 * self.levels))).transpose(2, 0, 1)
         return made
 
 

@@ -55,24 +55,33 @@ def fit_top(patch: Patch) -> Top:
     inside = _region(patch)
     pixels = np.flatnonzero(inside)
     values = patch.values.ravel()[pixels].astype(float)
-    if len(pixels) < MIN_PIXELS or values.min() <= 0 or inside.all():
+    if len(pixels) < MIN_PIXELS or values.min() <= 0 or len(pixels) == inside.size:
         return fallback
-    rows, columns = np.divmod(pixels, patch.values.shape[1])
-    x, y = (columns - columns.mean()) / max(np.ptp(columns), 1), (rows - rows.mean()) / max(np.ptp(rows), 1)
-    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    normal = design.T @ design
-    if np.linalg.cond(normal) > 1e12:
+    rows = pixels // patch.values.shape[1]
+    x, y = _centred(pixels - rows * patch.values.shape[1]), _centred(rows)
+    design = np.array([np.ones_like(x), x, y, x * x, x * y, y * y])
+    normal = design @ design.T
+    # The eigenvalues tell the condition and, with the vectors, solve for both right sides.
+    spread, vectors = np.linalg.eigh(normal)
+    if not spread[0] * 1e12 > spread[-1]:
         return fallback
-    f, d, e, a, b, c = np.linalg.solve(normal, design.T @ np.log(values))
+    inverse = (vectors / spread) @ vectors.T
+    f, d, e, a, b, c = (inverse @ (design @ np.log(values))).tolist()
     if not (a < 0 and 4 * a * c > b * b):
         return fallback
-    u, v = np.linalg.solve(np.array([[2 * a, b], [b, 2 * c]]), [-d, -e])
+    determinant = 4 * a * c - b * b
+    u, v = (b * e - 2 * c * d) / determinant, (b * d - 2 * a * e) / determinant
     apex = np.array([1.0, u, v, u * u, u * v, v * v])
     value = float(np.exp(apex @ [f, d, e, a, b, c]))
-    if np.hypot(u, v) > 1:
+    if u * u + v * v > 1:
         return fallback
     # At the apex the value does not move with the place.
-    return Top(value, pixels, design @ np.linalg.solve(normal, apex) / values)
+    return Top(value, pixels, (inverse @ apex) @ design / values)
+
+
+def _centred(places: npt.NDArray[np.intp]) -> Array:
+    """Give places about their mean, over their range."""
+    return np.asarray((places - places.mean()) / max(places.max() - places.min(), 1))
 
 
 def _region(patch: Patch) -> Mask:

@@ -194,8 +194,10 @@ class Camera:
         x = (points[..., 0] - self.cx - self.skew * y) / self.fx
         if self.distortion is not None:
             return self.distortion.undistort(np.stack([x, y], axis=-1))
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        rays = np.empty((*x.shape, 3))
+        rays[..., 0], rays[..., 1], rays[..., 2] = x, y, 1.0
+        rays /= np.sqrt(x * x + y * y + 1.0)[..., None]
+        return rays
 
     def project(self, points: npt.ArrayLike) -> Array:
         """Give the pixels of points or directions that the lens images.

@@ -129,10 +129,14 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
     """
     C = np.asarray(cones, dtype=float)
     finite = np.isfinite(C).all(axis=(1, 2))
-    C = np.where(finite[:, None, None], C, _ROUND)
+    if not finite.all():
+        C = np.where(finite[:, None, None], C, _ROUND)
     # The scale means nothing, and squares of very large or small entries would leave the range of numbers.
     size = np.abs(C).max(axis=(1, 2), keepdims=True)
-    values, vectors = _ordered(C / np.where((size > _HUGE) | (size < 1 / _HUGE), size + (size == 0), 1.0), sightlines)
+    extreme = (size > _HUGE) | (size < 1 / _HUGE)
+    if extreme.any():
+        C = C / np.where(extreme, size + (size == 0), 1.0)
+    values, vectors = _ordered(C, sightlines)
     l1, l2, l3 = values.T
     sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
     failures = {}
@@ -141,7 +145,8 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
         cone = Failure(Reason.DEGENERATE_CONIC, detail)
         failures[index] = cone if finite[index] else Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
     # The values of a round cone stand in for those that are none.
-    l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
+    if failures:
+        l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
     e1, e3 = vectors[:, :, 0], vectors[:, :, 2]
     g, h = np.sqrt((l1 - l2) / (l1 - l3)), np.sqrt((l2 - l3) / (l1 - l3))
     normals = _pair(e1 * g[:, None], e3 * h[:, None])
@@ -157,5 +162,7 @@ _HUGE = 1e100
 
 def _pair(across: Array, along: Array) -> Array:
     """Give the unit vectors along -(+-across + along), shape (N, 2, 3)."""
-    both = -np.stack([along + across, along - across], axis=1)
-    return np.asarray(both / np.linalg.norm(both, axis=2, keepdims=True))
+    both = np.empty((len(along), 2, 3))
+    np.add(along, across, out=both[:, 0])
+    np.subtract(along, across, out=both[:, 1])
+    return np.asarray(both / -np.sqrt((both * both).sum(axis=2, keepdims=True)))

@@ -51,7 +51,7 @@ def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -
     H = conic.normalised_from_image @ plane_from_camera
     cone = np.swapaxes(H, -1, -2) @ conic.normalised @ H
     cone = (cone + np.swapaxes(cone, -1, -2)) / 2
-    return np.asarray(cone / np.linalg.norm(cone, axis=(-2, -1), keepdims=True))
+    return np.asarray(cone / np.sqrt((cone * cone).sum(axis=(-2, -1), keepdims=True)))
 
 
 def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None, count: int = 73) -> Array:

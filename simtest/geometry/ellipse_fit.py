@@ -1,8 +1,10 @@
 """Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled, of many contours at once."""
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +23,6 @@ MAX_COORDINATE = 1e150
 MAX_AXIS_RATIO = 1e4
 """A fitted ellipse longer than this over its width is a line."""
 
-_STEP = 64
-"""Contours are padded to a multiple of this many points. Their own length alone decides, so that a fit's last bits
-do not depend on what else is in the batch."""
-
 _LINE = 1e-14
 """A share of the squared second moments' trace below which their determinant is rounding."""
 
@@ -32,7 +30,7 @@ _RANK = 1e-15
 """A share of the largest moment below which an eigenvalue is rounding."""
 
 _AT_ONCE = 2**16
-"""Padded points that are worked on at once: more would leave the processor's cache."""
+"""Points that are worked on at once: more would leave the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +88,20 @@ class _Failures:
     """The first failure of each contour."""
 
     def __init__(self) -> None:
-        self.found: dict[int, Failure] = {}
+        self._noted: list[tuple[npt.NDArray[np.bool_], Reason, str]] = []
 
     def add(self, which: npt.NDArray[np.bool_], reason: Reason, detail: str) -> None:
-        for index in np.flatnonzero(which):
-            self.found.setdefault(int(index), Failure(reason, detail))
+        self._noted.append((which, reason, detail))
+
+    @property
+    def found(self) -> dict[int, Failure]:
+        found: dict[int, Failure] = {}
+        # As a rule there are none: one look at all then does.
+        if np.array([which for which, _, _ in self._noted]).any():
+            for which, reason, detail in self._noted:
+                for index in np.flatnonzero(which).tolist():
+                    found.setdefault(index, Failure(reason, detail))
+        return found
 
 
 def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
@@ -137,23 +144,34 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
         If a contour is no numbers of shape (N, 2).
     """
     count = len(contours)
-    normalised, transforms = np.tile(np.eye(3), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1))
+    normalised, transforms = np.zeros((2, count, 3, 3)) + np.eye(3)
     failures: dict[int, Failure] = {}
-    alike: dict[int, list[int]] = {}
     arrays = [_points(points, index) for index, points in enumerate(contours)]
+    long_enough = []
     for index, xy in enumerate(arrays):
         if len(xy) < MIN_POINTS:
             failures[index] = Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
         else:
-            alike.setdefault(-(-len(xy) // _STEP) * _STEP, []).append(index)
-    for length, members in alike.items():
-        at_once = max(1, _AT_ONCE // length)
-        for first in range(0, len(members), at_once):
-            part = members[first : first + at_once]
-            fitted = _fit_padded([arrays[i] for i in part], length)
-            normalised[part], transforms[part] = fitted.normalised, fitted.normalised_from_image
-            failures |= {part[i]: failure for i, failure in fitted.failures.items()}
+            long_enough.append(index)
+    for part in _parts(long_enough, [len(xy) for xy in arrays]):
+        fitted = _fit_together([arrays[i] for i in part])
+        normalised[part], transforms[part] = fitted.normalised, fitted.normalised_from_image
+        failures |= {part[i]: failure for i, failure in fitted.failures.items()}
     return FittedConics(normalised, transforms, failures)
+
+
+def _parts(members: list[int], lengths: list[int]) -> Iterator[list[int]]:
+    """Split contours into parts of not too many points in all."""
+    part: list[int] = []
+    total = 0
+    for index in members:
+        if part and total + lengths[index] > _AT_ONCE:
+            yield part
+            part, total = [], 0
+        part.append(index)
+        total += lengths[index]
+    if part:
+        yield part
 
 
 def _points(points: npt.ArrayLike, index: int) -> Array:
@@ -169,89 +187,140 @@ def _points(points: npt.ArrayLike, index: int) -> Array:
     return xy
 
 
-def _fit_padded(contours: list[Array], length: int) -> FittedConics:
-    """Fit contours of at most `length` points, B of them."""
-    counts = np.array([len(xy) for xy in contours])
-    present = np.arange(length) < counts[:, None]
-    # One table for all steps: x^2, x y, y^2, x, y, 1. Fresh memory for each would cost more than the sums.
-    design = np.zeros((6, len(contours), length))
-    design[5] = present
-    points = design[3:5]
-    for i, xy in enumerate(contours):
-        points[:, i, : len(xy)] = xy.T
-    failures = _Failures()
-    extent = np.abs(points).max(axis=(0, 2))
+@dataclass(frozen=True)
+class _Batch:
+    """Points of B contours one after the other.
+
+    Every sum is over one contour's points alone, so that a fit's last bits do not depend on what else is in the batch.
+
+    Parameters
+    ----------
+    points : ndarray, shape (2, N)
+    counts : ndarray of int, shape (B,)
+        Points of each contour.
+    """
+
+    points: Array
+    counts: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, contours: list[Array]) -> "_Batch":
+        counts = np.array([len(xy) for xy in contours])
+        return cls(np.concatenate(contours).T.copy(), counts)
+
+    @cached_property
+    def first(self) -> npt.NDArray[np.intp]:
+        """First point of each contour, shape (B,)."""
+        return np.asarray(np.cumsum(self.counts) - self.counts)
+
+    def sums(self, table: Array) -> Array:
+        """Add up what belongs to each contour, from shape (K, N) to (K, B)."""
+        return np.add.reduceat(table, self.first, axis=1)
+
+    def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Give each point the value of its contour, from shape (..., B) to (..., N)."""
+        return np.repeat(values, self.counts, axis=-1)
+
+
+def _fit_together(contours: list[Array]) -> FittedConics:
+    """Fit B contours."""
+    batch, failures = _Batch.of(contours), _Failures()
+    extent = np.maximum.reduceat(np.abs(batch.points), batch.first, axis=1).max(axis=0)
     failures.add(~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity")
     failures.add(extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
-    points[:, list(failures.found)] = 0.0
-    transforms = _normalise(points, design[5], counts, failures)
-    conics = _fit_normalised(design, counts, failures)
+    if found := failures.found:
+        batch.points[:, batch.spread(np.isin(np.arange(len(contours)), list(found)))] = 0.0
+    transforms = _normalise(batch, failures)
+    conics = _fit_normalised(batch, failures)
     _check(conics, failures)
     return FittedConics(conics, transforms, failures.found)
 
 
-def _normalise(points: Array, present: Array, counts: Array, failures: _Failures) -> Array:
-    """Move points, shape (2, B, n), to their centre, principal axes and unit spread; give the similarities.
+def _normalise(batch: _Batch, failures: _Failures) -> Array:
+    """Move points to their centre, principal axes and unit spread; give the similarities, shape (B, 3, 3).
 
     In the principal axes the moments of a long ellipse are graded, and no digits are lost between them.
     """
+    points, counts = batch.points, batch.counts
     centre = np.zeros((2, len(counts)))
     # Twice: far from the origin the first mean is off by its rounding, and the points would share that offset.
     for _ in range(2):
-        mean = points.sum(axis=2) / counts
-        points -= mean[:, :, None]
-        points *= present
+        mean = batch.sums(points) / counts
+        points -= batch.spread(mean)
         centre += mean
-    (xx, xy), (_, yy) = np.einsum("ibn,jbn->ijb", points, points)
+    x, y = points
+    xx, xy, yy = batch.sums(np.array([x * x, x * y, y * y]))
     scale = np.sqrt((xx + yy) / counts / 2)
     together = ~(scale > 1e-12 * (1 + np.abs(centre).max(axis=0)))
     failures.add(together, Reason.DEGENERATE_CONIC, "all points coincide")
-    points[:, together] = 0.0
-    scale[together] = 1.0
+    if together.any():
+        points[:, batch.spread(together)] = 0.0
+        scale[together] = 1.0
     angle = np.arctan2(2 * xy, xx - yy) / 2
     cos, sin = np.cos(angle) / scale, np.sin(angle) / scale
     transforms = np.zeros((len(counts), 3, 3))
     transforms[:, 0, 0] = transforms[:, 1, 1] = cos
     transforms[:, 0, 1], transforms[:, 1, 0] = sin, -sin
-    transforms[:, :2, 2] = -(transforms[:, :2, :2] @ centre.T[:, :, None])[:, :, 0]
+    transforms[:, 0, 2], transforms[:, 1, 2] = -cos * centre[0] - sin * centre[1], sin * centre[0] - cos * centre[1]
     transforms[:, 2, 2] = 1.0
-    points[:] = (transforms[:, :2, :2] @ points.transpose(1, 0, 2)).transpose(1, 0, 2)
+    cos, sin = batch.spread(np.array([cos, sin]))
+    points[:] = cos * x + sin * y, cos * y - sin * x
     return transforms
 
 
-def _fit_normalised(design: Array, counts: Array, failures: _Failures) -> Array:
+_QUARTIC, _CUBIC, _QUADRATIC = [0, 1, 2, 1, 2, 3, 2, 3, 4], [5, 6, 6, 7, 7, 8], slice(9, 12)
+"""Where in the table of moments those of (x^2, x y, y^2) with themselves, with (x, y) and with 1 are."""
+
+
+_CIRCLE = np.eye(3)
+
+
+def _moments(batch: _Batch) -> Array:
+    """Sum up x^4, x^3 y, x^2 y^2, x y^3, y^4, x^3, x^2 y, x y^2, y^3, x^2, x y, y^2; shape (B, 12)."""
+    x, y = batch.points
+    table = np.empty((12, len(x)))
+    xx, yy = table[9], table[11]
+    np.multiply(x, batch.points, out=table[9:11])
+    np.multiply(y, y, out=yy)
+    np.multiply(xx, table[_QUADRATIC], out=table[0:3])
+    np.multiply(yy, table[10:12], out=table[3:5])
+    np.multiply(xx, batch.points, out=table[5:7])
+    np.multiply(yy, batch.points, out=table[7:9])
+    return np.ascontiguousarray(batch.sums(table).T)
+
+
+def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     """Give conics of normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
 
-    The last three of `design`, shape (6, B, n), are x, y and 1. The sums of x and of y are 0: the linear and the
-    constant part do not mix.
+    The sums of x and of y are 0: the linear and the constant part do not mix.
     """
-    x, y = design[3:5]
-    for row, (first, second) in enumerate(((x, x), (x, y), (y, y))):
-        np.multiply(first, second, out=design[row])
-    S = design[:3].transpose(1, 0, 2) @ design.transpose(1, 2, 0)
-    S1, S2, (xx, xy, yy) = S[:, :, :3], S[:, :, 3:5], S[:, :, 5].T
+    moments = _moments(batch)
+    S1, S2 = moments[:, _QUARTIC].reshape(-1, 3, 3), moments[:, _CUBIC].reshape(-1, 3, 2)
+    S3 = moments[:, _QUADRATIC]
+    xx, xy, yy = S3.T
     spread = xx * yy - xy * xy
     on_line = ~(spread > _LINE * (xx + yy) ** 2)
     failures.add(on_line, Reason.DEGENERATE_CONIC, "the points lie on a line")
     # d, e and f that minimise the residual for given a, b, c: (d, e) = -linear (a, b, c), f = -constant (a, b, c).
-    inverse = np.stack([yy, -xy, -xy, xx], axis=1) / np.where(on_line, 1.0, spread)[:, None]
-    linear = inverse.reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
-    constant = S[:, :, 5] / counts[:, None]
-    M = S1 - S2 @ linear - S[:, :, 5, None] * constant[:, None, :]
+    inverse = np.array([yy, -xy, -xy, xx]) / np.where(on_line, 1.0, spread)
+    linear = np.ascontiguousarray(inverse.T).reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
+    constant = S3 / batch.counts[:, None]
+    M = S1 - S2 @ linear - S3[:, :, None] * constant[:, None, :]
     M = (M + M.transpose(0, 2, 1)) / 2
     # One eigenvalue of M is 0 on an exact ellipse; where two are, as on four points, many conics fit.
-    trace, rounding = np.trace(M, axis1=1, axis2=2), _RANK * np.trace(S1, axis1=1, axis2=2)
-    minors = (trace**2 - (M**2).sum(axis=(1, 2))) / 2
+    trace, rounding = np.einsum("nii->n", M), _RANK * np.einsum("nii->n", S1)
+    minors = (trace * trace - (M * M).sum(axis=(1, 2))) / 2
     many = ~((trace > rounding) & (minors > rounding * trace))
     failures.add(many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse")
     # A circle's problem stands in for those without a solution.
-    M[many | on_line] = np.eye(3)
+    M[many | on_line] = _CIRCLE
     quadratic = constrained_minimum(M)
     a, b, c = quadratic.T
     d, e = -(linear @ quadratic[:, :, None])[:, :, 0].T
     f = -(constant * quadratic).sum(axis=1)
-    conics = np.stack([a, b / 2, d / 2, b / 2, c, e / 2, d / 2, e / 2, f], axis=1)
-    conics *= (np.where(a + c < 0, -1.0, 1.0) / np.linalg.norm(conics, axis=1))[:, None]
+    # In rows: the order of the norm's sum hangs on the layout.
+    conics = np.ascontiguousarray(np.array([a, b / 2, d / 2, b / 2, c, e / 2, d / 2, e / 2, f]).T)
+    conics *= (np.where(a + c < 0, -1.0, 1.0) / np.sqrt((conics * conics).sum(axis=1)))[:, None]
     return np.asarray(conics.reshape(-1, 3, 3))
 
 

@@ -24,15 +24,17 @@ def constrained_minimum(M: Array) -> Array:
     ndarray, shape (B, 3)
         q, unit.
     """
-    A, B, C, D, E, F = M[:, 0, 0], M[:, 0, 1], M[:, 0, 2], M[:, 1, 1], M[:, 1, 2], M[:, 2, 2]
     # det(M - l C) = c0 + c1 l + c2 l^2 - 4 l^3: Vieta's largest root, then Newton's steps for its last digits.
-    c0 = A * (D * F - E * E) - B * (B * F - C * E) + C * (B * E - C * D)
-    c1, c2 = A * F - 4 * B * E - C * C + 4 * C * D, 4 * (C - D)
+    entries = M.reshape(-1, 9)
+    products = entries.T[_FACTORS[0]] * entries.T[_FACTORS[1]]
+    minors = products[:4] - products[4:]
+    c0 = (entries.T[:3] * minors[:3]).sum(axis=0)
+    c1, c2 = minors[3] - 4 * minors[2], 4 * (entries[:, 2] - entries[:, 4])
     shift = c2 / 12
-    p, q = -c1 / 4 - 3 * shift**2, -c0 / 4 - c1 * shift / 4 - 2 * shift**3
-    radius = np.sqrt(np.maximum(-p / 3, 0))
-    cosine = -q / (2 * radius**3)
-    root = 2 * radius * np.cos(np.arccos(np.clip(cosine, -1, 1)) / 3) + shift
+    square, quarter = shift * shift, c1 / 4
+    radius = np.sqrt(np.maximum(quarter / 3 + square, 0))
+    cosine = (c0 / 4 + shift * (quarter + 2 * square)) / (2 * radius * radius * radius)
+    root = 2 * radius * np.cos(np.arccos(np.maximum(np.minimum(cosine, 1), -1)) / 3) + shift
     for _ in range(_NEWTON_STEPS):
         slope = c1 + root * (2 * c2 - 12 * root)
         root = root - (c0 + root * (c1 + root * (c2 - 4 * root))) / slope
@@ -47,20 +49,28 @@ def _rayleigh(M: Array, q: Array) -> Array:
     return np.asarray(np.einsum("ni,nij,nj->n", q, M, q) / (4 * q[:, 0] * q[:, 2] - q[:, 1] ** 2))
 
 
+# Entries, in a flattened matrix, whose products make the minors of its first row and of its middle: DF - E^2, CE - BF,
+# BE - CD and AF - C^2. Of few matrices each call costs more than its products: all at once.
+_FACTORS = np.array([[4, 2, 1, 0, 5, 1, 2, 2], [8, 5, 5, 8, 5, 8, 4, 2]])
+
+# The same for the cross products of rows 1 and 2, 2 and 0, 0 and 1: u1 v2 - u2 v1, u2 v0 - u0 v2, u0 v1 - u1 v0.
+_CROSSES = np.array(
+    [
+        [4, 5, 3, 7, 8, 6, 1, 2, 0, 5, 3, 4, 8, 6, 7, 2, 0, 1],
+        [8, 6, 7, 2, 0, 1, 5, 3, 4, 7, 8, 6, 1, 2, 0, 4, 5, 3],
+    ]
+)
+
+
 def _null_vector(M: Array, root: Array) -> Array:
     """Give the null vectors of M - l C, unit, shape (B, 3): of the cross products of two rows the longest."""
     N = M.copy()
     N[:, 0, 2] -= 2 * root
     N[:, 2, 0] -= 2 * root
     N[:, 1, 1] += root
-    crosses = np.stack([_cross(N[:, 1], N[:, 2]), _cross(N[:, 2], N[:, 0]), _cross(N[:, 0], N[:, 1])])
-    lengths = np.sqrt((crosses**2).sum(axis=2))
-    best, each = lengths.argmax(axis=0), np.arange(len(M))
-    length = lengths[best, each]
-    return np.asarray(crosses[best, each] / length[:, None])
-
-
-def _cross(u: Array, v: Array) -> Array:
-    """Give cross products, shapes (B, 3); numpy's is several times slower on few."""
-    (a, b, c), (d, e, f) = u.T, v.T
-    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=1)
+    entries = N.reshape(-1, 9)
+    products = entries.take(_CROSSES[0], axis=1) * entries.take(_CROSSES[1], axis=1)
+    crosses = (products[:, :9] - products[:, 9:]).reshape(-1, 3, 3)
+    squares = (crosses * crosses).sum(axis=2)
+    best, each = squares.argmax(axis=1), np.arange(len(M))
+    return np.asarray(crosses[each, best] / np.sqrt(squares[each, best])[:, None])

@@ -1,5 +1,6 @@
 """Isophotes of a highlight: the border of the region above a share of the smoothed peak that holds the peak."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -9,7 +10,14 @@ from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.level_sets import LevelSet, Sensitivities, cut_level_set_around, level_set_around
+from simtest.geometry.level_sets import (
+    Crossings,
+    LevelSet,
+    Sensitivities,
+    crossings,
+    cut_level_set_around,
+    level_set_around,
+)
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -98,6 +106,9 @@ class Patch:
     others_px: tuple[tuple[float, float], ...] = ()
     _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
     _cut_sets: dict[float, LevelSet] = field(default_factory=dict, compare=False, repr=False)
+    _crossings: dict[tuple[LevelSet, ...], Crossings] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
 
     @classmethod
     def cut(
@@ -201,20 +212,54 @@ class Patch:
         InputError
             If t is outside (0, 1).
         """
-        found = self._level_set(isovalue)
-        return found if isinstance(found, Failure) else found.crossings() + PIXEL_CENTRE + self.origin_px
+        return self.crossings_of([isovalue])[0]
+
+    def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
+        """Give the points of several isophotes (see `crossings`), at little more than the price of one."""
+        found = [self._level_set(t) for t in isovalues]
+        closed = [each for each in found if not isinstance(each, Failure)]
+        if not closed:
+            return [each for each in found if isinstance(each, Failure)]
+        traced = self._crossings_of_sets(closed)
+        points = iter(traced.each(traced.points + self._first_centre))
+        return [each if isinstance(each, Failure) else next(points) for each in found]
 
     def arc(self, isovalue: float) -> Array:
         """Give what is to be seen of an isophote that the region's border or the view cuts, shape (N, 2), in no order.
 
         Points nearer to the cut than 1.5 times the smoothing's width are left out.
         """
-        return self._cut_set(isovalue).crossings() + PIXEL_CENTRE + self.origin_px
+        return self._crossings_of_sets([self._cut_set(isovalue)]).points + self._first_centre
 
-    def sensitivities(self, isovalue: float, cut: bool = False) -> Sensitivities | Failure:
-        """Tell how the points of `crossings`, or of `arc`, move with the patch's values, in the same order."""
-        found = self._cut_set(isovalue) if cut else self._level_set(isovalue)
-        return found if isinstance(found, Failure) else found.sensitivities()
+    def sensitivities(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Sensitivities:
+        """Tell how the points of `crossings`, or of `arc` where cut, move with the patch's values, in the same order.
+
+        Parameters
+        ----------
+        isovalues : sequence of float
+            Of isophotes that were found.
+        cut : sequence of bool
+            Whether each is an arc.
+
+        Returns
+        -------
+        Sensitivities
+            One isophote's after the other's.
+        """
+        found = [self._cut_set(t) if arc else self._level_set(t) for t, arc in zip(isovalues, cut, strict=True)]
+        return self._crossings_of_sets([each for each in found if not isinstance(each, Failure)]).sensitivities
+
+    def _crossings_of_sets(self, sets: list[LevelSet]) -> Crossings:
+        """Give the crossings of level sets; as a rule their points are asked for first, then their sensitivities."""
+        key = tuple(sets)
+        if key not in self._crossings:
+            self._crossings[key] = crossings(sets)
+        return self._crossings[key]
+
+    @property
+    def _first_centre(self) -> Array:
+        """Centre of the region's first pixel, shape (2,), px."""
+        return np.array(self.origin_px) + PIXEL_CENTRE
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.

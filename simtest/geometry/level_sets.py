@@ -4,8 +4,9 @@ These are the points of marching squares, whose contours are the region's border
 and without it they are found several times faster than by tracing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,21 +54,74 @@ class Sensitivities:
 
 
 @dataclass(frozen=True)
+class Crossings:
+    """Where the borders of K level sets cross the lines between pixel centres, by linear interpolation.
+
+    One set after the other; of each the points between horizontal neighbours first, row by row, then those between
+    vertical ones. Each point once, though several lines cross a border at a pixel whose value is the level.
+
+    Parameters
+    ----------
+    counts : ndarray of int, shape (K,)
+        Points of each set.
+    first : ndarray of int, shape (N, 2)
+        Column and row of each line's first pixel in the array that the regions were found in.
+    vertical : ndarray of bool, shape (N,)
+        Whether the line is vertical; else it is horizontal.
+    share : ndarray, shape (N,)
+        How far from the first pixel, px.
+    rise : ndarray, shape (N,)
+        Intensity of the line's second pixel less that of its first.
+    """
+
+    counts: npt.NDArray[np.intp]
+    first: npt.NDArray[np.intp]
+    vertical: Mask
+    share: Array
+    rise: Array
+
+    @property
+    def points(self) -> Array:
+        """The points, shape (N, 2), integer-centred."""
+        points = self.first.astype(float)
+        points[:, 0] += self.share * ~self.vertical
+        points[:, 1] += self.share * self.vertical
+        return points
+
+    @property
+    def sensitivities(self) -> Sensitivities:
+        """How the points move with the intensities."""
+        ends = np.empty((len(self.first), 2, 2), dtype=np.intp)
+        ends[:, 0] = ends[:, 1] = self.first
+        ends[:, 1, 0] += ~self.vertical
+        ends[:, 1, 1] += self.vertical
+        level = 1 / self.rise
+        second = -self.share * level
+        return Sensitivities(self.vertical, ends, np.array([-level - second, second]).T, level)
+
+    def each(self, table: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        """Cut a table of all points, shape (N, ...), into those of the sets."""
+        ends = np.cumsum(self.counts).tolist()
+        return [table[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+
+
+@dataclass(frozen=True, eq=False)
 class LevelSet:
     """A 4-connected region of pixels above a level, its holes filled, with one pixel of margin on all sides.
 
     Parameters
     ----------
-    values : ndarray, shape (h, w)
-        Intensities.
+    values : ndarray, shape (H, W)
+        Intensities of the array that the region was found in.
     inside : ndarray of bool, shape (h, w)
         The region; the outermost rows and columns are outside of it.
     level : float
         The level.
     corner : tuple of int
-        Column and row of the first pixel in the array that the region was found in.
+        Column and row of the region's first pixel in the array; -1 where the margin lies outside.
     sound : ndarray of bool, shape (h, w), optional
-        Of a region that something cuts: the pixels far enough from the cut. Only lines between these are crossed.
+        Of a region that something cuts: the pixels far enough from the cut, none of them in the margin. Only lines
+        between these are crossed.
     """
 
     values: Image | Array
@@ -75,59 +129,6 @@ class LevelSet:
     level: float
     corner: tuple[int, int]
     sound: Mask | None = None
-
-    def crossings(self) -> Array:
-        """Give the border's points by linear interpolation between pixel centres, shape (N, 2), integer-centred.
-
-        Those between horizontal neighbours first, row by row, then those between vertical ones; each point once, though
-        several lines cross the border at a pixel whose value is the level.
-        """
-        across, pixels, start, end = self._lines
-        share = (self.level - start) / (end - start)
-        points = np.empty((len(share), 2))
-        points[:, 1], points[:, 0] = np.divmod(pixels, self.inside.shape[1])
-        points[:across, 0] += share[:across]
-        points[across:, 1] += share[across:]
-        points += self.corner
-        # Rounding too can put a crossing onto a pixel.
-        at_pixel = np.abs(share - 0.5) > _AT_PIXEL
-        return points[_first_of_each(points, at_pixel)] if at_pixel.any() else points
-
-    def sensitivities(self) -> Sensitivities:
-        """Tell how the points of `crossings` move with the intensities, in the same order."""
-        across, pixels, start, end = self._lines
-        share, rise = (self.level - start) / (end - start), end - start
-        vertical = np.arange(len(pixels)) >= across
-        ends: npt.NDArray[np.intp] = np.empty((len(pixels), 2, 2), dtype=np.intp)
-        ends[:, 0, 1], ends[:, 0, 0] = np.divmod(pixels, self.inside.shape[1])
-        ends[:, 0] += self.corner
-        ends[:, 1] = ends[:, 0]
-        ends[:across, 1, 0] += 1
-        ends[across:, 1, 1] += 1
-        weights = np.empty((len(pixels), 2))
-        weights[:, 0], weights[:, 1] = (share - 1) / rise, -share / rise
-        at_pixel = np.abs(share - 0.5) > _AT_PIXEL
-        if not at_pixel.any():
-            return Sensitivities(vertical, ends, weights, 1 / rise)
-        kept = _first_of_each(ends[:, 0] + (ends[:, 1] - ends[:, 0]) * share[:, None], at_pixel)
-        return Sensitivities(vertical[kept], ends[kept], weights[kept], 1 / rise[kept])
-
-    @cached_property
-    def _lines(self) -> tuple[int, npt.NDArray[np.intp], Array, Array]:
-        """Give how many crossed lines are horizontal; of all lines the first pixel and the values at both ends."""
-        width = self.inside.shape[1]
-        across, down = self.inside[:, 1:] != self.inside[:, :-1], self.inside[1:] != self.inside[:-1]
-        if self.sound is not None:
-            across &= self.sound[:, 1:] & self.sound[:, :-1]
-            down &= self.sound[1:] & self.sound[:-1]
-        rows, columns = np.divmod(np.flatnonzero(across), width - 1)
-        first = rows * width + columns
-        below = np.flatnonzero(down)
-        values = np.ravel(self.values)
-        pixels = np.concatenate([first, below])
-        start = values[pixels].astype(float)
-        end = values[np.concatenate([first + 1, below + width])].astype(float)
-        return len(first), pixels, start, end
 
     def polygon(self) -> Array:
         """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
@@ -137,11 +138,69 @@ class LevelSet:
         # Traced on the region itself: on the values, contours that meet at such a pixel would fall apart there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)
-        start, end = (self.values[at[:, 0], at[:, 1]].astype(float) for at in (first, last))
+        x, y = self.corner
+        start, end = (self.values[at[:, 0] + y, at[:, 1] + x].astype(float) for at in (first, last))
         points = first + (last - first) * ((self.level - start) / (end - start))[:, None]
         points = points[:, ::-1] + self.corner
         moved = (points[1:] != points[:-1]).any(axis=1)
         return np.asarray(points[np.append(True, moved)])
+
+
+def crossings(sets: Sequence[LevelSet]) -> Crossings:
+    """Give the crossings of level sets of one array, all at once: a call for each would cost more than the work.
+
+    Parameters
+    ----------
+    sets : sequence of LevelSet
+        At least one.
+
+    Returns
+    -------
+    Crossings
+        In the order of the sets.
+    """
+    (x, y), crossed = _crossed_lines(sets)
+    height, width = crossed.shape[2:]
+    places = np.flatnonzero(crossed)
+    # Floor division by one number is several times faster than divmod.
+    rows = places // width
+    planes = rows // height
+    number, vertical = planes >> 1, (planes & 1).astype(bool)
+    first = np.array([places - rows * width + x, rows - planes * height + y]).T
+    # A copy of the sets' part of the array alone: it may be that of a whole frame. The margin is never crossed.
+    part = sets[0].values[max(y, 0) : y + height, max(x, 0) : x + width]
+    place = (first[:, 1] - max(y, 0)) * part.shape[1] + first[:, 0] - max(x, 0)
+    values = part.ravel()
+    start, end = values.take([place, place + np.where(vertical, part.shape[1], 1)]).astype(float)
+    rise = end - start
+    share = (np.array([each.level for each in sets]).take(number) - start) / rise
+    # Rounding too can put a crossing onto a pixel.
+    at_pixel = np.abs(share - 0.5) > _AT_PIXEL
+    if at_pixel.any():
+        along = share[:, None] * np.array([~vertical, vertical]).T
+        kept = _first_of_each(np.column_stack([first + along, number]), at_pixel)
+        number, first, vertical, share, rise = (table[kept] for table in (number, first, vertical, share, rise))
+    return Crossings(np.bincount(number, minlength=len(sets)), first, vertical, share, rise)
+
+
+def _crossed_lines(sets: Sequence[LevelSet]) -> tuple[tuple[int, int], Mask]:
+    """Tell which lines right and down from the pixels of a box are crossed, shape (K, 2, h, w), and the box' corner."""
+    x, y = (min(each.corner[axis] for each in sets) for axis in (0, 1))
+    width, height = (max(each.corner[axis] + each.inside.shape[1 - axis] for each in sets) for axis in (0, 1))
+    inside = np.zeros((len(sets), height - y, width - x), dtype=bool)
+    boxes = [np.s_[each.corner[1] - y :, each.corner[0] - x :] for each in sets]
+    for each, layer, box in zip(sets, inside, boxes, strict=True):
+        rows, columns = each.inside.shape
+        layer[box][:rows, :columns] = each.inside
+    crossed = np.zeros((len(sets), 2, height - y, width - x), dtype=bool)
+    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[:, 0, :, :-1])
+    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[:, 1, :-1])
+    for each, (right, down), box in zip(sets, crossed, boxes, strict=True):
+        if each.sound is not None:
+            rows, columns = each.sound.shape
+            right[box][:rows, : columns - 1] &= each.sound[:, 1:] & each.sound[:, :-1]
+            down[box][: rows - 1, :columns] &= each.sound[1:] & each.sound[:-1]
+    return (x, y), crossed
 
 
 def level_set_around(
@@ -173,11 +232,11 @@ def level_set_around(
     if x == 0 or y == 0 or x + width == columns or y + height == rows:
         return None
     box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
-    around = np.where(marks[box] == _REGION, np.uint8(_REGION), np.uint8(0))
+    around = (marks[box] == _REGION).view(np.uint8)
     if seen is not None and (cv2.dilate(around, _NEIGHBOURS) > 0)[~seen[box]].any():
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
-    return LevelSet(values[box], around != _OUTSIDE, level, (x - 1, y - 1))
+    return LevelSet(values, around != _OUTSIDE, level, (x - 1, y - 1))
 
 
 def cut_level_set_around(
@@ -206,12 +265,11 @@ def cut_level_set_around(
     known = np.ones(values.shape, dtype=bool) if seen is None else seen
     marks = ((values > level) & known).view(np.uint8)
     cv2.floodFill(marks, None, pixel, _REGION, flags=4)
-    around = np.pad(np.where(marks == _REGION, np.uint8(_REGION), np.uint8(0)), 1)
+    around = np.pad((marks == _REGION).view(np.uint8), 1)
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     side = 2 * margin_px + 1
     sound = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0) > 0
-    framed = np.asarray(np.pad(values, 1, mode="edge"), dtype=np.float64)
-    return LevelSet(framed, around != _OUTSIDE, level, (-1, -1), np.asarray(sound))
+    return LevelSet(values, around != _OUTSIDE, level, (-1, -1), np.asarray(sound))
 
 
 def _first_of_each(points: Array, suspects: Mask) -> Mask:

@@ -22,8 +22,8 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    first = np.array([1 + sign * x * x * a, sign * b, -sign * x]).T.copy()
+    second = np.array([b, sign + y * y * a, -y]).T.copy()
     return first, second
 
 

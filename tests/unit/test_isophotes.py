@@ -266,3 +266,19 @@ def test_even_odd_rule():
     u = np.array([[0.0, 0], [5, 0], [5, 5], [4, 5], [4, 1], [1, 1], [1, 5], [0, 5], [0, 0]])
     assert not encloses(u, np.array([2.5, 3]))
     assert encloses(u, np.array([0.5, 3]))
+
+
+def test_several_isophotes_at_once_are_those_of_each_alone():
+    y, x = np.mgrid[:60, :80] + 0.5
+    values = np.exp(-((x - 22.3) ** 2) / 300 - (y - 30.6) ** 2 / 200)
+    # In steps, so that borders pass through pixels whose value is the level, two of them through the same ones.
+    values = np.round(values * 40) / 40
+    isovalues = (0.7, 0.1, 0.5, 0.5 + 1e-9, 0.3)
+    found = Patch.cut(values, (0, 0, 80, 60)).crossings_of(isovalues)
+    alone = [Patch.cut(values, (0, 0, 80, 60)).crossings(t) for t in isovalues]
+    assert [isinstance(each, Failure) for each in found] == [False, True, False, False, False]
+    for each, other in zip(found, alone, strict=True):
+        if isinstance(other, Failure):
+            assert each == other
+        else:
+            np.testing.assert_array_equal(each, other)

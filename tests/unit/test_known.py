@@ -136,7 +136,7 @@ def test_moments_of_a_gaussian_are_those_before_smoothing():
 
 def test_crossings_move_as_their_sensitivities_say():
     patch, t, change = lobe(), 0.5, 1e-8
-    moved = patch.sensitivities(t)
+    moved = patch.sensitivities([t], [False])
     before, bump = patch.crossings(t), change * np.random.default_rng(1).standard_normal(patch.values.shape)
     column, row = patch.peak_pixel
     value = float(patch.values[row, column] + bump[row, column])
@@ -158,6 +158,13 @@ def test_the_covariance_is_that_of_realisations():
     stated = np.diag(fit_spot(lobe(sigma, seed=1), CAMERA, ISOVALUES).covariance)
     # Variances of 200 draws lie within 30 % with more than 99.7 % each; top and peak pixel are not quite linear.
     np.testing.assert_allclose(np.var(made, axis=0, ddof=1), stated, rtol=0.3)
+
+
+def test_covariances_of_parts_are_those_of_the_whole():
+    spot = fit_spot(lobe(0.02), CAMERA, ISOVALUES)
+    np.testing.assert_allclose(spot.axes_covariance, spot.covariance[:4, :4], rtol=1e-12)
+    np.testing.assert_allclose(spot.moments_covariance, spot.covariance[4:, 4:], rtol=1e-12)
+    assert np.abs(spot.covariance[:4, 4:]).max() > 0
 
 
 def test_the_top_is_not_the_highest_pixel():
