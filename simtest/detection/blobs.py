@@ -16,7 +16,7 @@ from simtest.detection.light_split import SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
 from simtest.errors import Failure
 from simtest.geometry import FittedConic, fit_ellipses, smooth
-from simtest.geometry.level_sets import LevelSet, level_set_around
+from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -231,7 +231,7 @@ def _bordering(spot: _Found, region: Mask, visible: Mask | None, shape: tuple[in
 
 
 def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
-    contours = [part.crossings() for part in sets if part is not None]
+    contours = [crossings([part]).points for part in sets if part is not None]
     conics = fit_ellipses(contours)
     fitted = iter(range(len(contours)))
     made: list[FittedConic | None] = []
@@ -306,7 +306,7 @@ def _shape(spot: _Found, fits: list[FittedConic | None]) -> tuple[float | None, 
         if conic is None or part is None:
             break
         centre, Q = _quadratic(conic)
-        gap = part.crossings() - centre
+        gap = crossings([part]).points - centre
         away = np.sqrt(np.einsum("ni,ij,nj->n", gap, Q, gap)) - 1
         centres.append(centre)
         residuals.append(float(np.sqrt(np.mean(away**2))))
