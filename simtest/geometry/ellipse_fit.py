@@ -29,8 +29,8 @@ _LINE = 1e-14
 _RANK = 1e-15
 """A share of the largest moment below which an eigenvalue is rounding."""
 
-_AT_ONCE = 2**16
-"""Points that are worked on at once: more would leave the processor's cache."""
+_AT_ONCE = 2**18
+"""Points that are worked on at once: more would only take memory."""
 
 
 @dataclass(frozen=True)
