@@ -3,8 +3,6 @@
 The samples are those of the shipped dataset `endoscopy`: 640 x 480 with 16 samples a pixel and all labels.
 """
 
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -24,22 +22,6 @@ COUNT = 16
 """Samples that are made in each way, of one anatomy."""
 
 ROUNDS = 5
-
-_MEMORY = """
-import sys
-from simtest.dataset.plan import Plan
-from simtest.dataset.sample import Maker
-from simtest.spec import load_dataset
-made = Maker(Plan(load_dataset("endoscopy", {"samples": 100000, "samples_per_anatomy": 50,
-    "camera.width": 64, "camera.height": 48, "camera.fx": 32.0, "camera.fy": 32.0, "render.samples_per_pixel": 1})))
-def resident():
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * 4096 / 2**20
-for index in range(int(sys.argv[1])):
-    made.make(index).encode()
-    if index + 1 in (50, int(sys.argv[1])):
-        print(resident(), flush=True)
-"""
 
 
 def figures() -> list[Figure]:
@@ -101,13 +83,6 @@ def _reading(path: Path) -> list[Figure]:
         ]  # fmt: skip
     finally:
         cv2.setNumThreads(threads)
-
-
-def memory(count: int = 2000) -> float:
-    """Give how much the memory of a process grows from its 50th to its last sample, as a share; some minutes."""
-    done = subprocess.run([sys.executable, "-c", _MEMORY, str(count)], check=True, capture_output=True, text=True)
-    first, last = (float(line) for line in done.stdout.split())
-    return last / first - 1
 
 
 def _time(function: Callable[[], object]) -> float:

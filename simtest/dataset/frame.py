@@ -221,7 +221,9 @@ def _description(frame: LabelledFrame) -> dict[str, Any]:
         "full_scale": frame.full_scale,
         **encoding,
         **_places(frame.scene),
-        "highlights": [_highlight(judged) for judged in frame.highlights],
+        "highlights": [
+            {**describe_highlight(judged), "radiance": judged.highlight.radiance} for judged in frame.highlights
+        ],
         "fields": fields,
         "provenance": {**provenance.environment(), "variant": frame.variant},
     }
@@ -233,7 +235,8 @@ def _places(scene: Scene) -> dict[str, Any]:
     return {} if rig.preset is None and not rig.is_drawn else {"lights_mm": rig.true_mm().tolist()}
 
 
-def _highlight(judged: JudgedHighlight) -> dict[str, Any]:
+def describe_highlight(judged: JudgedHighlight) -> dict[str, Any]:
+    """Describe a true highlight for JSON: place, normal, curvature, and whether it counts as isolated."""
     highlight = judged.highlight
     return {
         "light": highlight.light,
@@ -243,7 +246,6 @@ def _highlight(judged: JudgedHighlight) -> dict[str, Any]:
         "distance_mm": highlight.distance,
         "kd_min": highlight.kd_min,
         "kd_max": highlight.kd_max,
-        "radiance": highlight.radiance,
         "isolated": judged.isolated,
         "why_not": judged.why_not or None,
     }

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from simtest.anatomy import forget_meshes
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import FIELDS, depth_scale_mm
+from simtest.dataset.frame import describe_highlight
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
@@ -224,19 +225,11 @@ def _instances(seen: View, mask: Array | None) -> Array:
 
 
 def _highlight(judged: JudgedHighlight) -> dict[str, Any]:
-    highlight = judged.highlight
+    direction = judged.highlight.direction_min
     return {
-        "light": highlight.light,
-        "bp_px": highlight.bp_px.tolist(),
-        "position_mm": highlight.position.tolist(),
-        "normal": highlight.normal.tolist(),
-        "distance_mm": highlight.distance,
-        "kd_min": highlight.kd_min,
-        "kd_max": highlight.kd_max,
-        "direction_min": None if highlight.direction_min is None else highlight.direction_min.tolist(),
+        **describe_highlight(judged),
+        "direction_min": None if direction is None else direction.tolist(),
         "peak_snr": _plain(judged.peak_snr),
-        "isolated": judged.isolated,
-        "why_not": judged.why_not or None,
     }
 
 
