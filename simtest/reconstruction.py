@@ -13,7 +13,7 @@ from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_
 from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
-from simtest.estimators.checked import run
+from simtest.estimators.checked import run_each
 from simtest.geometry import Camera, Patch, smooth
 from simtest.resources import shown
 
@@ -179,16 +179,10 @@ def run_estimators(
     patches = [
         _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
     ]
+    made = {name: run_each(each, patches, calibration.camera, calibration.known) for name, each in estimators.items()}
     return [
-        Specularity(
-            region,
-            patch,
-            {
-                name: _flagged(run(made, patch, calibration.camera, calibration.known), patch, limited)
-                for name, made in estimators.items()
-            },
-        )
-        for (region, _), patch in zip(found, patches, strict=True)
+        Specularity(region, patch, {name: _flagged(results[i], patch, limited) for name, results in made.items()})
+        for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))
     ]
 
 

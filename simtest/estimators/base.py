@@ -148,11 +148,22 @@ BatchEstimator = Callable[[Sequence[Patch | Failure], Camera], list[Estimate | F
 Estimator = Callable[..., Estimate | Failure]
 """An estimator: a callable that takes the patch of a highlight and the camera.
 
-One that has a parameter `known` is also given what is known beside the picture, as `simtest.calibration.Known`, by that
-name.
+One with an attribute `each`, a `BatchEstimator` that gives the same of each patch, is asked for all highlights of a
+frame at once (`answers_each`). One that has a parameter `known` is also given what is known beside the picture, as
+`simtest.calibration.Known`, by that name.
 
 Other packages register theirs under the entry-point group ``simtest.estimators``.
 """
+
+
+def answers_each(each: BatchEstimator) -> Callable[[Estimator], Estimator]:
+    """Give a decorator of an estimator that takes several highlights at once, too, and is faster then."""
+
+    def add(estimator: Estimator) -> Estimator:
+        estimator.each = each  # type: ignore[attr-defined]
+        return estimator
+
+    return add
 
 
 def fit_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophote | Failure:

@@ -1,6 +1,7 @@
 """Running an estimator, of this package or another, so that whatever it does is an `Estimate` or a `Failure`."""
 
 import inspect
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -41,18 +42,44 @@ def run(
         return patch
     try:
         result = estimator(patch, camera, known=known) if _asks(estimator) else estimator(patch, camera)
-        if isinstance(result, Failure):
-            return result
-        if not isinstance(result, Estimate):
-            return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
-        return _problem(result, patch, camera) or result
+        return _checked(result, patch, camera)
     except Exception as error:
         return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+
+
+def run_each(
+    estimator: Estimator, patches: Sequence[Patch | Failure], camera: Camera, known: Known = NOTHING_KNOWN
+) -> list[Estimate | Failure]:
+    """Run an estimator on several patches: all at once where it has a way of its own (`each`), else one by one.
+
+    See `run` for the parameters and what is given of each patch. Where the estimator's own way raises, or loses count,
+    each patch is run alone, so that one of them spoils no other.
+    """
+    each: BatchEstimator | None = getattr(estimator, "each", None)
+    if each is not None and len(patches) > 1:
+        try:
+            results = each(patches, camera)
+            return [
+                patch if isinstance(patch, Failure) else _checked(result, patch, camera)
+                for patch, result in zip(patches, results, strict=True)
+            ]
+        except Exception:
+            pass
+    return [run(estimator, patch, camera, known) for patch in patches]
 
 
 def one_by_one(estimator: Estimator, known: Known = NOTHING_KNOWN) -> BatchEstimator:
     """Give an estimator that takes several patches, each run as by `run`."""
     return lambda patches, camera: [run(estimator, patch, camera, known) for patch in patches]
+
+
+def _checked(result: object, patch: Patch, camera: Camera) -> Estimate | Failure:
+    """Give what an estimator gave, or a Failure where that is not what `Estimate` describes."""
+    if isinstance(result, Failure):
+        return result
+    if not isinstance(result, Estimate):
+        return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
+    return _problem(result, patch, camera) or result
 
 
 def _asks(estimator: Estimator) -> bool:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
-from simtest.estimators.base import Estimate, FittedIsophote, fit_isophote_of_each
+from simtest.estimators.base import Estimate, FittedIsophote, answers_each, fit_isophote_of_each
 from simtest.estimators.pose_region import pose_region
 from simtest.geometry import Camera, CirclePoses, Patch
 from simtest.geometry import circle_poses as poses_of_cones
@@ -60,6 +60,15 @@ class _Choice:
         )
 
 
+def _each(patches: Sequence[Patch | Failure], camera: Camera) -> list[Estimate | Failure]:
+    """Give `circle_pose` of several patches."""
+    return [
+        made if isinstance(patch, Failure) else _with_region(made, patch, camera)
+        for patch, made in zip(patches, circle_poses(patches, camera), strict=True)
+    ]
+
+
+@answers_each(_each)
 def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOVALUE) -> Estimate | Failure:
     """Reconstruct the normal of a plane from one isophote taken as the image of a circle.
 
@@ -85,10 +94,7 @@ def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOV
         distance: as a rule the light is at the camera, and the two-fold model does not apply. `region` holds the
         normals that the isophote's noise leaves: about both candidates, which near the branch point are one region.
     """
-    made = circle_poses([patch], camera, isovalue)[0]
-    if isinstance(made, Failure):
-        return made
-    return replace(made, region=pose_region(patch, camera, made.isophotes[0]))
+    return _with_region(circle_poses([patch], camera, isovalue)[0], patch, camera)
 
 
 def circle_poses(
@@ -106,6 +112,12 @@ def circle_poses(
     ]
     posed = iter(_pose(pending, camera))
     return [isophote if isinstance(isophote, Failure) else next(posed) for isophote in fitted]
+
+
+def _with_region(made: Estimate | Failure, patch: Patch, camera: Camera) -> Estimate | Failure:
+    if isinstance(made, Failure):
+        return made
+    return replace(made, region=pose_region(patch, camera, made.isophotes[0]))
 
 
 def _pose(fitted: Sequence[tuple[Patch, FittedIsophote]], camera: Camera) -> list[Estimate | Failure]:

@@ -60,19 +60,21 @@ def _region(spot: Spot) -> PoseRegion | None:
 
 
 def _ellipse(conic: Array) -> Array:
-    """Give centre and second moments (x, y, xx, xy, yy) of (a, b, c, d, e)."""
-    a, b, c, d, e = conic
-    A = np.array([[a, b / 2], [b / 2, c]])
-    centre = -np.linalg.solve(A, [d, e]) / 2
-    E = np.linalg.inv(A) * (1 + centre @ A @ centre)
-    return np.append(centre, E[np.triu_indices(2)])
+    """Give centre and second moments (x, y, xx, xy, yy) of (a, b, c, d, e), shape (..., 5)."""
+    a, b, c, d, e = np.moveaxis(conic, -1, 0)
+    determinant = 4 * a * c - b * b
+    x, y = (b * e - 2 * c * d) / determinant, (b * d - 2 * a * e) / determinant
+    scale = 2 * (1 + a * x * x + b * x * y + c * y * y) / determinant
+    return np.stack([x, y, 2 * c * scale, -b * scale, 2 * a * scale], axis=-1)
 
 
 def _conic(ellipse: Array) -> Array:
     """Undo `_ellipse`."""
-    centre, A = ellipse[:2], np.linalg.inv(_matrix(ellipse))
-    A /= 1 - centre @ A @ centre
-    return np.append([A[0, 0], 2 * A[0, 1], A[1, 1]], -2 * A @ centre)
+    x, y, xx, xy, yy = np.moveaxis(ellipse, -1, 0)
+    determinant = xx * yy - xy * xy
+    a, half, c = yy / determinant, -xy / determinant, xx / determinant
+    dx, dy = a * x + half * y, half * x + c * y
+    return np.stack([a, 2 * half, c, -2 * dx, -2 * dy], axis=-1) / (1 - x * dx - y * dy)[..., None]
 
 
 def _matrix(ellipse: Array) -> Array:
@@ -83,5 +85,5 @@ def _matrix(ellipse: Array) -> Array:
 def _jacobian(function: Callable[[Array], Array], place: Array) -> Array:
     """Give a function's derivatives by central differences, shape (5, 5)."""
     step = STEP * np.abs(place).max()
-    columns = [(function(place + step * unit) - function(place - step * unit)) / (2 * step) for unit in np.eye(5)]
-    return np.stack(columns, axis=1)
+    steps = step * np.eye(5)
+    return np.asarray((function(place + steps) - function(place - steps)).T / (2 * step))

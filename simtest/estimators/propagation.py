@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.float32]
 
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
@@ -51,7 +52,7 @@ def conics_by_crossings(
 
 def raw_moves(
     pixels: npt.NDArray[np.intp], moves: Array, width: int, noise: float | npt.NDArray[np.float32], smoothing_px: float
-) -> Array:
+) -> Rows:
     """Give what the noise's standard deviation in each raw pixel moves K quantities by, shape (K, P).
 
     What hangs on the smoothed pixels does on the raw ones, whose noise is independent, by the transpose of smoothing:
@@ -72,7 +73,7 @@ def raw_moves(
 
     Returns
     -------
-    ndarray, shape (K, P)
+    ndarray of float32, shape (K, P)
     """
     rows = pixels // width
     columns = pixels - rows * width
@@ -80,25 +81,27 @@ def raw_moves(
     margin = int(np.ceil(KERNEL_SIGMAS * smoothing_px))
     wide, high = right - left + 2 * margin, bottom - top + 2 * margin
     place = (rows - (top - margin)) * wide + (columns - (left - margin))
-    level = np.pad(noise[top:bottom, left:right], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-    raw = np.empty((len(moves), high, wide))
+    # Single precision from here on: these are standard deviations, and it takes half the time.
+    raw = np.empty((len(moves), high * wide), np.float32)
     for image, each in zip(raw, moves, strict=True):
-        summed = np.bincount(place, each, high * wide).astype(float, copy=False).reshape(high, wide)
-        _smooth_transposed(summed, smoothing_px, margin, image)
-    raw *= level
-    return raw.reshape(len(raw), -1)
+        image[:] = np.bincount(place, each, high * wide)
+    # Margins keep the images apart, so that one call smooths all.
+    smoothed = _smooth_transposed(raw.reshape(-1, wide), smoothing_px, margin).reshape(len(moves), high, wide)
+    level = np.pad(noise[top:bottom, left:right], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
+    smoothed *= np.float32(level)
+    return smoothed.reshape(len(moves), -1)
 
 
-def gram(rows: Array) -> Array:
+def gram(rows: Rows) -> Array:
     """Give the products of few long rows, shape (K, P), with each other, shape (K, K)."""
     # A product of the matrix with its own transpose takes a routine that is several times slower on so few rows.
-    return np.asarray((rows[:, None, None] @ rows[:, :, None])[:, :, 0, 0])
+    products = np.dot(rows, rows.copy().T).astype(float)
+    return np.asarray((products + products.T) / 2)
 
 
-def _smooth_transposed(image: Array, sigma_px: float, margin: int, smoothed: Array) -> None:
-    """Smooth an image that is 0 in a margin of the kernel's half-width into another."""
+def _smooth_transposed(images: Rows, sigma_px: float, margin: int) -> Rows:
+    """Smooth images, one below the other, that are 0 in a margin of the kernel's half-width."""
     if sigma_px <= 0:
-        smoothed[:] = image
-    else:
-        side = 2 * margin + 1
-        cv2.GaussianBlur(image, (side, side), sigma_px, dst=smoothed, borderType=cv2.BORDER_CONSTANT)
+        return images
+    side = 2 * margin + 1
+    return np.asarray(cv2.GaussianBlur(images, (side, side), sigma_px, borderType=cv2.BORDER_CONSTANT), np.float32)

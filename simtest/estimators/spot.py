@@ -164,44 +164,26 @@ class Spot:
         J = self.basis @ (ahead - behind).T
         return np.asarray(J @ J.T)
 
-    @property
-    def covariance(self) -> Array | None:
-        """Covariance by noise of (mean axis, drift, moments 11, 12, 22), shape (7, 7); None without known noise."""
-        if self.patch.noise is None:
-            return None
-        raw = np.concatenate([self._axes_by_noise, self._moments_by_noise])
-        return gram(raw)
-
     @cached_property
     def axes_covariance(self) -> Array | None:
-        """That of mean axis and drift alone, shape (4, 4)."""
+        """Covariance by noise of mean axis and drift, shape (4, 4); None without known noise."""
         if self.patch.noise is None:
             return None
-        return gram(self._axes_by_noise)
-
-    @cached_property
-    def moments_covariance(self) -> Array | None:
-        """That of the moments alone, shape (3, 3)."""
-        if self.patch.noise is None:
-            return None
-        return gram(self._moments_by_noise)
-
-    @cached_property
-    def _axes_by_noise(self) -> Array:
-        """How mean axis and drift move with the raw pixels' noise, shape (4, P)."""
         by_linear = self._by_linear
         by_conic = np.zeros((len(by_linear), 4, 5))
         by_conic[:, :2, 3:] = by_linear / len(by_linear)
         if self.can_extrapolate:
             by_conic[:, 2:, 3:] = by_linear * (self._weights - 1 / len(by_linear))[:, None, None]
-        return self._crossings.moved_by_noise(by_conic, (np.zeros(4), self._top))
+        return gram(self._crossings.moved_by_noise(by_conic))
 
     @cached_property
-    def _moments_by_noise(self) -> Array:
-        """How the moments 11, 12, 22 move with the raw pixels' noise, shape (3, P)."""
+    def moments_covariance(self) -> Array | None:
+        """Covariance by noise of the moments 11, 12, 22, shape (3, 3); None without known noise."""
+        if self.patch.noise is None:
+            return None
         step = 1e-4
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
-        return self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._top))
+        return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._top)))
 
     def conic(self, k: int) -> Array:
         """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""

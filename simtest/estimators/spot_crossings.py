@@ -10,15 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.estimators.base import FittedIsophote
-from simtest.estimators.propagation import conics_by_crossings, raw_moves
+from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
 from simtest.estimators.top import Top
 from simtest.geometry import Camera, Patch
 from simtest.geometry.level_sets import Sensitivities
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 STEP_PX = 0.1
-"""Step of the central differences of sightlines."""
+"""Step of the central differences of a distorting lens' sightlines."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,21 @@ class SpotCrossings:
 
     def tangents(self, points: Array) -> Array:
         """Give the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
+        if self.camera.distortion is None:
+            return self._pinhole(points)[0]
         along = self.frame @ self.camera.unproject(points).T
         return np.asarray(along[:2] / along[2])
+
+    def _pinhole(self, points: Array) -> tuple[Array, Array]:
+        """Give the tangents, and the third of the coordinates that they are ratios of: a homography of the image."""
+        H = self._from_image
+        along = H[:, :2] @ points.T
+        along += H[:, 2:]
+        return along[:2] / along[2], along[2]
+
+    @cached_property
+    def _from_image(self) -> Array:
+        return np.asarray(self.frame @ np.linalg.inv(self.camera.K))
 
     @cached_property
     def residuals(self) -> Array:
@@ -68,7 +82,7 @@ class SpotCrossings:
         a, b, c = self.conics.T[:3]
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
 
-    def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, Top] | None = None) -> Array:
+    def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, Top] | None = None) -> Rows:
         """Give what the noise's standard deviation in each raw pixel moves quantities by; the noise must be known.
 
         Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
@@ -84,7 +98,7 @@ class SpotCrossings:
 
         Returns
         -------
-        ndarray, shape (Q, P)
+        ndarray of float32, shape (Q, P)
         """
         noise, moved = self.patch.noise, self._sensitivities
         assert noise is not None
@@ -126,6 +140,16 @@ class SpotCrossings:
         """Their tangents, shape (2, N)."""
         return self.tangents(self._points)
 
+    def _steps(self, vertical: Mask) -> Array:
+        """Tell how the tangents change as each point moves along its line, per px, shape (2, N)."""
+        if self.camera.distortion is None:
+            places, depth = self._pinhole(self._points)
+            along = self._from_image.take(vertical.astype(np.intp), axis=1)
+            return np.asarray((along[:2] - places * along[2]) / depth)
+        step, count = STEP_PX * np.array([~vertical, vertical]).T, len(vertical)
+        there = self.tangents(np.concatenate([self._points + step, self._points - step]))
+        return np.asarray((there[:, :count] - there[:, count:]) / (2 * STEP_PX))
+
     @cached_property
     def _misses(self) -> tuple[Array, Array]:
         """What each point makes of its conic's left side less 1, shape (N,), and the gradient there, shape (2, N)."""
@@ -147,9 +171,6 @@ class SpotCrossings:
 
     @cached_property
     def _conics_by_crossings(self) -> tuple[Array, Array]:
-        vertical = self._sensitivities.vertical
-        step, count = STEP_PX * np.array([~vertical, vertical]).T, len(vertical)
-        there = self.tangents(np.concatenate([self._points + step, self._points - step]))
-        moves = (there[:, :count] - there[:, count:]) / (2 * STEP_PX)
+        moves = self._steps(self._sensitivities.vertical)
         cut = [isophote.cut for isophote in self.isophotes]
         return conics_by_crossings(self._places, self._misses[1], moves, self._parts, cut)
