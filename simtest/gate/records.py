@@ -8,6 +8,10 @@ import polars as pl
 PLACE = ("experiment", "label", "surface", "setting", "estimator")
 """Columns that name a family member of the gate: what an estimator did in one setting of one experiment."""
 
+POOLED = "all"
+"""Stands for label, surface and setting of a comparison over all settings of an experiment, and for the experiment too
+of one over all experiments."""
+
 FIGURES: dict[str, pl.DataType] = {
     "kind": pl.String(), **{name: pl.String() for name in PLACE}, "quantity": pl.String(), "unit": pl.String(),
     "value": pl.Float64(), "low": pl.Float64(), "high": pl.Float64(), "n": pl.Int64(), "passed": pl.Boolean(),
@@ -30,12 +34,15 @@ COMPARISONS: dict[str, pl.DataType] = {
 
 `method` is "equal" (the same bytes: no test is made), "paired", "unpaired" or "none"; `difference` is tonight less the
 baseline, `low`, `high` its 95 % interval, `margin` what it may be without harm; `p` one-sided for "worse by more than
-the margin", `p_holm` corrected over the family. `outcome` is one of `OUTCOMES`.
+the margin", `p_holm` corrected over the family. `outcome` is one of `OUTCOMES`. Rows over many settings (`POOLED`) of a
+quantity with a relative margin have the unit "x": the baseline is 1, the difference the mean share of the settings'.
+Canaries (`experiment` the canary's name, `low`, `high` what it may be) and costs have the method "none".
 """
 
 OUTCOMES = ("same", "equivalent", "undecided", "better", "worse", "new", "gone")
-"""same: equal bytes; equivalent: the interval lies within the margin; worse: beyond the margin at the corrected level
-(a regression); better: its mirror image; undecided: neither shown; new, gone: one of the two nights lacks the place."""
+"""same: equal bytes; equivalent: the interval, or every single pair, lies within the margin; worse: beyond the margin
+at the corrected level (a regression); better: its mirror image; undecided: neither shown; new, gone: one of the two
+nights lacks the place."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,34 @@
+"""Holm's correction for many tests, with weights."""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def holm(p: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> Array:
+    """Correct p-values for the size of their family by Holm's step-down procedure [H79], section 2 and 4.
+
+    Rejecting what is at most alpha keeps the chance of any false rejection at alpha, however the tests hang together.
+
+    Parameters
+    ----------
+    p : array_like, shape (N,)
+        p-values in [0, 1].
+    weights : array_like, shape (N,), optional
+        How much of alpha each test is given, positive; only their ratios count. Default equal ones.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Corrected p-values in [0, 1].
+    """
+    own = np.asarray(p, dtype=float)
+    share = np.ones_like(own) if weights is None else np.asarray(weights, dtype=float)
+    order = np.argsort(own / share, kind="stable")
+    # What is left of the weights when a test's turn comes: its own and those of the less significant ones.
+    left = np.cumsum(share[order][::-1])[::-1]
+    stepped = np.maximum.accumulate(own[order] * left / share[order])
+    corrected = np.empty_like(own)
+    corrected[order] = np.minimum(stepped, 1.0)
+    return corrected

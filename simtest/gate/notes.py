@@ -1,0 +1,77 @@
+"""What a reader of the verdict must know beside its comparisons."""
+
+from typing import Any
+
+import polars as pl
+
+from simtest.gate.limits import Limits
+from simtest.gate.pairing import changes
+from simtest.gate.quantities import ANSWERED
+from simtest.gate.records import PLACE, Night
+
+
+def notes_on(baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, limits: Limits) -> tuple[str, ...]:
+    """Say in what two nights differ beside their numbers.
+
+    Parameters
+    ----------
+    baseline, tonight : Night
+        The nights.
+    bit_equal : bool
+        Whether all results are the same bytes.
+    unmatched : int
+        Places whose results differ and whose rows are no exact pairs.
+    limits : Limits
+        `medians_deg`.
+
+    Returns
+    -------
+    tuple of str
+        Plain sentences.
+    """
+    made = [_other("Versions", *_differing(baseline.run, tonight.run))]
+    made.append(_other("The processor", baseline.run.get("processor"), tonight.run.get("processor")))
+    if unmatched:
+        made.append(
+            f"Seeds, or the rows, of {unmatched} places are not those of the baseline: these places were compared "
+            "unpaired."
+        )
+    if not bit_equal:
+        made += _numbers(baseline, tonight, limits)
+    return tuple(note for note in made if note)
+
+
+def _differing(before: dict[str, Any], after: dict[str, Any]) -> tuple[str, str]:
+    first, second = (dict(run.get("versions") or {}) for run in (before, after))
+    names = [name for name in sorted(first.keys() | second.keys()) if first.get(name) != second.get(name)]
+    return tuple(", ".join(f"{name} {own.get(name, 'missing')}" for name in names) for own in (first, second))  # type: ignore[return-value]
+
+
+def _other(what: str, before: str | None, after: str | None) -> str:
+    if before == after:
+        return ""
+    tested = " All places were compared unpaired." if what == "Versions" else ""
+    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}.{tested}"
+
+
+def _numbers(baseline: Night, tonight: Night, limits: Limits) -> list[str]:
+    """Say how near the medians are, and how many answers changed in kind."""
+    first, second = (
+        night.rows.filter(ANSWERED).group_by(PLACE).agg(pl.col("error_deg").median()) for night in (baseline, tonight)
+    )
+    both = first.join(second, on=PLACE, suffix="_2")
+    apart = (both["error_deg"] - both["error_deg_2"]).abs()
+    made = []
+    if both.height:
+        made.append(
+            f"Medians agree to {limits.medians_deg:g} deg at {int((apart <= limits.medians_deg).sum())} of "
+            f"{both.height} places; they differ by {float(apart.to_numpy().max()):.2g} deg at most."
+        )
+    found = changes(baseline.rows, tonight.rows)
+    if found.pairs:
+        made.append(
+            f"Of {found.pairs} pairs of answers {found.status} differ in status, {found.lost} of them answered in the "
+            f"baseline alone and {found.gained} tonight alone; of {found.frames} frames {found.detections} have "
+            "another number of detections: contours that changed topology."
+        )
+    return made
