@@ -7,7 +7,7 @@ from typing import Any
 from simtest.files import write_atomically
 from simtest.report import fineness, static, style, words
 from simtest.report.coverage import coverage, is_anatomical
-from simtest.report.gallery import isophote_colour
+from simtest.report.gallery import isophote_colour, isovalues
 from simtest.report.html import environment, picture, plotly_script
 from simtest.report.laws.section import laws_section
 from simtest.report.pairs import pairs
@@ -165,18 +165,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         provenance=words.provenance_rows(run),
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,
-        isophotes=[(t, _hex(isophote_colour(t))) for t in _isovalues(run)],
+        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(run.gallery)],
         charts={key: Markup(text) for key, text in charts.items()},
         plotly=Markup(plotly_script()) if charts else None,
     )
-
-
-def _isovalues(run: Run) -> list[float]:
-    """Give the isovalues that the gallery draws, sorted."""
-    estimates = [estimate for item in run.gallery for estimate in item.estimates]
-    drawn = [isophote.get("t") for estimate in estimates for isophote in estimate.get("isophotes") or ()]
-    return sorted({round(float(t), 3) for t in drawn if isinstance(t, int | float)})
-
-
-def _hex(colour: tuple[float, float, float, float]) -> str:
-    return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
