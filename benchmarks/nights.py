@@ -1,7 +1,7 @@
 """Nights made from the rows of real runs: what the nightly page is timed and tested with.
 
-Errors are real; later nights are the same figures with noise, as if each night's seeds were fresh. The verdicts are made
-up to show all outcomes, so no figure of them means anything.
+Errors are real; later nights are the same figures with noise, as if each night's seeds were fresh. The verdicts are
+made up to show all outcomes, so no figure of them means anything.
 """
 
 from dataclasses import replace
@@ -75,7 +75,7 @@ def _canaries() -> list[dict[str, Any]]:
 def _costs(rows: pl.DataFrame) -> list[dict[str, Any]]:
     names = rows["experiment"].unique(maintain_order=True).to_list()
     times = [
-        {"kind": "cost", "experiment": name, "quantity": "run time", "unit": "x the reference kernel",
+        {"kind": "cost", "experiment": name, "quantity": "run time", "unit": "×",
          "value": 10.0 * (i + 1), "low": 9.5 * (i + 1), "high": 10.5 * (i + 1)}
         for i, name in enumerate(names)
     ]  # fmt: skip
@@ -113,7 +113,8 @@ def history_of(night: Night, nights: int, seed: int = 0, noise: float = 0.05) ->
         commit = f"{rng.integers(2**48):012x}" if i % 3 == 0 or not parts else parts[-1]["commit"][0]
         run = {"run_id": f"night-{i:05d}", "commit": commit, "profile": night.run["profile"],
                "state": "regression" if rng.random() < 0.02 else "fine", "bit_equal": i % 3 != 0,
-               "processor": "made up", "versions": "made up", "duration_s": 1200.0, "source_hash": "made up"}  # fmt: skip
+               "processor": "made up", "versions": "made up", "duration_s": 1200.0,
+               "source_hash": "made up"}  # fmt: skip
         constants = [pl.lit(value).alias(name) for name, value in run.items()]
         own = held.with_columns(pl.Series("value", np.where(values == 0, 0.0, values * factor)))
         parts.append(own.with_columns(pl.lit(started).alias("started"), *constants))

@@ -6,7 +6,7 @@ from typing import Any
 import polars as pl
 
 from simtest.gate.records import Verdict
-from simtest.report.nightly.words import MEANINGS, interval, measure, signed
+from simtest.report.nightly.words import MEANINGS, interval, measure, scaled, signed
 from simtest.report.style import number
 
 MOST_ROWS = 1200
@@ -69,8 +69,8 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
         "tonight": (measure(row["tonight"], unit), row["tonight"]),
         "difference": (signed(row["difference"], unit), row["difference"]),
         "share": _share(row["difference"], row["baseline"]),
-        "interval": interval(row["low"], row["high"]),
-        "margin": (number(row["margin"]), row["margin"]),
+        "interval": interval(row["low"], row["high"], unit),
+        "margin": (number(scaled(row["margin"], unit)), row["margin"]),
         "p": (number(row["p_holm"], 2), row["p_holm"]),
         "n": row["n"] if row["n"] is not None else "–",
     }

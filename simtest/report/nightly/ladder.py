@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,7 +42,8 @@ def ladder(night: Night, colours: Mapping[str, str]) -> Ladder | None:
     figures = night.figures.filter((pl.col("kind") == "ladder") & pl.col("value").is_not_null())
     if figures.is_empty():
         return None
-    rungs = tuple((str(q), str(about or "")) for q, about in figures.select("quantity", "about").unique("quantity", maintain_order=True).iter_rows())
+    told = figures.select("quantity", "about").unique("quantity", keep="first", maintain_order=True)
+    rungs = tuple((str(name), str(about or "")) for name, about in told.iter_rows())
     names = [name for name, _ in rungs]
     rows = []
     for (setting, estimator), own in figures.group_by("setting", "estimator", maintain_order=True):
@@ -66,7 +69,7 @@ def _blame(names: list[str], cells: list[dict[str, Any] | None]) -> str:
     values = [(name, cell["value"]) for name, cell in zip(names, cells, strict=True) if cell is not None]
     if len(values) < 2 or values[0][1] <= FLOOR_DEG:
         return "–"
-    steps = [(before - after, name) for (_, before), (name, after) in zip(values, values[1:], strict=False)]
+    steps = [(before - after, name) for (_, before), (name, after) in pairwise(values)]
     most, name = max(steps)
     return f"{name} ({number(100 * most / values[0][1], 2)}\u00a0%)" if most > 0 else "–"
 
@@ -87,8 +90,9 @@ def _chart(names: list[str], rows: list[dict[str, Any]], colours: Mapping[str, s
                 x=list(range(len(names))), y=values, mode="lines+markers", name=name, legendgroup=name,
                 showlegend=name not in named, line={"color": colour, "width": 1.5},
                 marker={"symbol": marks[row["setting"]].plotly, "size": 9, "color": colour},
-                customdata=[[row["setting"], cell["text"], rung] for cell, rung in zip(row["cells"], names, strict=True)],
-                hovertemplate=f"<b>{name}</b>, %{{customdata[0]}}<br>%{{customdata[2]}}: %{{customdata[1]}}<extra></extra>",
+                customdata=[[cell["text"], rung] for cell, rung in zip(row["cells"], names, strict=True)],
+                hovertemplate=f"<b>{escape(name)}</b>, {escape(row['setting'])}<br>%{{customdata[1]}}: %{{customdata[0]}}"
+                "<extra></extra>",
             )
         )  # fmt: skip
         named.add(name)

@@ -21,7 +21,7 @@ def canaries(night: Night) -> list[dict[str, Any]]:
         {
             "name": row["experiment"] or "–", "quantity": row["quantity"] or "–", "about": row["about"] or "",
             "value": measure(row["value"], row["unit"]), "passed": row["passed"], "sort": row["value"],
-            "allowed": interval(row["low"], row["high"]), "where": row["setting"] or row["label"] or "",
+            "allowed": interval(row["low"], row["high"], row["unit"]), "where": row["setting"] or row["label"] or "",
         }
         for row in rows.iter_rows(named=True)
     ]  # fmt: skip
@@ -50,7 +50,7 @@ def answers(night: Night, by: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     table = rows.group_by(*by, "estimator", maintain_order=True).agg(
         true=true.sum(), ok=(ok & true).sum(), missed=(pl.col("status") == "missed").sum(), false=(~true).sum(),
         with_region=held.len(), covered=(held <= COVERED).sum(),
-        reasons=pl.col("status").filter(true & ~ok & (pl.col("status") != "missed")).value_counts(sort=True),
+        failed=(true & ~ok & (pl.col("status") != "missed")).sum(),
     )  # fmt: skip
     order = estimator_order(table["estimator"].drop_nulls().to_list())
     made = [_answers(row, by) for row in table.iter_rows(named=True)]
@@ -60,14 +60,10 @@ def answers(night: Night, by: tuple[str, ...] = ()) -> list[dict[str, Any]]:
 
 
 def _answers(row: dict[str, Any], by: tuple[str, ...]) -> dict[str, Any]:
-    reasons = {entry["status"]: entry["count"] for entry in row["reasons"]}
-    failed, covered = sum(reasons.values()), row["covered"]
-    share = None if not row["with_region"] else 100 * covered / row["with_region"]
+    share = None if not row["with_region"] else 100 * row["covered"] / row["with_region"]
     return {
-        **{name: row[name] for name in (*by, "estimator", "true", "ok", "missed", "false")},
-        "failed": failed,
+        **{name: row[name] for name in (*by, "estimator", "true", "ok", "failed", "missed", "false")},
         "answered": f"{100 * row['ok'] / row['true']:.1f}" if row["true"] else "–",
-        "reasons": ", ".join(f"{name} {count}" for name, count in reasons.items()) or "–",
         "covered": "–" if share is None else f"{share:.1f}",
         "with_region": row["with_region"],
     }
@@ -76,7 +72,7 @@ def _answers(row: dict[str, Any], by: tuple[str, ...]) -> dict[str, Any]:
 def reasons(night: Night) -> tuple[list[str], list[dict[str, Any]]]:
     """Give the failures' reasons, the commonest first, and their counts by estimator."""
     rows = night.rows
-    failed = rows.filter(pl.col("true_id").is_not_null() & ~pl.col("status").is_in(["ok"]))
+    failed = rows.filter(pl.col("true_id").is_not_null() & ~pl.col("status").is_in(["ok", "missed"]))
     if failed.is_empty():
         return [], []
     counts = failed.group_by("status", "estimator").len()
@@ -99,7 +95,7 @@ def costs(night: Night, verdict: Verdict) -> list[dict[str, Any]]:
         made.append(
             {"name": ", ".join(dict.fromkeys(names)) or "–", "quantity": row["quantity"] or "–",
              "value": measure(row["value"], row["unit"]), "sort": row["value"],
-             "interval": interval(row["low"], row["high"]), "about": row["about"] or "",
+             "interval": interval(row["low"], row["high"], row["unit"]), "about": row["about"] or "",
              "baseline": measure(before.get("baseline"), row["unit"])}
         )  # fmt: skip
     return made

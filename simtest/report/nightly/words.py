@@ -25,7 +25,10 @@ MEANINGS = {
 }
 """What the outcomes mean, those first that a reader looks for first."""
 
-_LEVEL = "simtest nightly accept --reason TEXT"
+SHARE = "share"
+"""Unit of what is shown in per cent."""
+
+_ACCEPT = "simtest nightly accept --reason TEXT"
 
 
 def short_commit(commit: str | None) -> str:
@@ -44,12 +47,18 @@ def when(started: Any) -> str:
     return f"{time.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
 
 
+def scaled(value: float | None, unit: str | None) -> float | None:
+    """Give a number as it is shown: shares in per cent."""
+    return value if value is None or unit != SHARE else 100 * value
+
+
 def measure(value: float | None, unit: str | None) -> str:
     """Write a number with its unit."""
     if unit in ("deg", "°"):
         return degrees(value)
-    text = number(value)
-    return text if text == "–" or not unit else f"{text}\u00a0{unit}"
+    text = number(scaled(value, unit))
+    shown = "%" if unit == SHARE else unit
+    return text if text == "–" or not shown else f"{text}\u00a0{shown}"
 
 
 def signed(value: float | None, unit: str | None = "") -> str:
@@ -58,11 +67,11 @@ def signed(value: float | None, unit: str | None = "") -> str:
     return "+" + text if value is not None and value > 0 and text != "–" else text
 
 
-def interval(low: float | None, high: float | None) -> str:
-    """Write an interval; a dash where there is none."""
+def interval(low: float | None, high: float | None, unit: str | None = "") -> str:
+    """Write an interval in the unit that `measure` shows; a dash where there is none."""
     if low is None and high is None:
         return "–"
-    return f"{number(low)} to {number(high)}".replace("-", "−")
+    return f"{number(scaled(low, unit))} to {number(scaled(high, unit))}".replace("-", "−")
 
 
 def headline(verdict: Verdict) -> str:
@@ -73,7 +82,9 @@ def headline(verdict: Verdict) -> str:
     if worse.is_empty():
         return "Regression."
     total = verdict.comparisons.height
-    counts = worse["estimator"].drop_nulls().value_counts(sort=True).sort("count", "estimator", descending=[True, False])
+    counts = (
+        worse["estimator"].drop_nulls().value_counts(sort=True).sort("count", "estimator", descending=[True, False])
+    )
     names = [f"{name} ({count})" for name, count in counts.iter_rows()]
     which = f": {labelled(names)}" if names else ""
     verb = "is" if worse.height == 1 else "are"
@@ -88,7 +99,7 @@ def lines(night: Night, verdict: Verdict) -> list[tuple[str, str]]:
         text = f"{when(base.get('started'))}, commit {short_commit(base.get('commit'))}"
         made.append(("Baseline", f"{text}: {base['reason']}" if base.get("reason") else text))
     else:
-        made.append(("Baseline", f"none; `{_LEVEL}` makes this night the baseline"))
+        made.append(("Baseline", f"none; `{_ACCEPT}` makes this night the baseline"))
     canaries = night.figures.filter(pl.col("kind") == "canary")
     if canaries.height:
         made.append(("Canaries", _canaries(canaries)))
