@@ -91,7 +91,8 @@ def _chart(names: list[str], rows: list[dict[str, Any]], colours: Mapping[str, s
                 showlegend=name not in named, line={"color": colour, "width": 1.5},
                 marker={"symbol": marks[row["setting"]].plotly, "size": 9, "color": colour},
                 customdata=[[cell["text"], rung] for cell, rung in zip(row["cells"], names, strict=True)],
-                hovertemplate=f"<b>{escape(name)}</b>, {escape(row['setting'])}<br>%{{customdata[1]}}: %{{customdata[0]}}"
+                hovertemplate=f"<b>{escape(name)}</b>, {escape(row['setting'])}<br>"
+                "%{customdata[1]}: %{customdata[0]}"
                 "<extra></extra>",
             )
         )  # fmt: skip
