@@ -1,6 +1,6 @@
 """Draws gallery frames: isophotes, fitted ellipses, brightest points and normals over the frame."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -161,6 +161,13 @@ def isophote_colour(isovalue: float) -> tuple[float, float, float, float]:
 
     red, green, blue, alpha = matplotlib.colormaps[_ISOPHOTE_MAP](float(np.clip(isovalue, 0, 1)))
     return red, green, blue, alpha
+
+
+def isovalues(items: Iterable[GalleryItem]) -> list[float]:
+    """Give the isovalues that gallery items draw, sorted."""
+    estimates = [estimate for item in items for estimate in item.estimates]
+    drawn = [isophote.get("t") for estimate in estimates for isophote in estimate.get("isophotes") or ()]
+    return sorted({round(float(t), 3) for t in drawn if isinstance(t, int | float)})
 
 
 def _closed(ax: "Axes", points: Any, colour: Any, width: float) -> None:

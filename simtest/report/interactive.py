@@ -9,6 +9,7 @@ import plotly.graph_objects as go
 
 from simtest.report import style
 from simtest.report.curves import Curve
+from simtest.report.html import script_text
 from simtest.report.series import LineFigure
 from simtest.report.static import has_law, heat_range, log_range, segment_colour, visible
 from simtest.report.style import LIGHT, NEUTRAL, Array
@@ -20,7 +21,7 @@ _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif"
 
 def to_json(figure: go.Figure) -> str:
     """Write a figure as JSON that may stand inside a script element."""
-    return str(figure.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return script_text(str(figure.to_json()))
 
 
 def layout(height: int, **more: Any) -> dict[str, Any]:

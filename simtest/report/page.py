@@ -1,7 +1,5 @@
 """Writes the page of a run: figures as PNG, and one HTML file that needs nothing else."""
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +7,8 @@ from typing import Any
 from simtest.files import write_atomically
 from simtest.report import fineness, static, style, words
 from simtest.report.coverage import coverage, is_anatomical
-from simtest.report.gallery import isophote_colour
+from simtest.report.gallery import isophote_colour, isovalues
+from simtest.report.html import environment, picture, plotly_script
 from simtest.report.laws.section import laws_section
 from simtest.report.pairs import pairs
 from simtest.report.paper.section import paper_section
@@ -138,48 +137,12 @@ def _gallery_section(run: Run, paths: Sequence[Path]) -> list[dict[str, Any]]:
     ]
 
 
-def picture(path: Path, limit: int) -> str:
-    """Give a PNG as a data address of a WebP picture.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The picture.
-    limit : int
-        Wanted size in bytes; quality and then width are lowered until it is met, but not below 40 and 420 px.
-
-    Returns
-    -------
-    str
-        ``data:image/webp;base64,...``
-    """
-    from PIL import Image
-
-    with Image.open(path) as source:
-        image = source.convert("RGB")
-    data = b""
-    for width, quality in ((640, 85), (640, 70), (560, 60), (480, 50), (420, 40)):
-        if image.width > width:
-            image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-        buffer = io.BytesIO()
-        image.save(buffer, "WEBP", quality=quality)
-        data = buffer.getvalue()
-        if len(data) <= limit:
-            break
-    return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
-
-
 def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], charts: Mapping[str, str]) -> str:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters["degrees"], environment.filters["number"] = style.degrees, style.number
     content = run.experiments.get(run.experiment) or {}
-    return environment.get_template("template.html.j2").render(
+    template = environment().get_template("template.html.j2")
+    return template.render(
         experiment=run.experiment,
         title=content.get("title") or run.experiment,
         description=content.get("description") or "",
@@ -202,24 +165,7 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         provenance=words.provenance_rows(run),
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,
-        isophotes=[(t, _hex(isophote_colour(t))) for t in _isovalues(run)],
+        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(run.gallery)],
         charts={key: Markup(text) for key, text in charts.items()},
-        plotly=Markup(_plotly_script()) if charts else None,
+        plotly=Markup(plotly_script()) if charts else None,
     )
-
-
-def _isovalues(run: Run) -> list[float]:
-    """Give the isovalues that the gallery draws, sorted."""
-    estimates = [estimate for item in run.gallery for estimate in item.estimates]
-    drawn = [isophote.get("t") for estimate in estimates for isophote in estimate.get("isophotes") or ()]
-    return sorted({round(float(t), 3) for t in drawn if isinstance(t, int | float)})
-
-
-def _hex(colour: tuple[float, float, float, float]) -> str:
-    return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
-
-
-def _plotly_script() -> str:
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs()).replace("</script", "<\\/script")

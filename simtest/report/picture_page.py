@@ -1,7 +1,6 @@
 """The page of a picture: its highlights one by one, to zoom and click; one file that needs nothing else."""
 
 import base64
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.report.html import environment, script_json
 from simtest.report.style import colours
 
 MAX_PICTURE_BYTES = 1_200_000
@@ -28,16 +28,12 @@ def write_picture_page(path: Path, document: dict[str, Any], picture: npt.NDArra
     picture : ndarray of float32, shape (H, W) or (H, W, 3)
         In [0, 1], as encoded, RGB.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
     spots = document["specularities"]
     height, width = picture.shape[:2]
-    html = environment.get_template("picture.html.j2").render(
+    template = environment().get_template("picture.html.j2")
+    html = template.render(
         title=Path(document["image"]).name,
         width=width,
         height=height,
@@ -45,15 +41,9 @@ def write_picture_page(path: Path, document: dict[str, Any], picture: npt.NDArra
         warnings=document["warnings"],
         reference=document.get("reference"),
         picture=_data_address(picture),
-        data=Markup(_script(_page_data(document))),
+        data=Markup(script_json(_page_data(document))),
     )
     path.write_text(html, encoding="utf-8")
-
-
-def _script(value: Any) -> str:
-    """Write a value as JSON that may stand inside a script element."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _data_address(picture: npt.NDArray[np.float32]) -> str:

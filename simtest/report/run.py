@@ -150,7 +150,7 @@ def read_run(path: Path) -> Run:
     files = sorted((path / "gallery").glob("[!.]*.npz"))
     count = min(len(files), MAX_GALLERY)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, count).round().astype(int))] if count else []
-    items = varied([_read_item(file) for file in chosen])
+    items = varied([read_item(file) for file in chosen])
     return Run(path, _read_results(path / "results.parquet"), _read_summary(path / "summary.json"), items, len(files))
 
 
@@ -173,6 +173,11 @@ def _read_results(path: Path) -> pl.DataFrame:
         frame = pl.read_parquet(path)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]})") from error
+    return completed(frame)
+
+
+def completed(frame: pl.DataFrame) -> pl.DataFrame:
+    """Give rows of results with every column the report uses; numbers that are not finite become null."""
     columns: list[pl.Expr] = []
     types: tuple[tuple[tuple[str, ...], pl.DataType], ...] = (
         (_TEXT, pl.String()), (_WHOLE, pl.Int64()), (_FLOAT, pl.Float64()),
@@ -205,7 +210,8 @@ def _read_summary(path: Path) -> dict[str, Any]:
     return summary
 
 
-def _read_item(path: Path) -> GalleryItem:
+def read_item(path: Path) -> GalleryItem:
+    """Read one gallery item; raises `InputError` where the file is none."""
     try:
         with np.load(path, allow_pickle=False) as data:
             meta = json.loads(str(data["meta"][()]))

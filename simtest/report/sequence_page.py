@@ -1,9 +1,10 @@
 """The page of a sequence: its frames one by one, and its tracks."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from simtest.report.html import environment, script_json
 
 LEAST_FRAMES = 3
 """Shorter tracks are counted, not listed."""
@@ -11,13 +12,8 @@ LEAST_FRAMES = 3
 
 def write_sequence_page(path: Path, documents: Sequence[dict[str, Any]], tracks: Sequence[dict[str, Any]]) -> None:
     """Write the page; the pictures lie beside it in frames/."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
     frames = [
         {"file": f"frames/{d['frame_index']:06d}.jpg", "name": d["image"], "time": d["time_s"],
          "count": len(d["specularities"])}
@@ -25,9 +21,11 @@ def write_sequence_page(path: Path, documents: Sequence[dict[str, Any]], tracks:
     ]  # fmt: skip
     listed = [track for track in tracks if len(track["frames"]) >= LEAST_FRAMES]
     place = {document["frame_index"]: i for i, document in enumerate(documents)}
-    text = json.dumps({"frames": frames, "place": place}, allow_nan=False)
-    text = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    html = environment.get_template("sequence.html.j2").render(
-        count=len(frames), tracks=listed, short=len(tracks) - len(listed), data=Markup(text)
+    template = environment().get_template("sequence.html.j2")
+    html = template.render(
+        count=len(frames),
+        tracks=listed,
+        short=len(tracks) - len(listed),
+        data=Markup(script_json({"frames": frames, "place": place})),
     )
     path.write_text(html, encoding="utf-8")

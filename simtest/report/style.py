@@ -158,6 +158,11 @@ def curvature_axis(values: npt.ArrayLike, title: str) -> Axis:
     return Axis(title, "stretched" if wide else "linear")
 
 
+def hexadecimal(colour: Sequence[float]) -> str:
+    """Write a colour, red, green and blue in [0, 1] first."""
+    return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
+
+
 def labelled(names: Sequence[str]) -> str:
     """Join names as an English list."""
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)

@@ -1,5 +1,6 @@
 """Sentences and captions made from the run's numbers."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import polars as pl
@@ -140,14 +141,19 @@ def gallery_caption(item: GalleryItem) -> dict[str, Any]:
     }
 
 
+def flattened(values: Mapping[str, Any]) -> dict[str, str]:
+    """Give the entries of a table, and of tables within it, as text by name."""
+    made: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            made |= {f"{key}: {name}": str(entry) for name, entry in value.items()}
+        elif isinstance(value, list | tuple):
+            made[str(key)] = " ".join(str(entry) for entry in value)
+        else:
+            made[str(key)] = "–" if value is None else str(value)
+    return made
+
+
 def provenance_rows(run: Run) -> list[tuple[str, str]]:
     """Flatten the provenance of summary.json to (name, text)."""
-    rows: list[tuple[str, str]] = []
-    for key, value in (run.summary.get("run") or {}).items():
-        if isinstance(value, dict):
-            rows += [(f"{key}: {name}", str(entry)) for name, entry in value.items()]
-        elif isinstance(value, list):
-            rows.append((str(key), " ".join(str(entry) for entry in value)))
-        else:
-            rows.append((str(key), "–" if value is None else str(value)))
-    return rows
+    return list(flattened(run.summary.get("run") or {}).items())

@@ -25,7 +25,9 @@ CONTOUR_POINTS = 200
 """Contours are thinned to about this many points."""
 
 
-def save(path: Path, session: Session, case: Case, seen: View, made: Realisation, command: str) -> None:
+def save(
+    path: Path, session: Session, case: Case, seen: View, made: Realisation, command: str, why: str | None = None
+) -> None:
     """Write one gallery item.
 
     Parameters
@@ -42,6 +44,8 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         The frame and the estimates.
     command : str
         Makes this item again.
+    why : str, optional
+        Why it is kept.
     """
     camera = session.camera
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
@@ -56,6 +60,8 @@ def save(path: Path, session: Session, case: Case, seen: View, made: Realisation
         "truth": [_truth(j, judged) for j, judged in enumerate(made.truths)],
         "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made, camera)],
     }
+    if why:
+        meta["why"] = why
 
     # Pictures are encoded once more where they are drawn.
     linear = seen.scene.sensor.response.model().decode(made.frame)

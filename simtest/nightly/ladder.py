@@ -1,0 +1,31 @@
+"""The error ladder as figures of a night."""
+
+import polars as pl
+
+from simtest.gate.records import FIGURES
+from simtest.validation.ladder import RUNGS, error_ladder
+
+
+def ladder_figures(seed: int = 0) -> pl.DataFrame:
+    """Compute the error ladder (`simtest.validation.ladder`): seconds.
+
+    Parameters
+    ----------
+    seed : int
+        Of the noisy frames.
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns `FIGURES`, of kind "ladder": `setting` the scene, `quantity` the rung, `value` the mean error, deg, with
+        its 95 % interval where it is one over noise, `n` the answers, `about` what the rung replaces.
+    """
+    rows = []
+    for rung in error_ladder(seed=seed):
+        low, high = rung.interval_deg
+        rows.append(
+            {"kind": "ladder", "experiment": "error ladder", "label": rung.scene, "setting": rung.scene,
+             "estimator": rung.estimator, "quantity": rung.name, "unit": "deg", "value": rung.mean_deg, "low": low,
+             "high": high, "n": len(rung.errors_deg), "about": RUNGS[rung.name]}
+        )  # fmt: skip
+    return pl.DataFrame(rows, schema=FIGURES)

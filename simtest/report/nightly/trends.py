@@ -1,0 +1,211 @@
+"""The figures of many nights, packed so that a page can hold them.
+
+A curve is one quantity of one estimator in one setting. Where there are more nights than a curve may have points, the
+newest are all kept; the older ones are cut into stretches, and of each the lowest and the highest are kept, so that no
+peak is lost. Values are stored as 16 bits between the curve's own least and largest.
+"""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from simtest.gate.records import PLACE, Night
+from simtest.report.nightly.words import short_commit
+from simtest.report.style import Array
+
+Mask = npt.NDArray[np.bool_]
+
+NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
+HISTORY_COLUMNS = ("kind", *PLACE, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
+"""All that the page reads of the history; a history of other columns may leave the rest out."""
+
+BUDGET_BYTES = 1_500_000
+"""Most that the packed curves may take in the page."""
+
+MOST_POINTS = 500
+"""Most points of a curve: more cannot be told apart on a screen."""
+
+NEWEST = 40
+"""Nights that are all kept."""
+
+LEAST_POINTS = NEWEST + 20
+
+COSTS, LADDER, MEDIAN = "run time and memory", "error ladder", "median over all settings"
+
+_KEY = (*PLACE, "kind", "quantity", "unit")
+
+
+@dataclass(frozen=True)
+class Trends:
+    """The curves of a page.
+
+    Parameters
+    ----------
+    data : dict
+        What the page's script unpacks.
+    nights : int
+        How many there are.
+    points : int
+        Most points of a curve; fewer than `nights` where the curves are thinned.
+    """
+
+    data: dict[str, Any]
+    nights: int
+    points: int
+
+    @property
+    def experiments(self) -> list[str]:
+        """Names to choose from."""
+        return list(self.data["names"]["experiment"])
+
+
+def trends(history: pl.DataFrame, night: Night, budget: int = BUDGET_BYTES) -> Trends | None:
+    """Pack the history of a night's profile, the night included.
+
+    Parameters
+    ----------
+    history : polars.DataFrame
+        Rows of the history's files, `HISTORY_COLUMNS` at least; may be empty, and may hold the night already.
+    night : Night
+        Tonight's.
+    budget : int
+        Bytes for the packed curves.
+
+    Returns
+    -------
+    Trends or None
+        None where no night has a figure.
+    """
+    rows = _joined(history, night)
+    if rows.is_empty():
+        return None
+    nights = rows.select(NIGHT_COLUMNS).unique("run_id").sort("started", "run_id").with_row_index("night")
+    rows = rows.join(nights.select("run_id", "night"), on="run_id")
+    keys, values = _matrix(rows, nights.height)
+    keys, values = _with_medians(keys, values)
+    points = _points(values, budget)
+    kept = _thinned(values, points)
+    return Trends(_packed(keys, values, kept, nights), nights.height, points)
+
+
+def _joined(history: pl.DataFrame, night: Night) -> pl.DataFrame:
+    """Give the numbers of all nights of the profile, of costs and settings alike."""
+    run = night.run
+    started = datetime.fromisoformat(run["started"]).astimezone(UTC)
+    constants = {"run_id": run["id"], "commit": run.get("commit"), "state": None, "profile": run["profile"]}
+    tonight = night.figures.select(HISTORY_COLUMNS[: HISTORY_COLUMNS.index("value") + 1]).with_columns(
+        pl.lit(started).alias("started"), *(pl.lit(value, pl.String).alias(name) for name, value in constants.items())
+    )
+    parts = [tonight.select(HISTORY_COLUMNS)]
+    if not history.is_empty():
+        past = history.select(HISTORY_COLUMNS).filter(pl.col("profile") == run["profile"])
+        past = past.with_columns(pl.col("started").cast(pl.Datetime("us", "UTC")))
+        parts = [past] if (past["run_id"] == run["id"]).any() else [past, *parts]
+    rows = pl.concat([part.with_columns(pl.col("started").cast(pl.Datetime("us", "UTC"))) for part in parts])
+    rows = rows.filter(pl.col("kind").is_in(["setting", "cost", "ladder"]) & pl.col("value").is_finite())
+    cost = pl.col("kind") == "cost"
+    shown = pl.coalesce("estimator", "experiment", pl.lit("all"))
+    return rows.with_columns(
+        estimator=pl.when(cost).then(shown).otherwise(pl.coalesce("estimator", pl.lit("all"))),
+        experiment=pl.when(cost).then(pl.lit(COSTS)).otherwise(pl.coalesce("experiment", pl.lit("all"))),
+        setting=pl.coalesce("setting", "label", pl.lit("all")),
+        unit=pl.col("unit").fill_null(""),
+    )
+
+
+def _matrix(rows: pl.DataFrame, nights: int) -> tuple[pl.DataFrame, Array]:
+    """Give the curves' names and their values, shape (curves, nights); NaN where a night has none."""
+    groups = rows.group_by(_KEY, maintain_order=True).agg("night", "value")
+    values = np.full((groups.height, nights), np.nan)
+    lengths = groups["night"].list.len().to_numpy()
+    index = np.repeat(np.arange(groups.height), lengths)
+    values[index, groups["night"].explode().to_numpy()] = groups["value"].explode().to_numpy()
+    keys = groups.select(_KEY)
+    # The surface tells settings apart that share a name.
+    several = pl.col("surface").n_unique().over("experiment", "setting") > 1
+    setting = pl.when(several).then(pl.format("{}, {}", "setting", "surface")).otherwise("setting")
+    return keys.with_columns(setting=pl.coalesce(setting, "setting")), values
+
+
+def _with_medians(keys: pl.DataFrame, values: Array) -> tuple[pl.DataFrame, Array]:
+    """Put before the curves those of the median over an experiment's settings, where it has several."""
+    names = ["experiment", "estimator", "quantity", "unit"]
+    groups = keys.with_row_index("row").group_by(names, maintain_order=True).agg("row", "kind")
+    groups = groups.filter(pl.col("row").list.len() > 1)
+    if groups.is_empty():
+        return keys.select(*names, "setting"), values
+    medians = np.array([_median(values[rows]) for rows in groups["row"].to_list()])
+    made = groups.select(*names, pl.lit(MEDIAN).alias("setting"))
+    return pl.concat([made, keys.select(*names, "setting")]), np.concatenate([medians, values])
+
+
+def _median(values: Array) -> Array:
+    """Give the median over rows of each column that has a value."""
+    made = np.full(values.shape[1], np.nan)
+    held = np.isfinite(values).any(axis=0)
+    made[held] = np.nanmedian(values[:, held], axis=0)
+    return made
+
+
+def _points(values: Array, budget: int) -> int:
+    """Give how many points a curve may have: 2 bytes each and a bit a night, 4 characters for 3 bytes."""
+    changing = int(np.count_nonzero(np.nanmax(values, axis=1) > np.nanmin(values, axis=1)))
+    left = budget * 3 / 4 - values.shape[0] * (values.shape[1] / 8 + 12)
+    return int(np.clip(left / (2 * max(changing, 1)), LEAST_POINTS, MOST_POINTS))
+
+
+def _thinned(values: Array, points: int) -> Mask:
+    """Choose the points of each curve, shape (curves, nights)."""
+    held = np.isfinite(values)
+    curves, nights = values.shape
+    if nights <= points:
+        return np.asarray(held)
+    kept = np.zeros_like(held)
+    kept[:, nights - NEWEST :] = held[:, nights - NEWEST :]
+    old = nights - NEWEST
+    count = max((points - NEWEST) // 2, 1)
+    width = -(-old // count)
+    padded = np.full((curves, width * -(-old // width)), np.nan)
+    padded[:, :old] = values[:, :old]
+    stretches = padded.reshape(curves, -1, width)
+    first = np.arange(stretches.shape[1]) * width
+    # A stretch without a value gives its first night, which is not held.
+    for lowest in (np.where(np.isnan(stretches), np.inf, stretches), np.where(np.isnan(stretches), np.inf, -stretches)):
+        np.put_along_axis(kept, np.minimum(lowest.argmin(axis=2) + first, old - 1), True, axis=1)
+    return np.asarray(kept & held)
+
+
+def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame) -> dict[str, Any]:
+    names = {name: keys[name].unique(maintain_order=True).to_list() for name in keys.columns}
+    low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
+    span = np.where(high > low, high - low, 1.0)[:, None]
+    codes = np.rint((values - low[:, None]) / span * 65535)
+    coded = kept & (high > low)[:, None]
+    return {
+        "nights": {
+            "started": nights["started"].dt.strftime("%Y-%m-%dT%H:%M:%SZ").to_list(),
+            "commit": [short_commit(commit) for commit in nights["commit"]],
+            "state": [state or "" for state in nights["state"]],
+        },
+        "names": names,
+        "series": {name: _places(keys[name], names[name]) for name in keys.columns},
+        "low": [float(f"{v:.7g}") for v in low],
+        "high": [float(f"{v:.7g}") for v in high],
+        "kept": _text(np.packbits(kept, axis=1)),
+        "values": _text(codes[coded].astype("<u2")),
+    }
+
+
+def _places(column: pl.Series, names: Sequence[str]) -> list[int]:
+    place = {name: i for i, name in enumerate(names)}
+    return [place[name] for name in column]
+
+
+def _text(data: npt.NDArray[Any]) -> str:
+    return base64.b64encode(data.tobytes()).decode("ascii")

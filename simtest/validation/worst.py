@@ -1,0 +1,174 @@
+"""The worst cases of many results: which rows missed by most, and their frames made again from their seeds."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from simtest.errors import InputError
+from simtest.estimators import load_estimators
+from simtest.rendering import Session
+from simtest.spec import Experiment
+from simtest.validation import gallery
+from simtest.validation.cases import Case, expand
+from simtest.validation.paper.item import save_realisation
+from simtest.validation.realise import realise, view
+
+MOST = 8
+"""Cases that are chosen."""
+
+_PLACE = ("experiment", "label", "surface", "setting", "estimator")
+
+
+@dataclass(frozen=True)
+class WorstCase:
+    """A frame that is worth a look.
+
+    Parameters
+    ----------
+    experiment, setting : str
+        Where it belongs.
+    realisation : int
+        Number of the realisation.
+    estimator : str
+        Who missed.
+    why : str
+        A sentence with the error, and what was expected.
+    """
+
+    experiment: str
+    setting: str
+    realisation: int
+    estimator: str
+    why: str
+
+
+def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: int = MOST) -> list[WorstCase]:
+    """Choose the worst cases: of places that got worse, then of each estimator in turn.
+
+    How bad a row is, is by how much the error of its better candidate exceeds what was expected: its law, or where
+    there is none the median of its setting and estimator. So the known failure of a model does not fill the gallery.
+
+    Parameters
+    ----------
+    results : polars.DataFrame
+        Rows of any experiments.
+    worse : polars.DataFrame, optional
+        Columns that name places (experiment, label, surface, setting, estimator), the worst first; they have half of
+        the cases at most.
+    most : int
+        Cases at most. A frame is chosen once.
+
+    Returns
+    -------
+    list of WorstCase
+    """
+    expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_PLACE))
+    answered = (pl.col("status") == "ok") & pl.col("true_id").is_not_null() & pl.col("error_oracle_deg").is_finite()
+    rows = results.filter(answered).with_columns(
+        expected=expected, excess=pl.col("error_oracle_deg") - expected, row=pl.int_range(pl.len())
+    )
+    rows = rows.sort("excess", "row", descending=[True, False])
+    queues: list[pl.DataFrame] = []
+    if worse is not None:
+        places = worse.select(_PLACE).unique(maintain_order=True).head(most // 2)
+        queues += [rows.join(place, on=_PLACE, nulls_equal=True).head(1) for place in places.iter_slices(1)]
+    chosen: dict[tuple[str, str, int], WorstCase] = {}
+    _take(chosen, [queue for queue in queues if queue.height], most // 2)
+    _take(chosen, [own for _, own in sorted(rows.group_by("estimator"), key=lambda item: str(item[0]))], most)
+    return list(chosen.values())
+
+
+def _take(chosen: dict[tuple[str, str, int], WorstCase], queues: list[pl.DataFrame], most: int) -> None:
+    """Take from the queues in turn, the worst of each first, a frame once and a setting once for each estimator."""
+    waiting = [(own.iter_rows(named=True), set[tuple[str, str]]()) for own in queues]
+    while waiting and len(chosen) < most:
+        left = []
+        for rows, settings in waiting:
+            if len(chosen) >= most:
+                break
+            for row in rows:
+                key = (row["experiment"], row["setting"], row["realisation"])
+                if key not in chosen and key[:2] not in settings:
+                    settings.add(key[:2])
+                    chosen[key] = WorstCase(*key, row["estimator"], _why(row))
+                    left.append((rows, settings))
+                    break
+        waiting = left
+
+
+def _why(row: dict[str, object]) -> str:
+    beside = "its law says" if row["error_law_deg"] is not None else "the setting's median is"
+    return f"{row['estimator']} missed by {row['error_oracle_deg']:.3g}°; {beside} {row['expected']:.3g}°."
+
+
+def save_worst(
+    cases: Iterable[WorstCase], experiments: Iterable[Experiment], folder: Path, variant: str | None = None
+) -> tuple[Path, ...]:
+    """Make the frames of worst cases again from their seeds, and keep them as gallery items.
+
+    Parameters
+    ----------
+    cases : iterable of WorstCase
+        Which.
+    experiments : iterable of Experiment
+        As they were run: name, seed and realisations.
+    folder : Path
+        Where the .npz files go; made if need be.
+    variant : str, optional
+        Mitsuba variant.
+
+    Returns
+    -------
+    tuple of Path
+        The files, in the order of the cases.
+
+    Raises
+    ------
+    InputError
+        If a case belongs to none of the experiments.
+    """
+    by_name = {experiment.name: experiment for experiment in experiments}
+    expanded: dict[str, list[Case]] = {}
+    folder.mkdir(parents=True, exist_ok=True)
+    files, session = [], None
+    for i, worst in enumerate(cases):
+        experiment = by_name.get(worst.experiment)
+        if experiment is None:
+            raise InputError(f"experiment {worst.experiment!r}: is none of {', '.join(by_name) or 'those given'}")
+        if worst.experiment not in expanded:
+            expanded[worst.experiment] = expand(experiment)
+        case = _case(expanded[worst.experiment], worst)
+        file = folder / f"worst-{i:02d}.npz"
+        if case.is_paper:
+            names = {"label": case.label, "setting": case.setting, "why": worst.why}
+            seed = case.noise_seed(experiment, worst.realisation)
+            save_realisation(file, case.paper_setting(), experiment.estimators, seed, names)
+        else:
+            session = _save(file, session, experiment, case, worst, variant)
+        files.append(file)
+    return tuple(files)
+
+
+def _case(cases: list[Case], worst: WorstCase) -> Case:
+    for case in cases:
+        if case.setting == worst.setting and worst.realisation in case.numbers():
+            return case
+    raise InputError(
+        f"experiment {worst.experiment}: has no realisation {worst.realisation} of the setting {worst.setting!r}"
+    )
+
+
+def _save(
+    file: Path, session: Session | None, experiment: Experiment, case: Case, worst: WorstCase, variant: str | None
+) -> Session:
+    """Make one frame again and keep it; gives the session, which later frames use."""
+    scene, drawn = case.scene(experiment, worst.realisation)
+    session = session or Session(scene, variant)
+    seen = view(session, scene)
+    estimators = load_estimators(experiment.estimators)
+    made = realise(session, experiment, case, worst.realisation, seen, drawn, estimators)
+    command = f"{case.again(experiment, worst.realisation)} --out frame"
+    gallery.save(file, session, case, seen, made, command, worst.why)
+    return session
