@@ -187,7 +187,7 @@ def contents(folder):
     return {
         path.relative_to(folder): path.read_bytes()
         for path in folder.rglob("*")
-        if path.is_file() and path.name != "lock" and path.suffix != ".lock"
+        if path.is_file() and not path.name.endswith("lock")
     }
 
 
@@ -345,12 +345,12 @@ def test_a_folder_is_replaced_whole(tmp_path):
 
 def test_reports_that_are_a_file_are_refused(tmp_path):
     (tmp_path / "reports").touch()
-    with pytest.raises(InputError, match="--reports .*reports: is a file; must be a folder"):
+    with pytest.raises(InputError, match=r"--reports .*reports: is a file; must be a folder"):
         Reports(tmp_path / "reports").make()
 
 
 def test_a_night_that_another_wrote_is_refused(tmp_path):
     save_night(tmp_path, make_night(), TONIGHT_ROWS)
     (tmp_path / "run.json").write_text('{"id": "x"}')
-    with pytest.raises(InputError, match="run.json: damaged"):
+    with pytest.raises(InputError, match=r"run\.json: damaged"):
         load_night(tmp_path, TONIGHT_ROWS)
