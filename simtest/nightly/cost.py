@@ -120,9 +120,9 @@ def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
 
 def _figure(
     name: str, quantity: str, unit: str, value: float, low: float | None, high: float | None, n: int, about: str,
-    label: str = "",
+    label: str | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     return {
-        "kind": "cost", "experiment": name, "label": label, "surface": "", "setting": "", "estimator": "",
-        "quantity": quantity, "unit": unit, "value": value, "low": low, "high": high, "n": n, "about": about,
+        "kind": "cost", "experiment": name, "label": label, "quantity": quantity, "unit": unit, "value": value,
+        "low": low, "high": high, "n": n, "about": about,
     }  # fmt: skip
