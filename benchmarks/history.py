@@ -41,7 +41,7 @@ def figures() -> list[Figure]:
         start = time.perf_counter()
         history, _ = read_history(reports.history, "quick")
         read_s = time.perf_counter() - start
-        verdict = judge(outcome.night, outcome.night, load_profile("quick"))
+        verdict = judge(outcome.night, outcome.night)
         folder = reports.work / "page"
         folder.mkdir()
         start = time.perf_counter()
@@ -108,7 +108,7 @@ def _main(folder: str, profile: str = "quick") -> None:
     scratch = reports.work / "page"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
-    verdict = judge(outcome.night, outcome.night, described)
+    verdict = judge(outcome.night, outcome.night)
     print(publish(reports, scratch, outcome.night, verdict, history) / "index.html")
 
 

@@ -89,7 +89,15 @@ def _print(outcome: "Outcome") -> None:
     from rich.table import Table
 
     from simtest.gate.records import OUTCOMES
-    from simtest.nightly.overview import by_experiment, failed_canaries, headline, number, ordered, place_name
+    from simtest.nightly.overview import (
+        by_experiment,
+        failed_canaries,
+        headline,
+        number,
+        ordered,
+        place_name,
+        without_canaries,
+    )
 
     night, verdict = outcome.night, outcome.verdict
     counts = OUTCOMES if verdict.baseline is not None else ()
@@ -99,7 +107,7 @@ def _print(outcome: "Outcome") -> None:
         table.add_row(*("" if row[key] is None else str(row[key]) for key in keys))
     console = Console(width=TABLE_WIDTH)
     console.print(table)
-    for row in ordered(verdict.comparisons, "worse").iter_rows(named=True):
+    for row in ordered(without_canaries(night, verdict), "worse").iter_rows(named=True):
         print(
             f"worse: {row['experiment']}, {place_name(row)}, {row['quantity']}: {number(row['tonight'], row['unit'])}, "
             f"baseline {number(row['baseline'], row['unit'])}"

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.gate.records import Night
+from simtest.gate.records import PLACE, Night
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.storage import BASELINE_ROWS, RUN_FILE, TONIGHT_ROWS, load_night, save_night
 from simtest.resources import shown
@@ -15,11 +15,10 @@ LOG = "log.jsonl"
 MAX_REASON = 1000
 
 COLUMNS = (
-    "experiment", "label", "surface", "setting", "realisation", "specularity", "true_id", "seed", "estimator", "status",
-    "error_deg", "error_oracle_deg", "error_look_deg", "n_candidates", "rank_correct", "mahalanobis2", "axis_ratio",
+    *PLACE, "realisation", "specularity", "true_id", "seed", "status", "error_deg", "mahalanobis2", "axis_ratio",
     "axis_ratio_law",
 )  # fmt: skip
-"""Columns of the rows that a baseline keeps: what names a row, and what nights are compared by."""
+"""Columns of the rows that a baseline keeps: what names a row, and what `simtest.gate.compare` reads."""
 
 
 def load_baseline(reports: Reports, profile: str) -> Night | None:

@@ -23,6 +23,8 @@ from simtest.spec import load_scene
 SIDE, WIDTH_PX, SIGMA, SMOOTHING_PX = 100, 28.0, 0.05, 2.0
 FRAME_PX = 406
 
+HIGHLIGHT, FRAME = f"a highlight of {SIDE} x {SIDE} px", f"a frame of {FRAME_PX} x {FRAME_PX} px"
+
 ROUNDS = 15
 
 Piece = Callable[[], object]
@@ -89,13 +91,14 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
     Returns
     -------
     polars.DataFrame
-        Columns `FIGURES`, kind "cost", quantity "run_time": the median of the rounds' ratios to the reference kernel's
-        time; `low`, `high` are their quartiles.
+        Columns `FIGURES`, kind "cost", `estimator` the piece's name, quantity "run_time": the median of the rounds'
+        ratios to the reference kernel's time; `low`, `high` are their quartiles.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        pieces = {**estimator_pieces(), **_frame_pieces(variant)}
+        of_highlight = estimator_pieces()
+        pieces = {**of_highlight, **_frame_pieces(variant)}
         # The processor's time, of all threads: what else runs on the machine tells less on it than on the clock's.
         times = times_in_turns({"reference": reference_kernel(), **pieces}, rounds, time.process_time)
     finally:
@@ -105,7 +108,8 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
     for name in pieces:
         low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))
         about = f"{1e3 * np.median(times[name]):.3g} ms over {1e3 * np.median(reference):.3g} ms of processor time"
-        made.append(_figure(name, "run_time", "x", middle, low, high, rounds, about))
+        setting = HIGHLIGHT if name in of_highlight else FRAME
+        made.append(_figure(name, setting, "run_time", "x", middle, low, high, rounds, about))
     return pl.DataFrame(made, schema=FIGURES)
 
 
@@ -114,15 +118,16 @@ def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
     made = []
     if peak_mib is not None:
         about = "all processes together, shared pages once"
-        made.append(_figure("night", "peak_memory", "MiB", peak_mib, None, None, 1, about, f"workers={workers}"))
+        setting = f"{workers} worker{'s' * (workers > 1)}"
+        made.append(_figure("night", setting, "peak_memory", "MiB", peak_mib, None, None, 1, about))
     return pl.DataFrame(made, schema=FIGURES)
 
 
 def _figure(
-    name: str, quantity: str, unit: str, value: float, low: float | None, high: float | None, n: int, about: str,
-    label: str | None = None,
+    name: str, setting: str, quantity: str, unit: str, value: float, low: float | None, high: float | None, n: int,
+    about: str,
 ) -> dict[str, Any]:  # fmt: skip
     return {
-        "kind": "cost", "experiment": name, "label": label, "quantity": quantity, "unit": unit, "value": value,
-        "low": low, "high": high, "n": n, "about": about,
+        "kind": "cost", "experiment": "cost", "label": "", "surface": "", "setting": setting, "estimator": name,
+        "quantity": quantity, "unit": unit, "value": value, "low": low, "high": high, "n": n, "about": about,
     }  # fmt: skip

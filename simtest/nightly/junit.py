@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import polars as pl
 
 from simtest.gate.records import PLACE, Night, Verdict
-from simtest.nightly.overview import number, place_name
+from simtest.nightly.overview import number, place_name, without_canaries
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 has no way to write."""
@@ -57,7 +57,7 @@ def _places(night: Night, verdict: Verdict) -> Iterable[tuple[str, Iterable[Case
     measured = night.figures.filter(pl.col("kind") != "canary").select(*PLACE).unique(maintain_order=True)
     compared = {
         tuple(place): group
-        for place, group in verdict.comparisons.group_by(*PLACE, maintain_order=True)
+        for place, group in without_canaries(night, verdict).group_by(*PLACE, maintain_order=True)
     }  # fmt: skip
     rows = {tuple(row[name] for name in PLACE): row for row in measured.iter_rows(named=True)}
     rows |= {place: dict(zip(PLACE, place, strict=True)) for place in compared if place not in rows}

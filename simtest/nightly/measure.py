@@ -76,7 +76,7 @@ def measure_night(
         figures = [setting_figures(rows)]
         if profile.canaries:
             steps.tell("canaries")
-            figures.append(run_canaries(variant))
+            figures.append(run_canaries(rows, variant))
     if profile.costs:
         steps.tell("costs")
         figures += [cost.run_times(variant), cost.memory(peak.peak_mib, workers)]

@@ -15,7 +15,8 @@ from simtest.nightly.summary import summary
 
 SCHEMA_VERSION = 1
 
-VERDICT, JUNIT, SUMMARY, BADGE = "verdict.json", "junit.xml", "summary.md", "badge.svg"
+FILES = VERDICT, JUNIT, SUMMARY, BADGE = "verdict.json", "junit.xml", "summary.md", "badge.svg"
+"""What lies beside the page."""
 
 
 def write_outputs(folder: Path, night: Night, verdict: Verdict) -> None:

@@ -35,7 +35,8 @@ def by_experiment(night: Night, verdict: Verdict) -> list[dict[str, Any]]:
         (~true).sum().alias("false"),
     )
     table = {str(row["experiment"]): row for row in counted.iter_rows(named=True)}
-    for name, outcome, number in verdict.comparisons.group_by("experiment", "outcome").len().sort("experiment").rows():
+    compared = without_canaries(night, verdict).group_by("experiment", "outcome").len().sort("experiment")
+    for name, outcome, number in compared.rows():
         empty = {"experiment": name, "rows": None, "answered": None, "missed": None, "false": None}
         table.setdefault(str(name), empty)[outcome] = number
     return [{**dict.fromkeys(OUTCOMES, 0), **row} for row in table.values()]
@@ -44,6 +45,12 @@ def by_experiment(night: Night, verdict: Verdict) -> list[dict[str, Any]]:
 def failed_canaries(night: Night) -> pl.DataFrame:
     """Give the figures of the canaries that are not what they may be."""
     return night.figures.filter(pl.col("kind") == "canary", ~pl.col("passed").fill_null(False))
+
+
+def without_canaries(night: Night, verdict: Verdict) -> pl.DataFrame:
+    """Give the comparisons but those of canaries, which are told by what they may be."""
+    names = night.figures.filter(pl.col("kind") == "canary")["experiment"].unique()
+    return verdict.comparisons.filter(~pl.col("experiment").is_in(names.to_list()))
 
 
 def ordered(comparisons: pl.DataFrame, outcome: str) -> pl.DataFrame:

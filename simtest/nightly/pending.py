@@ -35,24 +35,32 @@ def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
     return pl.DataFrame(made, schema=FIGURES)
 
 
-def run_canaries(variant: str | None) -> pl.DataFrame:
+def run_canaries(rows: pl.DataFrame, variant: str | None) -> pl.DataFrame:
     """Run the canaries."""
     if module := _module("simtest.nightly.canaries"):
-        return module.run_canaries(variant=variant)
+        return module.run_canaries(rows, variant)
     return pl.DataFrame(schema=FIGURES)
 
 
-def compare(tonight: Night, baseline: Night) -> Verdict:
+def compare(tonight: Night, baseline: Night | None) -> Verdict:
     """Hold a night against another."""
     if module := _module("simtest.gate.compare"):
-        return module.compare(tonight, baseline, module.Limits())
-    return Verdict("fine", None, pl.DataFrame(schema=COMPARISONS), ("No gate.",), baseline.run)
+        return module.compare(tonight, baseline)
+    state = "fine" if baseline else "no baseline"
+    if not night_passed(tonight):
+        state = "regression"
+    return Verdict(state, None, pl.DataFrame(schema=COMPARISONS), ("No gate.",), baseline.run if baseline else None)
 
 
-def write_page(folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame, extras: Any = None) -> Path:
+def night_passed(night: Night) -> bool:
+    """Whether all canaries passed."""
+    return bool(night.figures.filter(pl.col("kind") == "canary")["passed"].all())
+
+
+def write_page(folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame, **extras: Any) -> Path:
     """Write the page."""
     if module := _module("simtest.report.nightly"):
-        return module.write_nightly_page(folder, night, verdict, history, extras)
+        return module.write_nightly_page(folder, night, verdict, history, module.Extras(**extras))
     page = folder / "index.html"
     page.write_text(f"<!doctype html><title>{verdict.state}</title>")
     return page

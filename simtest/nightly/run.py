@@ -11,12 +11,12 @@ import polars as pl
 
 from simtest.engines.base import Engine
 from simtest.errors import SimtestError
-from simtest.gate.records import COMPARISONS, Night, Verdict
+from simtest.gate.records import Night, Verdict
 from simtest.nightly.baseline import load_baseline
 from simtest.nightly.history import append, clock_note, history_rows, read_history
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.measure import measure_night
-from simtest.nightly.outputs import write_outputs
+from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.pending import compare, write_page
 from simtest.nightly.storage import TONIGHT_ROWS, save_night
 from simtest.resources import shown
@@ -105,7 +105,7 @@ def run_nightly(
         run_id = new_run_id(datetime.now(UTC))
         with scratch(reports, run_id) as folder:
             night = measure_night(profile, folder, run_id, command, variant, engine, workers, progress)
-            verdict = judge(night, baseline, profile)
+            verdict = judge(night, baseline)
             history, notes = read_history(reports.history, profile.name)
             late = clock_note(history, datetime.fromisoformat(night.run["started"]))
             verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *([late] if late else []), *notes))
@@ -116,18 +116,17 @@ def run_nightly(
     return Outcome(night, verdict, target, file)
 
 
-def judge(night: Night, baseline: Night | None, profile: Profile) -> Verdict:
-    """Hold a night against its baseline; without one, only its canaries can fail."""
+def judge(night: Night, baseline: Night | None) -> Verdict:
+    """Hold a night against its baseline; without one, say how to make it."""
+    verdict = compare(night, baseline)
     if baseline is not None:
-        return compare(night, baseline)
-    failed = night.figures.filter(pl.col("kind") == "canary", ~pl.col("passed"))["experiment"].unique().sort()
+        return verdict
+    profile = night.run["profile"]
     note = (
-        f"No baseline for the profile {profile.name}: nothing to compare with. Look at the figures, then run "
-        f'simtest nightly accept --profile {profile.name} --reason "...".'
+        f"No baseline for the profile {profile}: look at the figures, then run "
+        f'simtest nightly accept --profile {profile} --reason "...".'
     )
-    notes = (note, *(f"The canary {name} failed." for name in failed))
-    empty = pl.DataFrame(schema=COMPARISONS)
-    return Verdict("regression" if len(failed) else "no baseline", None, empty, notes, None)
+    return dataclasses.replace(verdict, notes=(*verdict.notes, note))
 
 
 def publish(reports: Reports, scratch_folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame) -> Path:
@@ -136,7 +135,7 @@ def publish(reports: Reports, scratch_folder: Path, night: Night, verdict: Verdi
     new.mkdir()
     save_night(new, night, TONIGHT_ROWS)
     write_outputs(new, night, verdict)
-    write_page(new, night, verdict, history)
+    write_page(new, night, verdict, history, files=FILES)
     with turn(target):
         replace_folder(new, target)
     return target

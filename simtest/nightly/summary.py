@@ -7,7 +7,15 @@ import polars as pl
 
 from simtest.gate.records import OUTCOMES, Night, Verdict
 from simtest.nightly.history import short_commit
-from simtest.nightly.overview import by_experiment, failed_canaries, headline, number, ordered, place_name
+from simtest.nightly.overview import (
+    by_experiment,
+    failed_canaries,
+    headline,
+    number,
+    ordered,
+    place_name,
+    without_canaries,
+)
 
 MAX_CHARACTERS = 60_000
 """A comment on GitHub may have 65,536."""
@@ -17,14 +25,14 @@ MAX_ROWS, MAX_NOTES, MAX_TEXT = 20, 20, 300
 
 def summary(night: Night, verdict: Verdict) -> str:
     """Give the summary as Markdown text of at most `MAX_CHARACTERS`."""
-    run = night.run
+    run, compared = night.run, without_canaries(night, verdict)
     parts = [f"## Nightly {_cell(run['profile'])}: {headline(verdict)}", _compared(verdict)]
     parts += [f"- {_cell(note)}" for note in verdict.notes[:MAX_NOTES]]
     if len(verdict.notes) > MAX_NOTES:
         parts.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
-    parts += _changes("Worse", ordered(verdict.comparisons, "worse"))
+    parts += _changes("Worse", ordered(compared, "worse"))
     parts += _canaries(failed_canaries(night))
-    parts += _changes("Better", ordered(verdict.comparisons, "better"))
+    parts += _changes("Better", ordered(compared, "better"))
     parts += ["### By experiment", _table_by_experiment(night, verdict)]
     parts.append(
         f"{_cell(run['started'])}, commit {short_commit(run.get('commit'))}, {run['duration_s']:.0f} s on "

@@ -184,7 +184,7 @@ def test_a_night_is_measured_kept_and_published(small, reports):
     assert set(history["run_id"]) == {first.night.run["id"]}
     assert {"setting", "cost"} <= set(history["kind"])
     costs = history.filter(pl.col("kind") == "cost")
-    assert {"cone_axis", "reconstruct", "night"} <= set(costs["experiment"])
+    assert {"cone_axis", "reconstruct", "night"} <= set(costs["estimator"])
     assert costs["value"].is_between(0, 1e5, closed="none").all()
     assert json.loads((first.folder / "run.json").read_text())["command"] == "simtest nightly"
     assert not [path for path in reports.work.iterdir() if path.is_dir()]
@@ -213,7 +213,9 @@ def test_a_failed_canary_is_a_regression_without_a_baseline(measured, reports):
     measured.insert(0, make_night(canaries=[canary("rotated camera", 0.5, False)]))
     outcome = run_nightly(quick(), reports)
     assert outcome.exit_code == 1
-    assert "The canary rotated camera failed." in outcome.verdict.notes
+    text = (outcome.folder / "summary.md").read_text()
+    assert "### Canaries failed: 1" in text
+    assert "| rotated camera |" in text
 
 
 @pytest.mark.filterwarnings("ignore:.*; skipped")
