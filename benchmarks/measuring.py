@@ -1,8 +1,5 @@
-"""What the benchmarks share: a measured figure with its limit, and times taken in turns."""
+"""What the benchmarks share: a measured figure with its limit."""
 
-import statistics
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 
@@ -39,29 +36,3 @@ class Figure:
         if self.limit is None:
             return True
         return self.value >= self.limit if self.at_least else self.value <= self.limit
-
-
-def in_turns(functions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Time functions in turns, so that what slows the machine down for a while slows all of them.
-
-    Parameters
-    ----------
-    functions : mapping
-        Function without arguments by name; each is called once beforehand.
-    rounds : int
-        How many times each is timed.
-
-    Returns
-    -------
-    dict
-        Median wall time by name, s.
-    """
-    for function in functions.values():
-        function()
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(rounds):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}

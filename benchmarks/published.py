@@ -1,5 +1,6 @@
 """The published protocol: its speed against making and blurring the noise alone."""
 
+import math
 import multiprocessing
 import subprocess
 import sys
@@ -11,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.measuring import Figure, in_turns
-from benchmarks.memory import peak_of_tree_mib
+from benchmarks.measuring import Figure
 from simtest.geometry import Camera, backproject_conic, circle_poses, fit_ellipses
+from simtest.measuring import PeakMemory, in_turns
 from simtest.resources import find
 from simtest.seeds import from_integer
 from simtest.spec import load_experiment
@@ -108,10 +109,11 @@ def _command(experiment: str = "paper") -> tuple[float, float]:
         program = [sys.executable, "-c", _PROGRAM, "validate", experiment, "--workers", str(WORKERS)]
         start = time.perf_counter()
         process = subprocess.Popen([*program, "--out", str(Path(folder) / "run")], stdout=subprocess.DEVNULL)
-        peak = peak_of_tree_mib(process)
-        if process.wait():
+        with PeakMemory(process.pid) as memory:
+            process.wait()
+        if process.returncode:
             raise SystemExit(f"simtest validate paper: exit {process.returncode}")
-        return time.perf_counter() - start, peak
+        return time.perf_counter() - start, memory.peak_mib or math.nan
 
 
 def _batched_pose() -> Figure:

@@ -45,6 +45,15 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
         part.unlink(missing_ok=True)
 
 
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's list of files to disk: a rename into it then outlasts a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def write_json(path: Path, value: Any, compact: bool = False) -> None:
     """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none."""
     how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}

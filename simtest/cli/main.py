@@ -22,13 +22,14 @@ APP = App(
 # Told here, since a sub-command's own text is loaded with it.
 _COMMANDS = {
     "doctor": "Check the rendering backend.",
-    "schema": "Print the JSON schema of a scene, experiment, dataset, camera or calibration file.",
+    "schema": "Print the JSON schema of a scene, experiment, dataset, camera, calibration or profile file.",
     "render": "Render a scene with its ground truth.",
     "views": "Pick viewpoints of an anatomy that show isolated highlights.",
     "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
     "validate": "Run an experiment and write its report.",
+    "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
 }
@@ -52,8 +53,10 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 def main() -> None:
     """Run the command line.
 
-    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C.
+    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C. Of `nightly`, whose 1 is
+    a regression, whatever else went wrong is 2.
     """
+    failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     if "--traceback" in sys.argv:
         sys.argv.remove("--traceback")
         sys.exit(APP())
@@ -66,11 +69,11 @@ def main() -> None:
     except CycloptsError as error:
         sys.exit(_say(" ".join(str(error).split()), BAD_USE))
     except BackendError as error:
-        sys.exit(_say(str(error), 1))
+        sys.exit(_say(str(error), failed))
     except InputError as error:
         sys.exit(_say(str(error), BAD_USE))
     except SimtestError as error:
-        sys.exit(_say(str(error), 1))
+        sys.exit(_say(str(error), failed))
     except KeyboardInterrupt as stopped:
         kept = "what is finished is kept, and the same command goes on from there"
         sys.exit(_say(f"stopped; {str(stopped) or kept}", INTERRUPTED))
@@ -79,7 +82,7 @@ def main() -> None:
         sys.exit(0)
     except Exception as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        sys.exit(_say(f"internal error, please report it ({text}); --traceback shows where", 1))
+        sys.exit(_say(f"internal error, please report it ({text}); --traceback shows where", failed))
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -4,7 +4,7 @@ import json
 from typing import Literal
 
 
-def schema(of: Literal["scene", "experiment", "dataset", "camera", "calibration"] = "scene", /) -> None:
+def schema(of: Literal["scene", "experiment", "dataset", "camera", "calibration", "profile"] = "scene", /) -> None:
     """Print the JSON schema of a file.
 
     Parameters
@@ -14,7 +14,7 @@ def schema(of: Literal["scene", "experiment", "dataset", "camera", "calibration"
     """
     from pydantic import BaseModel
 
-    from simtest.spec import CalibrationSpec, CameraSpec, Dataset, Experiment, Scene
+    from simtest.spec import CalibrationSpec, CameraSpec, Dataset, Experiment, Profile, Scene
 
     models: dict[str, type[BaseModel]] = {
         "scene": Scene,
@@ -22,5 +22,6 @@ def schema(of: Literal["scene", "experiment", "dataset", "camera", "calibration"
         "dataset": Dataset,
         "camera": CameraSpec,
         "calibration": CalibrationSpec,
+        "profile": Profile,
     }
     print(json.dumps(models[of].model_json_schema(), indent=2))

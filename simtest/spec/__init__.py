@@ -4,6 +4,7 @@ from simtest.spec.calibration import CalibrationSpec, load_calibration
 from simtest.spec.camera import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
 from simtest.spec.dataset import Dataset, load_dataset
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
+from simtest.spec.nightly import Profile, ProfileEntry, experiments_of, load_profile
 from simtest.spec.reading import apply_settings, parse_settings, read_toml
 from simtest.spec.rig import Emission, LightSpec, Rig
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
@@ -27,6 +28,8 @@ __all__ = [
     "Group",
     "LightSpec",
     "PlaneSurface",
+    "Profile",
+    "ProfileEntry",
     "QuadricSurface",
     "Rig",
     "Scene",
@@ -37,10 +40,12 @@ __all__ = [
     "camera_table",
     "camera_toml",
     "describe_camera",
+    "experiments_of",
     "load_calibration",
     "load_camera",
     "load_dataset",
     "load_experiment",
+    "load_profile",
     "load_scene",
     "parse_settings",
     "read_toml",

@@ -7,7 +7,7 @@ import re
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -97,32 +97,83 @@ def run_experiment(
     BackendError
         If the rendering backend cannot be used.
     """
+    return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
+
+
+def run_experiments(
+    wanted: Sequence[tuple[Experiment, Path]],
+    command: str = "",
+    variant: str | None = None,
+    progress: Progress | None = None,
+    engine: Engine | None = None,
+) -> list[Run]:
+    """Run several experiments as one piece of work, so that an engine's processes start once; see `run_experiment`.
+
+    Parameters
+    ----------
+    wanted : sequence of tuple
+        Each experiment with its folder.
+    command, variant, progress, engine
+        As of `run_experiment`.
+
+    Returns
+    -------
+    list of Run
+        In the same order.
+    """
     started, clock = datetime.now(UTC), time.monotonic()
-    # All that may be refused is refused before the folder is touched.
+    # All that may be refused is refused before a folder is touched.
+    # The variant is chosen here: a worker on another machine may have another environment.
+    variant = backend.requested_variant(variant)
+    jobs = [_job(experiment, folder, variant) for experiment, folder in wanted]
+    finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
+    left = [job for job in jobs if job.folder not in finished]
+    for job in left:
+        _prepare(job.folder, job.digest)
+    resumed = _work(left, variant, engine or make_engine(), progress)
+    for job in left:
+        run = {
+            "variant": variant,
+            "llvm": backend.library_in_use(),
+            "fingerprint": job.digest,
+            "seed": job.experiment.seed,
+            "realisations": job.experiment.realisations,
+            "started": started.isoformat(timespec="seconds"),
+            "duration_s": round(time.monotonic() - clock, 1),
+            "command": command,
+            "inputs": _inputs(job.cases),
+        }
+        finished[job.folder] = _finish(job, run, resumed[job.folder])
+    return [finished[job.folder] for job in jobs]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """An experiment that is to be run in a folder."""
+
+    experiment: Experiment
+    folder: Path
+    cases: list[Case]
+    digest: str
+
+    def missing(self) -> list[int]:
+        """Places of the cases that are not done yet."""
+        return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
+
+
+def _job(experiment: Experiment, folder: Path, variant: str) -> _Job:
     cases = expand(experiment)
     load_estimators(experiment.estimators)
-    # Chosen here: a worker on another machine may have another environment.
-    variant = backend.requested_variant(variant)
     digest = _fingerprint(experiment, cases, variant)
     _check_folder(folder)
-    finished = _finished(folder, digest, len(cases))
-    if finished is not None:
-        return finished
-    parts = _prepare(folder, digest)
-    resumed = _work(experiment, cases, folder, variant, engine or make_engine(), progress)
-    results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(cases))])
-    run = {
-        "variant": variant,
-        "llvm": backend.library_in_use(),
-        "fingerprint": digest,
-        "seed": experiment.seed,
-        "realisations": experiment.realisations,
-        "started": started.isoformat(timespec="seconds"),
-        "duration_s": round(time.monotonic() - clock, 1),
-        "command": command,
-        "inputs": _inputs(cases),
-    }
-    summary = _summary(experiment, results, run)
+    return _Job(experiment, folder, cases, digest)
+
+
+def _finish(job: _Job, run: dict[str, Any], resumed: int) -> Run:
+    """Put the parts of an experiment together."""
+    folder, parts = job.folder, job.folder / PARTS
+    results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
+    summary = _summary(job.experiment, results, run)
     write_atomically(folder / "results.parquet", results.write_parquet)
     write_json(folder / "summary.json", summary)
     # The parts go last: until the summary stands, a run that is stopped can go on.
@@ -140,26 +191,21 @@ def _summary(experiment: Experiment, results: pl.DataFrame, run: dict[str, Any])
     return {"run": {**provenance.environment(), **run}, "experiments": {experiment.name: content}}
 
 
-def _work(
-    experiment: Experiment,
-    cases: list[Case],
-    folder: Path,
-    variant: str | None,
-    engine: Engine,
-    progress: Progress | None,
-) -> int:
-    """Run the cases that are not done yet; gives how many were."""
-    total = sum(case.realisations for case in cases)
-    missing = [index for index in range(len(cases)) if not _part_file(folder / PARTS, index).exists()]
-    in_gallery, swept = _in_gallery(cases), swept_example(cases)
-    parts: list[tuple[int, Part]] = []
-    for index in missing:
-        item = folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
-        parts += [(index, part) for part in parts_of(experiment, cases[index], swept, item, variant)]
-    waiting = Counter(index for index, _ in parts)
-    made: dict[int, dict[int, pl.DataFrame]] = {index: {} for index in waiting}
-    done = total - sum(cases[index].realisations for index in missing)
-    name = cases[missing[0]].setting if missing else ""
+def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: Progress | None) -> dict[Path, int]:
+    """Run the cases that are not done yet; gives how many of each folder were."""
+    total = sum(case.realisations for job in jobs for case in job.cases)
+    missing = {job.folder: job.missing() for job in jobs}
+    parts: list[tuple[_Job, int, Part]] = []
+    for job in jobs:
+        in_gallery, swept = _in_gallery(job.cases), swept_example(job.cases)
+        for index in missing[job.folder]:
+            item = job.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
+            parts += [(job, index, part) for part in parts_of(job.experiment, job.cases[index], swept, item, variant)]
+    places = [(job.folder, index) for job, index, _ in parts]
+    waiting = Counter(places)
+    made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {place: {} for place in waiting}
+    done = total - sum(job.cases[index].realisations for job in jobs for index in missing[job.folder])
+    name = parts[0][2].case.setting if parts else ""
 
     def step() -> None:
         nonlocal done
@@ -167,19 +213,19 @@ def _work(
         if progress and done < total:
             progress(done, total, name)
 
-    if progress and missing:
+    if progress and parts:
         progress(done, total, name)
-    for place, rows in engine.run(make_rows, [part for _, part in parts], step):
-        index = parts[place][0]
-        made[index][place] = rows
-        if len(made[index]) == waiting[index]:
-            rows = pl.concat([rows for _, rows in sorted(made.pop(index).items())])
+    for number, rows in engine.run(make_rows, [part for *_, part in parts], step):
+        folder, index = place = places[number]
+        made[place][number] = rows
+        if len(made[place]) == waiting[place]:
+            rows = pl.concat([rows for _, rows in sorted(made.pop(place).items())])
             write_atomically(_part_file(folder / PARTS, index), rows.write_parquet)
-        name = cases[parts[min(place + 1, len(parts) - 1)][0]].setting
+        name = parts[min(number + 1, len(parts) - 1)][2].case.setting
     forget()
-    if progress:
+    if progress and jobs:
         progress(total, total, "done")
-    return len(cases) - len(missing)
+    return {job.folder: len(job.cases) - len(missing[job.folder]) for job in jobs}
 
 
 def _in_gallery(cases: list[Case]) -> set[int]:
@@ -214,11 +260,11 @@ def _finished(folder: Path, digest: str, cases: int) -> Run | None:
             return Run(folder, pl.read_parquet(folder / "results.parquet"), summary, cases)
     except (OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError):
         return None
-    warnings.warn(f"{folder}: holds another run, or one of another version of simtest; it is replaced", stacklevel=4)
+    warnings.warn(f"{folder}: holds another run, or one of another version of simtest; it is replaced", stacklevel=5)
     return None
 
 
-def _prepare(folder: Path, digest: str) -> Path:
+def _prepare(folder: Path, digest: str) -> None:
     """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
     parts = folder / PARTS
     record = parts / "fingerprint.json"
@@ -232,7 +278,6 @@ def _prepare(folder: Path, digest: str) -> Path:
         write_json(record, digest)
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
-    return parts
 
 
 def _check_folder(folder: Path) -> None:

@@ -1,0 +1,118 @@
+"""`simtest nightly`: measure a night, judge it, accept it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from simtest.cli.options import Address, EngineName, Variant, whole_number
+
+if TYPE_CHECKING:
+    from simtest.nightly.run import Outcome
+
+nightly = App(name="nightly", help="Run the fixed experiments, compare with the baseline, write the page.")
+
+ProfileName = Annotated[str, Parameter(help="A profile file, or the name of a shipped one: quick, full.")]
+ReportsFolder = Annotated[Path, Parameter(name="--reports", help="Folder of history, baselines and pages.")]
+DEFAULT_REPORTS = Path("reports")
+TABLE_WIDTH = 125
+
+
+@nightly.default
+def run(
+    *,
+    profile: ProfileName = "quick",
+    reports: ReportsFolder = DEFAULT_REPORTS,
+    variant: Variant = None,
+    engine: EngineName = "local",
+    workers: Annotated[
+        int | None,
+        Parameter(help="Processes that work at once; default one for each core, 8 at most.", converter=whole_number),
+    ] = None,
+    address: Address = None,
+) -> int:
+    """Run a profile; exit 0 fine, 1 a regression, 2 it could not be run.
+
+    The night is kept in the history, compared with the accepted baseline, and its page written.
+    """
+    import shlex
+    import sys
+
+    from simtest.cli.progress import progress_bar
+    from simtest.engines import make_engine
+    from simtest.nightly.layout import Reports
+    from simtest.nightly.run import run_nightly
+    from simtest.rendering.backend import requested_variant
+    from simtest.spec import load_profile
+
+    described = load_profile(profile)
+    command = shlex.join(["simtest", *sys.argv[1:]])
+    count = _cores() if workers is None else workers
+    gpu = requested_variant(variant).startswith("cuda")
+    chosen = make_engine(engine, count, address, gpu)
+    try:
+        with progress_bar("writing the page") as progress:
+            outcome = run_nightly(described, Reports(reports), command, variant, chosen, count, progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            "nothing of this night is kept; history, baseline and the last page are as they were"
+        ) from None
+    _print(outcome)
+    return outcome.exit_code
+
+
+@nightly.command
+def accept(
+    *,
+    reason: Annotated[str, Parameter(help="Why these numbers are right; stored with them.")],
+    profile: ProfileName = "quick",
+    reports: ReportsFolder = DEFAULT_REPORTS,
+) -> None:
+    """Make the last night's numbers the baseline."""
+    from simtest.nightly.baseline import accept as accept_night
+    from simtest.nightly.layout import Reports
+    from simtest.spec import load_profile
+
+    accepted = accept_night(Reports(reports), load_profile(profile).name, reason)
+    print(f"{accepted['id']} is the baseline of {accepted['profile']}: {accepted['reason']}")
+
+
+def _cores() -> int:
+    import os
+
+    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def _print(outcome: "Outcome") -> None:
+    """Print what the gate says, a table by experiment, and where the page lies."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from simtest.gate.records import OUTCOMES
+    from simtest.nightly.overview import (
+        by_experiment,
+        failed_canaries,
+        headline,
+        number,
+        ordered,
+        place_name,
+        without_canaries,
+    )
+
+    night, verdict = outcome.night, outcome.verdict
+    counts = OUTCOMES if verdict.baseline is not None else ()
+    keys = ("experiment", "rows", "answered", "missed", "false", *counts)
+    table = Table(*keys, title=f"{night.run['profile']}: {headline(verdict)}", title_justify="left")
+    for row in by_experiment(night, verdict):
+        table.add_row(*("" if row[key] is None else str(row[key]) for key in keys))
+    console = Console(width=TABLE_WIDTH)
+    console.print(table)
+    for row in ordered(without_canaries(night, verdict), "worse").iter_rows(named=True):
+        print(
+            f"worse: {row['experiment']}, {place_name(row)}, {row['quantity']}: {number(row['tonight'], row['unit'])}, "
+            f"baseline {number(row['baseline'], row['unit'])}"
+        )
+    for row in failed_canaries(night).iter_rows(named=True):
+        print(f"canary failed: {row['experiment']}, {row['quantity']} = {number(row['value'], row['unit'])}")
+    print(*verdict.notes, sep="\n", end="\n" * bool(verdict.notes))
+    print(outcome.folder / "index.html")

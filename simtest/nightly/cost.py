@@ -1,0 +1,133 @@
+"""What the code costs: run time of fixed pieces of work over a reference kernel timed beside them, and memory."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import polars as pl
+
+from simtest.calibration import Known
+from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.curved import curved
+from simtest.estimators.photometric import photometric
+from simtest.gate.records import FIGURES
+from simtest.geometry import Camera, Patch, smooth
+from simtest.measuring import times_in_turns
+from simtest.reconstruction import reconstruct
+from simtest.rendering import Session
+from simtest.spec import load_scene
+
+SIDE, WIDTH_PX, SIGMA, SMOOTHING_PX = 100, 28.0, 0.05, 2.0
+FRAME_PX = 406
+
+HIGHLIGHT, FRAME = f"a highlight of {SIDE} x {SIDE} px", f"a frame of {FRAME_PX} x {FRAME_PX} px"
+
+ROUNDS = 15
+
+Piece = Callable[[], object]
+
+
+def highlight() -> tuple[Patch, Camera]:
+    """Give a noisy highlight of 100 x 100 px, always the same, and its camera."""
+    y, x = np.mgrid[:SIDE, :SIDE] + 0.5
+    lobe = np.exp(-((x - 50.3) ** 2 + 1.3 * (y - 49.6) ** 2) / WIDTH_PX**2)
+    frame = (lobe + SIGMA * np.random.default_rng(0).standard_normal(lobe.shape)).astype(np.float32)
+    patch = Patch.cut(
+        smooth(frame, SMOOTHING_PX), (0, 0, SIDE, SIDE), raw=frame, noise=SIGMA, smoothing_px=SMOOTHING_PX
+    )
+    assert isinstance(patch, Patch)
+    return patch, Camera(SIDE, SIDE, 406.0, 406.0, SIDE / 2, SIDE / 2)
+
+
+def anew(patch: Patch) -> Patch:
+    """Give the same patch without the isophotes that it has traced."""
+    return Patch(
+        patch.values, patch.origin_px, patch.peak_px, patch.peak_value, patch.peak_pixel, raw=patch.raw,
+        noise=patch.noise, smoothing_px=patch.smoothing_px,
+    )  # fmt: skip
+
+
+def reference_kernel() -> Piece:
+    """Give the work that run times are held against: a wide blur of a frame, on one core."""
+    frame = np.random.default_rng(1).standard_normal((FRAME_PX, FRAME_PX), dtype=np.float32)
+    return lambda: cv2.GaussianBlur(frame, (0, 0), 8.0)
+
+
+def estimator_pieces() -> dict[str, Piece]:
+    """Give estimators at work on one highlight."""
+    patch, camera = highlight()
+    known = Known(lobe_curvature=200.0)
+    return {
+        "circle_pose": lambda: circle_pose(anew(patch), camera),
+        "cone_axis": lambda: cone_axis(anew(patch), camera),
+        "curved": lambda: curved(anew(patch), camera, known),
+        "photometric": lambda: photometric(anew(patch), camera),
+    }
+
+
+def _frame_pieces(variant: str | None) -> dict[str, Piece]:
+    """Give the work on a whole frame: its radiance, and detection with the default estimators."""
+    scene = load_scene("cylinder")
+    session = Session(scene, variant)
+    light = session.radiance().total
+    noise = np.random.default_rng(2).standard_normal(light.shape, dtype=np.float32)
+    frame = light / light.max() + np.float32(SIGMA) * noise
+    return {"radiance": session.radiance, "reconstruct": lambda: reconstruct(frame, session.camera)}
+
+
+def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
+    """Time the pieces.
+
+    Parameters
+    ----------
+    variant : str, optional
+        Mitsuba variant.
+    rounds : int
+        How many times each is timed.
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns `FIGURES`, kind "cost", `estimator` the piece's name, quantity "run_time": the median of the rounds'
+        ratios to the reference kernel's time; `low`, `high` are their quartiles.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        of_highlight = estimator_pieces()
+        pieces = {**of_highlight, **_frame_pieces(variant)}
+        # The processor's time, of all threads: what else runs on the machine tells less on it than on the clock's.
+        times = times_in_turns({"reference": reference_kernel(), **pieces}, rounds, time.process_time)
+    finally:
+        cv2.setNumThreads(threads)
+    reference = np.array(times["reference"])
+    made = []
+    for name in pieces:
+        low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))
+        about = f"{1e3 * np.median(times[name]):.3g} ms over {1e3 * np.median(reference):.3g} ms of processor time"
+        setting = HIGHLIGHT if name in of_highlight else FRAME
+        made.append(_figure(name, setting, "run_time", "x", middle, low, high, rounds, about))
+    return pl.DataFrame(made, schema=FIGURES)
+
+
+def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
+    """Give the figure of the night's peak memory; nothing where the system does not tell it."""
+    made = []
+    if peak_mib is not None:
+        about = "all processes together, shared pages once"
+        setting = f"{workers} worker{'s' * (workers > 1)}"
+        made.append(_figure("night", setting, "peak_memory", "MiB", peak_mib, None, None, 1, about))
+    return pl.DataFrame(made, schema=FIGURES)
+
+
+def _figure(
+    name: str, setting: str, quantity: str, unit: str, value: float, low: float | None, high: float | None, n: int,
+    about: str,
+) -> dict[str, Any]:  # fmt: skip
+    return {
+        "kind": "cost", "experiment": "cost", "label": "", "surface": "", "setting": setting, "estimator": name,
+        "quantity": quantity, "unit": unit, "value": value, "low": low, "high": high, "n": n, "about": about,
+    }  # fmt: skip

@@ -1,0 +1,168 @@
+"""The history of nights: an immutable Parquet file each, which is never changed once it is there."""
+
+import hashlib
+import json
+import re
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from simtest.files import sync_folder, write_atomically
+from simtest.gate.records import FIGURES, Night, Verdict
+from simtest.resources import shown
+
+HISTORY: dict[str, pl.DataType] = {
+    **FIGURES, "run_id": pl.String(), "started": pl.Datetime("us", "UTC"), "commit": pl.String(),
+    "profile": pl.String(), "state": pl.String(), "bit_equal": pl.Boolean(), "processor": pl.String(),
+    "versions": pl.String(), "duration_s": pl.Float64(), "source_hash": pl.String(),
+}  # fmt: skip
+"""Columns of the history: a night's figures, and what is the same in all its rows."""
+
+_NEEDED = ("kind", "experiment", "estimator", "quantity", "value", "run_id", "started", "profile")
+"""Without these a file is no night's; the others, which a later version may have added, are null where they lack."""
+
+MAX_NAMED = 5
+"""Damaged files that the notes name one by one."""
+
+
+def history_rows(night: Night, verdict: Verdict) -> pl.DataFrame:
+    """Give a night's figures with the columns `HISTORY`."""
+    run = night.run
+    constant: dict[str, Any] = {
+        "run_id": run["id"],
+        "started": datetime.fromisoformat(run["started"]).astimezone(UTC),
+        "commit": run["commit"],
+        "profile": run["profile"],
+        "state": verdict.state,
+        "bit_equal": verdict.bit_equal,
+        "processor": run["processor"],
+        "versions": versions_hash(run["versions"]),
+        "duration_s": run["duration_s"],
+        "source_hash": run["source_hash"],
+    }
+    figures = night.figures.select(pl.col(name).cast(dtype) for name, dtype in FIGURES.items())
+    return figures.with_columns(pl.lit(value, dtype=HISTORY[name]).alias(name) for name, value in constant.items())
+
+
+def versions_hash(versions: Mapping[str, str]) -> str:
+    """Give a short hash of packages' versions."""
+    return hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def append(folder: Path, rows: pl.DataFrame) -> Path:
+    """Write a night's rows into the history.
+
+    Parameters
+    ----------
+    folder : Path
+        The history; made if need be.
+    rows : polars.DataFrame
+        As `history_rows` gives them.
+
+    Returns
+    -------
+    Path
+        The file: whole on disk, or not there at all.
+    """
+    run_id, started, commit = rows.row(0, named=True)["run_id"], rows["started"][0], rows["commit"][0]
+    partition = folder / f"date={started:%Y-%m-%d}" / f"commit={short_commit(commit)}"
+    partition.mkdir(parents=True, exist_ok=True)
+    file = partition / f"{run_id}.parquet"
+    write_atomically(file, lambda part: rows.write_parquet(part, compression="zstd"))
+    for made in (partition, partition.parent, folder):
+        sync_folder(made)
+    return file
+
+
+def short_commit(commit: str | None) -> str:
+    """Give a commit as it stands in names: 12 digits, "+" where the checkout was changed, or "unknown"."""
+    found = re.fullmatch(r"([0-9a-f]{12})[0-9a-f]*(\+?)", commit or "")
+    return "".join(found.groups()) if found else "unknown"
+
+
+def read_history(folder: Path, profile: str | None = None) -> tuple[pl.DataFrame, list[str]]:
+    """Read the history; files that are damaged or foreign are skipped, with a warning each.
+
+    Parameters
+    ----------
+    folder : Path
+        The history; may be missing.
+    profile : str, optional
+        Only the nights of this profile.
+
+    Returns
+    -------
+    rows : polars.DataFrame
+        Columns `HISTORY`, night after night by the time they started, whatever their folders are called.
+    notes : list of str
+        What was skipped, for the page.
+    """
+    files = sorted(path for path in folder.glob("date=*/commit=*/*.parquet") if not path.name.startswith("."))
+    # Reading waits for the disk more than it works.
+    with ThreadPoolExecutor(4) as pool:
+        read = list(pool.map(_read, files))
+    nights: dict[str, pl.DataFrame] = {}
+    skipped = []
+    for file, found in zip(files, read, strict=True):
+        told = found if isinstance(found, str) else _twice(found, nights)
+        if told:
+            warnings.warn(f"{shown(file)}: {told}; skipped", stacklevel=2)
+            skipped.append(f"{shown(file.relative_to(folder))} ({told})")
+        elif not isinstance(found, str):
+            nights[found["run_id"][0]] = found
+    wanted = [night for night in nights.values() if profile in (None, night["profile"][0])]
+    wanted.sort(key=lambda night: (night["started"][0], night["run_id"][0]))
+    return pl.concat([pl.DataFrame(schema=HISTORY), *wanted]), _told(skipped)
+
+
+def _twice(found: pl.DataFrame, nights: Mapping[str, pl.DataFrame]) -> str:
+    return "a night that another file holds already" if found["run_id"][0] in nights else ""
+
+
+def _told(skipped: list[str]) -> list[str]:
+    if not skipped:
+        return []
+    more = f" and {len(skipped) - MAX_NAMED} more" if len(skipped) > MAX_NAMED else ""
+    files = f"file{'s' * (len(skipped) > 1)}"
+    return [f"History: {len(skipped)} {files} skipped: {'; '.join(skipped[:MAX_NAMED])}{more}."]
+
+
+def _read(file: Path) -> pl.DataFrame | str:
+    """Read one night's file; text says why it cannot be used."""
+    try:
+        found = pl.read_parquet(file, hive_partitioning=False, memory_map=False)
+    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
+        return f"not a readable Parquet file: {_first_line(error)}"
+    if missing := [name for name in _NEEDED if name not in found.columns]:
+        return f"no night's figures: no column {missing[0]}"
+    columns = [
+        (pl.col(name) if name in found.columns else pl.lit(None)).cast(dtype).alias(name)
+        for name, dtype in HISTORY.items()
+    ]
+    try:
+        found = found.select(columns)
+    except pl.exceptions.PolarsError as error:
+        return f"no night's figures: {_first_line(error)}"
+    if not found.height or found["run_id"].n_unique() > 1 or found.select(_NEEDED[5:]).null_count().row(0) != (0, 0, 0):
+        return "no night's figures: must be those of one run, with its id, start and profile"
+    return found
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:160]
+
+
+def clock_note(history: pl.DataFrame, started: datetime) -> str | None:
+    """Say so where a night starts before one that the history holds already: the clock went back."""
+    last = history["started"].max()
+    if not isinstance(last, datetime) or last <= started:
+        return None
+    return (
+        f"The clock went back: this night started {started:%Y-%m-%d %H:%M:%S} UTC, "
+        f"and the history holds one of {last:%Y-%m-%d %H:%M:%S}."
+    )

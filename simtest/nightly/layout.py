@@ -1,0 +1,147 @@
+"""The folders of the nightly's reports, and changing them so that a kill at any moment leaves them whole."""
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from simtest.errors import InputError
+from simtest.files import sync_folder
+from simtest.resources import shown
+
+LOCK = "lock"
+_ENTRY, _OLD = ".lock", ".old"
+
+
+@dataclass(frozen=True)
+class Reports:
+    """Folders under ``--reports``.
+
+    Parameters
+    ----------
+    root : Path
+        Made if need be.
+    """
+
+    root: Path
+
+    @property
+    def history(self) -> Path:
+        """Figures of all nights, a file each; never changed."""
+        return self.root / "history"
+
+    @property
+    def work(self) -> Path:
+        """Scratch of nights in progress, a folder each."""
+        return self.root / "work"
+
+    def baseline(self, profile: str) -> Path:
+        """Give the folder of a profile's accepted numbers."""
+        return self.root / "baseline" / profile
+
+    def tonight(self, profile: str) -> Path:
+        """Give the folder of a profile's last night: numbers, page and outputs for machines."""
+        return self.root / "nightly" / profile
+
+    def make(self) -> None:
+        """Make the root; raise `InputError` where that cannot be."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise InputError(f"--reports {shown(self.root)}: is a file; must be a folder") from None
+        except OSError as error:
+            raise InputError(f"--reports {shown(self.root)}: cannot be written ({error.strerror})") from error
+
+
+def new_run_id(now: datetime) -> str:
+    """Give a name for a night that no other has, whatever the clock says."""
+    return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+@contextlib.contextmanager
+def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
+    """Give a night its scratch folder, locked while the night lives and removed when it ends."""
+    folder = reports.work / run_id
+    with contextlib.ExitStack() as stack:
+        # Together with the lock, or another night would take the folder for a dead one's.
+        with _locked(reports.work / _ENTRY):
+            folder.mkdir()
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            stack.enter_context(_locked(folder / LOCK))
+        yield folder
+
+
+def remove_dead(reports: Reports) -> list[str]:
+    """Remove what nights left that were killed; gives their names. Those that live hold a lock, and are left alone."""
+    dead, alive = [], set()
+    with _locked(reports.work / _ENTRY):
+        for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
+            if _held(folder / LOCK):
+                alive.add(folder.name)
+            else:
+                shutil.rmtree(folder, ignore_errors=True)
+                dead.append(folder.name)
+        for part in reports.history.glob("date=*/commit=*/.*.part.parquet"):
+            if not any(part.name.startswith(f".{name}.") for name in alive):
+                part.unlink(missing_ok=True)
+    return dead
+
+
+def _held(lock: Path) -> bool:
+    """Whether a living process holds a lock."""
+    try:
+        with lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@contextlib.contextmanager
+def turn(folder: Path) -> Iterator[None]:
+    """Have a folder that several nights replace to oneself; what a kill left in the middle is put back first."""
+    with _locked(folder.parent / f".{folder.name}.{LOCK}"):
+        old = _old(folder)
+        if old.is_dir():
+            if folder.is_dir():
+                shutil.rmtree(old)
+            else:
+                old.rename(folder)
+        yield
+
+
+def replace_folder(new: Path, folder: Path) -> None:
+    """Put a finished folder in another's place, under `turn`: one of the two is always there, under a name it knows.
+
+    Parameters
+    ----------
+    new : Path
+        Whose files are on disk; on the same file system.
+    folder : Path
+        Its place.
+    """
+    old = _old(folder)
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    sync_folder(folder.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}{_OLD}")

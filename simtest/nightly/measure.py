@@ -1,0 +1,125 @@
+"""Runs a profile: its experiments, the canaries, and what they cost."""
+
+import os
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import polars as pl
+
+from simtest import provenance
+from simtest.engines import make_engine
+from simtest.engines.base import Engine
+from simtest.gate.records import FIGURES, Night
+from simtest.measuring import PeakMemory
+from simtest.nightly import cost
+from simtest.nightly.pending import run_canaries, setting_figures
+from simtest.rendering import backend
+from simtest.spec import Profile, experiments_of
+from simtest.validation.cases import expand
+from simtest.validation.runner import Progress, run_experiments
+
+_LOOK_S = 0.5
+"""Time between two looks at the memory: each takes some milliseconds of a big process."""
+
+
+def measure_night(
+    profile: Profile,
+    folder: Path,
+    run_id: str,
+    command: str = "",
+    variant: str | None = None,
+    engine: Engine | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Night:
+    """Run a profile.
+
+    Parameters
+    ----------
+    profile : Profile
+        What to run.
+    folder : Path
+        Scratch: each experiment's run stands in a folder of its name afterwards.
+    run_id, command : str
+        For the night's record.
+    variant : str, optional
+        Mitsuba variant.
+    engine : Engine, optional
+        Who does the work; default `workers` processes of this machine.
+    workers : int
+        How many work at once.
+    progress : callable, optional
+        See `simtest.validation.runner.Progress`.
+
+    Returns
+    -------
+    Night
+        The rows do not depend on engine and workers.
+
+    Raises
+    ------
+    SimtestError
+        If an experiment is malformed or cannot be run.
+    """
+    started, clock = datetime.now(UTC), time.monotonic()
+    experiments = experiments_of(profile)
+    steps = _Steps(progress, sum(case.realisations for experiment in experiments for case in expand(experiment)))
+    with PeakMemory(os.getpid(), _LOOK_S) as peak:
+        runs = run_experiments(
+            [(experiment, folder / experiment.name) for experiment in experiments], command, variant,
+            steps.of("experiments"), engine or make_engine(workers=workers),
+        )  # fmt: skip
+        took_s = time.monotonic() - clock
+        rows = pl.concat([run.results for run in runs], how="diagonal_relaxed")
+        figures = [setting_figures(rows)]
+        if profile.canaries:
+            steps.tell("canaries")
+            figures.append(run_canaries(rows, variant))
+    if profile.costs:
+        steps.tell("costs")
+        figures += [cost.run_times(variant), cost.memory(peak.peak_mib, workers)]
+    steps.end()
+    run = {
+        "id": run_id,
+        "profile": profile.name,
+        "title": profile.title or profile.name,
+        "started": started.isoformat(timespec="seconds"),
+        "duration_s": round(time.monotonic() - clock, 1),
+        "experiments_s": round(took_s, 1),
+        "workers": workers,
+        "command": command,
+        **provenance.environment(),
+        "source_hash": provenance.source_hash(),
+        "variant": backend.requested_variant(variant),
+        "llvm": backend.library_in_use(),
+    }
+    return Night(run, rows, pl.concat([table.select(*FIGURES) for table in figures]))
+
+
+class _Steps:
+    """The whole night's progress: each part moves the bar by its share."""
+
+    def __init__(self, progress: Progress | None, realisations: int) -> None:
+        # Canaries, costs, verdict and page count as some realisations each.
+        self._progress, self._total, self._done = progress, realisations + max(3, realisations // 20), 0
+
+    def of(self, part: str) -> Callable[[int, int, str], None] | None:
+        """Give the callable that moves the bar within a part; its last step is not the night's."""
+
+        def move(done: int, total: int, what: str) -> None:
+            self._done = done
+            self.tell(what if done < total else part)
+
+        return move if self._progress else None
+
+    def tell(self, what: str) -> None:
+        """Say what is done now."""
+        if self._progress:
+            self._progress(self._done, self._total, what)
+
+    def end(self) -> None:
+        """Say that all is measured."""
+        self._done = self._total
+        self.tell("done")

@@ -1,0 +1,156 @@
+"""A night from start to end: measured, judged, kept in the history, published."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import polars as pl
+
+from simtest.engines.base import Engine
+from simtest.errors import SimtestError
+from simtest.gate.records import Night, Verdict
+from simtest.nightly.baseline import load_baseline
+from simtest.nightly.history import append, clock_note, history_rows, read_history
+from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
+from simtest.nightly.measure import measure_night
+from simtest.nightly.outputs import FILES, write_outputs
+from simtest.nightly.pending import compare, write_page
+from simtest.nightly.storage import TONIGHT_ROWS, save_night
+from simtest.resources import shown
+from simtest.spec import Profile
+from simtest.validation.runner import Progress
+
+FINE, REGRESSION, COULD_NOT_RUN = 0, 1, 2
+"""Exit codes of a night."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A night that was measured and judged.
+
+    Parameters
+    ----------
+    night : Night
+        The night.
+    verdict : Verdict
+        Of the gate.
+    folder : Path
+        Holds the page and the outputs for machines.
+    history_file : Path
+        The night's file in the history.
+    """
+
+    night: Night
+    verdict: Verdict
+    folder: Path
+    history_file: Path
+
+    @property
+    def exit_code(self) -> int:
+        """`FINE` or `REGRESSION`."""
+        return exit_code(self.verdict)
+
+
+def exit_code(verdict: Verdict) -> int:
+    """Give the exit code of a verdict; a night without a baseline is fine unless a canary failed."""
+    return REGRESSION if verdict.state == "regression" else FINE
+
+
+def run_nightly(
+    profile: Profile,
+    reports: Reports,
+    command: str = "",
+    variant: str | None = None,
+    engine: Engine | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Run a night.
+
+    Parameters
+    ----------
+    profile : Profile
+        What to run.
+    reports : Reports
+        Where history, baseline and page lie; made if need be.
+    command : str
+        How the night was called, for the page.
+    variant : str, optional
+        Mitsuba variant.
+    engine : Engine, optional
+        Who does the work; default `workers` processes of this machine.
+    workers : int
+        How many work at once.
+    progress : callable, optional
+        See `Progress`.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    SimtestError
+        If the night could not be run: bad input, a damaged baseline, no rendering backend, no space on the disk. What
+        was written by earlier nights is as it was.
+    """
+    with _told_in_one_line(reports):
+        reports.make()
+        # A damaged baseline is told before the work, not after it.
+        baseline = load_baseline(reports, profile.name)
+        remove_dead(reports)
+        run_id = new_run_id(datetime.now(UTC))
+        with scratch(reports, run_id) as folder:
+            night = measure_night(profile, folder, run_id, command, variant, engine, workers, progress)
+            verdict = judge(night, baseline)
+            history, notes = read_history(reports.history, profile.name)
+            late = clock_note(history, datetime.fromisoformat(night.run["started"]))
+            verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *([late] if late else []), *notes))
+            rows = history_rows(night, verdict)
+            file = append(reports.history, rows)
+            history = pl.concat([history, rows]).sort("started", "run_id", maintain_order=True)
+            target = publish(reports, folder, night, verdict, history)
+    return Outcome(night, verdict, target, file)
+
+
+def judge(night: Night, baseline: Night | None) -> Verdict:
+    """Hold a night against its baseline; without one, say how to make it."""
+    verdict = compare(night, baseline)
+    if baseline is not None:
+        return verdict
+    profile = night.run["profile"]
+    note = (
+        f"No baseline for the profile {profile}: look at the figures, then run "
+        f'simtest nightly accept --profile {profile} --reason "...".'
+    )
+    return dataclasses.replace(verdict, notes=(*verdict.notes, note))
+
+
+def publish(reports: Reports, scratch_folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame) -> Path:
+    """Write the page and all that lies beside it, and put it in the place of the last night's."""
+    new, target = scratch_folder / "tonight", reports.tonight(night.run["profile"])
+    new.mkdir()
+    save_night(new, night, TONIGHT_ROWS)
+    write_outputs(new, night, verdict)
+    write_page(new, night, verdict, history, files=FILES)
+    with turn(target):
+        replace_folder(new, target)
+    return target
+
+
+@contextlib.contextmanager
+def _told_in_one_line(reports: Reports) -> Iterator[None]:
+    """Turn what the disk refuses into an error that says so."""
+    try:
+        yield
+    except SimtestError:
+        raise
+    except (OSError, pl.exceptions.PolarsError) as error:
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise SimtestError(
+            f"--reports {shown(reports.root)}: the night could not be written ({' '.join(said.split())[:200]}); "
+            "what earlier nights wrote is as it was"
+        ) from error

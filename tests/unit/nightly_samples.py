@@ -1,0 +1,69 @@
+"""A small night, made without rendering, for the tests of the nightly."""
+
+from datetime import UTC, datetime
+
+import polars as pl
+
+from simtest.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.nightly.pending import setting_figures
+from simtest.validation.metrics import SCHEMA
+
+STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
+
+RUN = {
+    "id": "20260301T023000Z-7-0123abcd", "profile": "quick", "started": STARTED.isoformat(timespec="seconds"),
+    "duration_s": 12.3, "command": "simtest nightly", "commit": "0123456789abcdef0123+", "version": "0.1.0",
+    "versions": {"simtest": "0.1.0", "numpy": "2.4.6"}, "python": "3.11.9", "processor": "A processor",
+    "system": "Linux", "source_hash": "ab" * 32, "variant": "llvm_ad_mono", "llvm": None,
+}  # fmt: skip
+
+
+def make_rows(count=4, error_deg=1.0):
+    made = [
+        {
+            "experiment": experiment, "label": "plane", "surface": "plane", "setting": setting, "realisation": number,
+            "specularity": 0, "true_id": 0, "seed": 100 + number, "estimator": estimator, "status": "ok",
+            "error_deg": error_deg + 0.1 * number,
+        }
+        for experiment in ("first", "second")
+        for setting in ("plane, tilt_deg=0", "plane, tilt_deg=5")
+        for estimator in ("cone_axis", "circle_pose")
+        for number in range(count)
+    ]  # fmt: skip
+    made[0] |= {"status": "missed", "error_deg": None, "specularity": None}
+    made[-1]["true_id"] = None
+    return pl.DataFrame(made, schema=SCHEMA)
+
+
+def canary(name="axis ratio", value=1.0, passed=True):
+    return {
+        "kind": "canary", "experiment": name, "label": "", "surface": "", "setting": "", "estimator": "cone_axis",
+        "quantity": "axis_ratio", "unit": "", "value": value, "low": 0.9, "high": 1.1, "n": 1, "passed": passed,
+    }  # fmt: skip
+
+
+def make_night(run=None, rows=None, canaries=()):
+    rows = make_rows() if rows is None else rows
+    figures = pl.concat([setting_figures(rows), pl.DataFrame(list(canaries) or [canary()], schema=FIGURES)])
+    return Night({**RUN, **(run or {})}, rows, figures)
+
+
+def compared(night, outcomes, **more):
+    """Give comparisons of a night's places, with outcomes in turn."""
+    places = night.figures.filter(pl.col("kind") == "setting").select(*PLACE).rows()
+    made = [
+        dict(zip(PLACE, place, strict=True))
+        | {"quantity": "mean_deg", "unit": "deg", "method": "paired", "n": 4, "baseline": 1.0, "tonight": 1.1,
+           "difference": 0.1, "low": 0.05, "high": 0.15, "margin": 0.02, "p": 1e-6, "p_holm": 1e-4}
+        | {"outcome": outcomes[i % len(outcomes)], **more}
+        for i, place in enumerate(places)
+    ]  # fmt: skip
+    return pl.DataFrame(made, schema=COMPARISONS)
+
+
+def regression(night, outcomes=("worse", "same", "better", "equivalent"), notes=(), **more):
+    return Verdict("regression", False, compared(night, outcomes, **more), tuple(notes), {**RUN, "reason": "first"})
+
+
+def no_baseline():
+    return Verdict("no baseline", None, pl.DataFrame(schema=COMPARISONS), ("No baseline.",), None)

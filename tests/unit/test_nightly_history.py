@@ -1,0 +1,356 @@
+"""The history of nights and the baseline: what is written stays, and what is damaged is named."""
+
+import errno
+import json
+import os
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from simtest.errors import InputError
+from simtest.nightly import layout
+from simtest.nightly.baseline import accept, load_baseline
+from simtest.nightly.history import HISTORY, append, clock_note, history_rows, read_history, short_commit
+from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
+from simtest.nightly.storage import BASELINE_ROWS, TONIGHT_ROWS, load_night, save_night
+from tests.unit.nightly_samples import STARTED, make_night, make_rows, no_baseline
+
+
+def keep(folder, number, **more):
+    """Append a night; gives its file."""
+    started = STARTED + timedelta(days=number)
+    run = {"id": f"{started:%Y%m%dT%H%M%SZ}-1-{number:08x}", "started": started.isoformat(), **more}
+    return append(folder, history_rows(make_night(run), no_baseline()))
+
+
+# History ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_night_reads_back_as_it_was_written(tmp_path):
+    file = keep(tmp_path, 0)
+    assert file.relative_to(tmp_path).as_posix() == (
+        "date=2026-03-01/commit=0123456789ab+/20260301T023000Z-1-00000000.parquet"
+    )
+    read, notes = read_history(tmp_path)
+    assert notes == []
+    assert read.schema == pl.Schema(HISTORY)
+    assert_frame_equal(read, history_rows(make_night({"id": file.stem}), no_baseline()))
+    assert read["started"].unique().to_list() == [STARTED]
+    assert read["state"].unique().to_list() == ["no baseline"]
+
+
+def test_an_empty_history_has_the_columns(tmp_path):
+    for folder in (tmp_path, tmp_path / "none"):
+        read, notes = read_history(folder)
+        assert (read.schema, read.height, notes) == (pl.Schema(HISTORY), 0, [])
+
+
+def test_nights_come_in_the_order_of_their_start_and_by_profile(tmp_path):
+    keep(tmp_path, 2)
+    keep(tmp_path, 0, commit=None)
+    keep(tmp_path, 1, profile="full")
+    read, _ = read_history(tmp_path, "quick")
+    assert read["run_id"].unique(maintain_order=True).to_list() == [
+        "20260301T023000Z-1-00000000", "20260303T023000Z-1-00000002",
+    ]  # fmt: skip
+    assert read_history(tmp_path)[0]["run_id"].n_unique() == 3
+    assert (tmp_path / "date=2026-03-01" / "commit=unknown").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("commit", "short"),
+    [("0123456789abcdef", "0123456789ab"), ("0123456789abcdef+", "0123456789ab+"), (None, "unknown"),
+     ("../../etc", "unknown"), ("0123456789ab/../x", "unknown")],
+)  # fmt: skip
+def test_a_commit_is_a_safe_name(commit, short):
+    assert short_commit(commit) == short
+
+
+def foreign(file):
+    pl.DataFrame({"kind": ["setting"], "value": [1.0]}).write_parquet(file)
+
+
+def wrong_types(file):
+    pl.read_parquet(file).with_columns(pl.lit("yesterday").alias("started")).write_parquet(file)
+
+
+def two_runs(file):
+    rows = pl.read_parquet(file)
+    pl.concat([rows, rows.with_columns(pl.lit("other").alias("run_id"))]).write_parquet(file)
+
+
+def without_start(file):
+    pl.read_parquet(file).with_columns(pl.lit(None, HISTORY["started"]).alias("started")).write_parquet(file)
+
+
+DAMAGE = {
+    "truncated": lambda file: os.truncate(file, file.stat().st_size // 2),
+    "a few bytes": lambda file: os.truncate(file, 3),
+    "empty": lambda file: os.truncate(file, 0),
+    "no rows": lambda file: pl.read_parquet(file).head(0).write_parquet(file),
+    "text": lambda file: file.write_text("not a table\n" * 50),
+    "foreign": foreign,
+    "wrong types": wrong_types,
+    "two runs": two_runs,
+    "no start": without_start,
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_file_is_named_and_skipped(tmp_path, kind):
+    bad = keep(tmp_path, 1)
+    keep(tmp_path, 2)
+    DAMAGE[kind](bad)
+    before = bad.read_bytes()
+    with pytest.warns(UserWarning, match=rf"{bad.name}: .*; skipped") as told:
+        read, (note,) = read_history(tmp_path)
+    assert len(told) == 1
+    assert read["run_id"].unique().to_list() == ["20260303T023000Z-1-00000002"]
+    assert note.startswith("History: 1 file skipped: ")
+    assert bad.relative_to(tmp_path).as_posix() in note
+    assert bad.read_bytes() == before
+
+
+@pytest.mark.filterwarnings("ignore:.*; skipped")
+def test_many_damaged_files_make_a_short_note(tmp_path):
+    for number in range(8):
+        os.truncate(keep(tmp_path, number), 9)
+    read, (note,) = read_history(tmp_path)
+    assert read.height == 0
+    assert note.startswith("History: 8 files skipped: ")
+    assert note.endswith(" and 3 more.")
+
+
+def test_a_copy_of_a_night_counts_once(tmp_path):
+    file = keep(tmp_path, 0)
+    copy = tmp_path / "date=2026-03-09" / "commit=unknown" / "copy.parquet"
+    copy.parent.mkdir(parents=True)
+    copy.write_bytes(file.read_bytes())
+    with pytest.warns(UserWarning, match="another file holds already"):
+        read, notes = read_history(tmp_path)
+    assert read.height == make_night().figures.height
+    assert len(notes) == 1
+
+
+def test_half_written_and_other_files_are_no_nights(tmp_path, recwarn):
+    file = keep(tmp_path, 0)
+    file.with_name(f".{file.stem}.12.part.parquet").write_bytes(b"half")
+    (tmp_path / "notes.txt").write_text("mine")
+    assert read_history(tmp_path)[1] == []
+    assert not recwarn.list
+
+
+def test_a_column_that_an_older_night_lacks_is_null(tmp_path):
+    file = keep(tmp_path, 0)
+    pl.read_parquet(file).drop("digest", "source_hash").write_parquet(file)
+    read, notes = read_history(tmp_path)
+    assert notes == []
+    assert read["digest"].null_count() == read.height > 0
+
+
+def test_a_clock_that_went_back_is_told(tmp_path):
+    keep(tmp_path, 3)
+    read, _ = read_history(tmp_path)
+    note = clock_note(read, STARTED)
+    assert note is not None
+    assert "2026-03-01 02:30:00 UTC" in note
+    assert "2026-03-04 02:30:00" in note
+    assert clock_note(read, STARTED + timedelta(days=4)) is None
+    assert clock_note(read.head(0), STARTED) is None
+    # The night is kept all the same, in its place by the time it tells.
+    keep(tmp_path, 0)
+    assert read_history(tmp_path)[0]["started"].is_sorted()
+
+
+def test_names_of_nights_differ_whatever_the_clock_says():
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    assert len({new_run_id(now) for _ in range(1000)}) == 1000
+
+
+def test_a_full_disk_leaves_no_half_of_a_night(tmp_path, monkeypatch):
+    keep(tmp_path, 0)
+    before = contents(tmp_path)
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("simtest.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        keep(tmp_path, 1)
+    assert contents(tmp_path) == before
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.endswith("lock")
+    }
+
+
+# Baseline --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reports(tmp_path):
+    """Reports with a last night."""
+    made = Reports(tmp_path / "reports")
+    write_tonight(made, make_night())
+    return made
+
+
+def write_tonight(reports, night):
+    folder = reports.tonight(night.run["profile"])
+    folder.mkdir(parents=True, exist_ok=True)
+    save_night(folder, night, TONIGHT_ROWS)
+
+
+def test_a_baseline_is_the_last_night_with_a_reason(reports):
+    assert load_baseline(reports, "quick") is None
+    run = accept(reports, "quick", "  first\n night ")
+    found, night = load_baseline(reports, "quick"), make_night()
+    assert found.run == run
+    assert found.run["reason"] == "first night"
+    assert datetime.fromisoformat(run["accepted"]).tzinfo is not None
+    assert_frame_equal(found.figures, night.figures)
+    kept = night.rows.select(found.rows.columns)
+    assert_frame_equal(found.rows, kept)
+    assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
+    assert not list(reports.work.glob("2*"))
+
+
+def test_all_acceptances_are_kept(reports):
+    accept(reports, "quick", "first")
+    write_tonight(reports, make_night({"id": "20260302T023000Z-7-0"}, make_rows(error_deg=0.5)))
+    accept(reports, "quick", "better ellipse fit")
+    lines = [json.loads(line) for line in (reports.baseline("quick") / "log.jsonl").read_text().splitlines()]
+    assert [line["reason"] for line in lines] == ["first", "better ellipse fit"]
+    assert [line["replaces"] for line in lines] == [None, "20260301T023000Z-7-0123abcd"]
+    assert load_baseline(reports, "quick").rows["error_deg"].min() == 0.5
+
+
+@pytest.mark.parametrize(("reason", "said"), [("", "0 characters"), (" \n", "0 characters"), ("x" * 1001, "1001")])
+def test_a_baseline_needs_a_reason(reports, reason, said):
+    with pytest.raises(InputError, match=f"--reason: {said} characters" if "c" not in said else f"--reason: {said}"):
+        accept(reports, "quick", reason)
+    assert load_baseline(reports, "quick") is None
+
+
+def test_there_is_nothing_to_accept(reports):
+    with pytest.raises(InputError, match="no night of the profile full; run simtest nightly first"):
+        accept(reports, "full", "why not")
+
+
+@pytest.mark.parametrize("name", ["run.json", "figures.parquet", BASELINE_ROWS])
+@pytest.mark.parametrize("damage", ["missing", "truncated", "text", "another night's"])
+def test_a_damaged_baseline_is_named(reports, name, damage):
+    accept(reports, "quick", "first")
+    file = reports.baseline("quick") / name
+    if damage == "missing":
+        file.unlink()
+    elif damage == "truncated":
+        os.truncate(file, file.stat().st_size // 2)
+    elif damage == "text":
+        file.write_text("no table")
+    else:
+        kept = file.read_bytes()
+        write_tonight(reports, make_night(rows=make_rows(error_deg=3.0)))
+        accept(reports, "quick", "second")
+        if file.read_bytes() == kept:
+            pytest.skip("the same in both nights")
+        file.write_bytes(kept)
+    # A record of another night names the first table, whose hash it does not hold.
+    named = BASELINE_ROWS if (name, damage) == ("run.json", "another night's") else name
+    with pytest.raises(InputError, match=f"{named}: (damaged|cannot be read)"):
+        load_baseline(reports, "quick")
+
+
+def test_a_damaged_last_night_is_not_accepted(reports):
+    accept(reports, "quick", "first")
+    before = contents(reports.baseline("quick"))
+    os.truncate(reports.tonight("quick") / TONIGHT_ROWS, 100)
+    with pytest.raises(InputError, match=rf"{TONIGHT_ROWS}: damaged"):
+        accept(reports, "quick", "second")
+    assert contents(reports.baseline("quick")) == before
+
+
+@pytest.mark.parametrize("renames", [0, 1, 2])
+def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, renames):
+    """The renames are where the folder changes hands: a kill before, between and after them."""
+    accept(reports, "quick", "first")
+    write_tonight(reports, make_night({"id": "20260302T023000Z-7-0"}))
+    done, rename = [], Path.rename
+
+    def killed(self, target):
+        if len(done) == renames:
+            raise KeyboardInterrupt
+        done.append(target)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    if renames < 2:
+        with pytest.raises(KeyboardInterrupt):
+            accept(reports, "quick", "second")
+    else:
+        monkeypatch.setattr(layout, "sync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            accept(reports, "quick", "second")
+    monkeypatch.undo()
+    assert load_baseline(reports, "quick").run["reason"] == ("first" if renames < 2 else "second")
+    accept(reports, "quick", "third")
+    assert load_baseline(reports, "quick").run["reason"] == "third"
+    assert {path.name for path in reports.baseline("quick").parent.iterdir()} == {"quick", ".quick.lock"}
+
+
+# Scratch ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_dead_nights_left_is_removed_and_the_living_are_left_alone(tmp_path):
+    reports = Reports(tmp_path)
+    dead = reports.work / "20260101T000000Z-1-dead"
+    dead.mkdir(parents=True)
+    (dead / "lock").touch()
+    (dead / "rows").write_text("half")
+    file = keep(reports.history, 0)
+    stale = file.with_name(".20260101T000000Z-1-dead.1.part.parquet")
+    stale.write_bytes(b"half")
+    with scratch(reports, "20260102T000000Z-1-alive") as alive:
+        writing = file.with_name(f".{alive.name}.1.part.parquet")
+        writing.write_bytes(b"half")
+        assert remove_dead(reports) == [dead.name]
+        assert alive.is_dir()
+        assert writing.is_file()
+    assert not alive.exists()
+    assert not dead.exists()
+    assert not stale.exists()
+    assert file.is_file()
+    assert remove_dead(reports) == []
+    remove_dead(reports)
+    assert not writing.exists()
+
+
+def test_a_folder_is_replaced_whole(tmp_path):
+    folder = tmp_path / "page"
+    for text in ("first", "second"):
+        new = tmp_path / "new"
+        new.mkdir()
+        (new / text).touch()
+        with turn(folder):
+            replace_folder(new, folder)
+        assert [path.name for path in folder.iterdir()] == [text]
+
+
+def test_reports_that_are_a_file_are_refused(tmp_path):
+    (tmp_path / "reports").touch()
+    with pytest.raises(InputError, match=r"--reports .*reports: is a file; must be a folder"):
+        Reports(tmp_path / "reports").make()
+
+
+def test_a_night_that_another_wrote_is_refused(tmp_path):
+    save_night(tmp_path, make_night(), TONIGHT_ROWS)
+    (tmp_path / "run.json").write_text('{"id": "x"}')
+    with pytest.raises(InputError, match=r"run\.json: damaged"):
+        load_night(tmp_path, TONIGHT_ROWS)

@@ -1,0 +1,190 @@
+"""What a night writes beside its page: JSON, JUnit XML, Markdown, a badge."""
+
+import dataclasses
+import json
+from xml.etree import ElementTree as ET
+
+import polars as pl
+import pytest
+
+from simtest.gate.records import COMPARISONS, OUTCOMES, Verdict
+from simtest.nightly.badge import COLOURS, badge
+from simtest.nightly.junit import junit
+from simtest.nightly.outputs import write_outputs
+from simtest.nightly.summary import MAX_CHARACTERS, summary
+from tests.unit.nightly_samples import RUN, canary, compared, make_night, no_baseline, regression
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def night():
+    return make_night(canaries=[canary(), canary("rotated camera", 0.2, False)])
+
+
+def written(folder, night, verdict):
+    folder.mkdir(exist_ok=True)
+    write_outputs(folder, night, verdict)
+    return {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir()}
+
+
+def test_the_same_night_gives_the_same_bytes(tmp_path, night):
+    first = written(tmp_path / "first", night, regression(night))
+    assert written(tmp_path / "second", night, regression(night)) == first
+    assert set(first) == {"verdict.json", "junit.xml", "summary.md", "badge.svg"}
+
+
+# JSON ------------------------------------------------------------------------------------------------------------
+
+
+def test_json_holds_the_verdict(tmp_path, night):
+    verdict = regression(night, notes=["Versions differ."])
+    data = json.loads(written(tmp_path, night, verdict)["verdict.json"])
+    assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (1, "regression", 1, False)
+    assert data["counts"] == {**dict.fromkeys(OUTCOMES, 0), "worse": 2, "same": 2, "better": 2, "equivalent": 2}
+    assert data["notes"] == ["Versions differ."]
+    assert data["run"] == night.run
+    assert data["baseline"]["reason"] == "first"
+    assert data["canaries"]["n"] == 2
+    assert [row["experiment"] for row in data["canaries"]["failed"]] == ["rotated camera"]
+    # What is the same is counted, not listed.
+    assert {row["outcome"] for row in data["comparisons"]} == {"worse", "better", "equivalent"}
+    assert data["comparisons"][0]["p_holm"] == 1e-4
+
+
+def test_json_without_a_baseline(tmp_path, night):
+    data = json.loads(written(tmp_path, night, no_baseline())["verdict.json"])
+    assert (data["state"], data["exit_code"], data["bit_equal"], data["baseline"]) == ("no baseline", 0, None, None)
+
+
+def test_json_bears_figures_that_are_not_finite(tmp_path, night):
+    text = written(tmp_path, night, regression(night, difference=float("inf"), low=float("nan")))["verdict.json"]
+    row = json.loads(text, parse_constant=pytest.fail)["comparisons"][0]
+    assert (row["difference"], row["low"]) == ("inf", "nan")
+
+
+# JUnit -----------------------------------------------------------------------------------------------------------
+
+
+def test_junit_counts_what_it_lists(night):
+    root = ET.fromstring(junit(night, regression(night)))
+    assert root.tag == "testsuites"
+    suites = {suite.get("name"): suite for suite in root}
+    assert set(suites) == {"quick.first", "quick.second", "quick.canaries"}
+    for suite in suites.values():
+        cases = suite.findall("testcase")
+        assert int(suite.get("tests")) == len(cases) > 0
+        assert int(suite.get("failures")) == sum(case.find("failure") is not None for case in cases)
+        assert int(suite.get("skipped")) == sum(case.find("skipped") is not None for case in cases)
+        assert all(case.get("classname") == suite.get("name") and case.get("name") for case in cases)
+        assert len({case.get("name") for case in cases}) == len(cases)
+    for count in ("tests", "failures", "skipped", "errors"):
+        assert int(root.get(count)) == sum(int(suite.get(count)) for suite in root)
+    (failure, *_) = suites["quick.first"].iter("failure")
+    assert failure.get("message") == "mean_deg: 1.1 deg, baseline 1 deg, margin 0.02 deg, p 0.0001 (Holm)"
+    (failed,) = suites["quick.canaries"].iter("failure")
+    assert failed.get("message") == "axis_ratio = 0.2: must be 0.9 to 1.1"
+
+
+def test_junit_skips_what_it_cannot_compare(night):
+    root = ET.fromstring(junit(night, no_baseline()))
+    assert int(root.get("skipped")) == 8
+    assert int(root.get("failures")) == 1  # the canary
+    new = Verdict("fine", False, compared(night, ("new", "same")), (), RUN)
+    assert int(ET.fromstring(junit(night, new)).get("skipped")) == 4
+
+
+def test_junit_names_places_that_are_gone(night):
+    gone = compared(night, ("gone",)).with_columns(pl.lit("third").alias("experiment"))
+    root = ET.fromstring(junit(night, Verdict("fine", False, gone, (), RUN)))
+    assert {case.find("skipped").get("message") for case in root.iter("testcase")
+            if case.get("classname") == "quick.third"} == {"the place is gone"}  # fmt: skip
+
+
+def test_junit_bears_any_label(night):
+    odd = 'a<b> & "c" \x00\x1b ]]> \ud800'.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    rows = night.rows.with_columns(pl.lit(odd).alias("setting"))
+    text = junit(make_night(rows=rows), no_baseline())
+    names = [case.get("name") for case in ET.fromstring(text.encode()).iter("testcase")]
+    assert any('a<b> & "c"' in name for name in names)
+
+
+# Markdown --------------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_says_first_what_matters(night):
+    lines = summary(night, regression(night, notes=["Versions differ."])).splitlines()
+    assert lines[0] == "## Nightly quick: regression: 2 figures worse"
+    assert lines[2].startswith('Not bit-equal to the baseline of 2026-03-01T02:30:00+00:00, commit 0123456789ab+: "fir')
+    titles = [line for line in lines if line.startswith("#")]
+    assert titles[1:] == ["### Worse: 2", "### Canaries failed: 1", "### Better: 2", "### By experiment"]
+    assert "- Versions differ." in lines
+    assert any(line.startswith("| first | plane, tilt_deg=0, cone_axis | mean_deg | 1 deg | 1.1 deg | 0.1 [")
+               for line in lines)  # fmt: skip
+
+
+def test_tables_are_whole(night):
+    head = None
+    for line in summary(night, regression(night)).splitlines():
+        if not line.startswith("|"):
+            head = None
+            continue
+        cells = line.count("|") - line.count("\\|")
+        head = head or cells
+        assert cells == head
+
+
+def test_the_counts_by_experiment(night):
+    text = summary(night, no_baseline())
+    assert "| first | 16 | 15 | 1 | 0 |" in text
+    assert "| second | 15 | 15 | 0 | 1 |" in text
+
+
+def test_a_huge_verdict_fits_a_comment(night):
+    places = pl.concat([compared(night, ("worse", "better"))] * 500)
+    long = places.with_columns(pl.lit("x" * 5000).alias("setting"))
+    verdict = Verdict("regression", False, long, tuple("note " * 500 for _ in range(1000)), RUN)
+    many = make_night(canaries=[canary("c" * 4000, passed=False)] * 500)
+    text = summary(many, verdict)
+    assert 10_000 < len(text) <= MAX_CHARACTERS
+
+
+def test_texts_of_a_user_stay_texts(night):
+    odd = "a|b <script>x</script> `c` @everyone\n# d"
+    lines = summary(night, regression(night, setting=odd, notes=[odd])).splitlines()
+    assert not [line for line in lines if "<script>" in line or "`c`" in line or "@everyone" in line]
+    assert not [line for line in lines if line.startswith("# d")]
+    assert any("a\\|b &lt;script>" in line for line in lines)
+
+
+# Badge -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", COLOURS)
+def test_the_badge_is_told_to_those_who_do_not_see_it(night, state):
+    verdict = Verdict(state, state == "fine", pl.DataFrame(schema=COMPARISONS), (), None)
+    root = ET.fromstring(badge(night, verdict))
+    assert root.get("role") == "img"
+    title = root.find(f"{SVG}title")
+    assert root.get("aria-labelledby") == title.get("id")
+    assert title.text.startswith("nightly quick: ")
+    assert state in title.text
+    drawn = [rect.get("fill") for rect in root.iter(f"{SVG}rect")]
+    assert COLOURS[state] in drawn
+    assert all(contrast_with_white(colour) >= 4.5 for colour in drawn)
+    # Both halves are drawn side by side, as wide as the picture.
+    widths = [int(rect.get("width")) for rect in root.iter(f"{SVG}rect")]
+    assert sum(widths) == int(root.get("width"))
+
+
+def contrast_with_white(colour):
+    """Contrast ratio of WCAG 2."""
+    shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+    return 1.05 / (0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2] + 0.05)
+
+
+def test_the_badge_tells_equal_bytes(night):
+    fine = Verdict("fine", True, pl.DataFrame(schema=COMPARISONS), (), RUN)
+    assert "fine, bit-equal" in badge(night, fine)
+    assert "bit-equal" not in badge(night, dataclasses.replace(fine, bit_equal=False))

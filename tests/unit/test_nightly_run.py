@@ -1,0 +1,388 @@
+"""A night from start to end: exit codes, what it leaves, and what stops it."""
+
+import errno
+import json
+import os
+import signal
+import sys
+from datetime import timedelta
+
+import polars as pl
+import pytest
+
+from simtest.cli import main as command_line
+from simtest.errors import BackendError, InputError, SimtestError
+from simtest.nightly import measure
+from simtest.nightly import run as run_module
+from simtest.nightly.baseline import accept, load_baseline
+from simtest.nightly.history import read_history
+from simtest.nightly.layout import Reports
+from simtest.nightly.run import run_nightly
+from simtest.resources import data_root
+from simtest.spec import experiments_of, load_profile
+from simtest.validation.cases import expand
+from tests.unit.nightly_samples import STARTED, canary, make_night, regression
+
+pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+
+SMALL = """
+title = "Small"
+[[experiments]]
+experiment = "planes.toml"
+[[experiments]]
+experiment = "paper"
+labels = ["slant"]
+realisations = 2
+"""
+PLANES = """
+realisations = 3
+estimators = ["cone_axis", "brightest_point"]
+[[groups]]
+scene = "plane"
+label = "plane"
+isolated = false
+set = { "camera.width" = 96, "camera.height" = 96 }
+sweep = [{ "surface.tilt_deg" = [0.5, 3.0] }]
+"""
+
+
+@pytest.fixture
+def small(tmp_path):
+    """Give the path of a profile of two quick experiments."""
+    (tmp_path / "planes.toml").write_text(PLANES)
+    (tmp_path / "small.toml").write_text(SMALL)
+    return tmp_path / "small.toml"
+
+
+@pytest.fixture
+def reports(tmp_path):
+    return Reports(tmp_path / "reports")
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Have nights that are measured in no time; gives the list whose first one is next."""
+    nights = [make_night() for _ in range(10)]
+
+    def measure_night(profile, folder, run_id, *_, **__):
+        night = nights.pop(0)
+        night.run.update(id=run_id, profile=profile.name)
+        return night
+
+    monkeypatch.setattr(run_module, "measure_night", measure_night)
+    return nights
+
+
+def quick():
+    return load_profile("quick")
+
+
+def accept_first(reports):
+    run_nightly(quick(), reports)
+    accept(reports, "quick", "first")
+
+
+def contents(folder):
+    """Give all files by path, but for locks."""
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.endswith("lock")
+    }
+
+
+# Profiles --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["quick", "full"])
+def test_shipped_profiles_represent_every_experiment(name):
+    experiments = experiments_of(load_profile(name))
+    shipped = {file.stem for file in (data_root("scenes") / "experiments").glob("*.toml")}
+    # `mesh` is `colon` until it is given a mesh.
+    assert {experiment.name for experiment in experiments} == shipped - {"mesh"}
+    for experiment in experiments:
+        assert expand(experiment)
+
+
+def profile_of(tmp_path, text):
+    (tmp_path / "mine.toml").write_text(text)
+    return load_profile(tmp_path / "mine.toml")
+
+
+def test_a_profile_cuts_experiments_down(tmp_path):
+    profile = profile_of(tmp_path, """
+        [[experiments]]
+        experiment = "colon"
+        name = "colon_few"
+        labels = ["curvature", "bounces"]
+        pool = 2
+        seed = 9
+        estimators = ["cone_axis"]
+        [experiments.set]
+        "sensor.noise_sigma" = 0.01
+    """)  # fmt: skip
+    (experiment,) = experiments_of(profile)
+    assert (experiment.name, experiment.seed, experiment.estimators) == ("colon_few", 9, ("cone_axis",))
+    assert [group.label for group in experiment.groups] == ["curvature", "bounces"]
+    cases = expand(experiment)
+    assert [case.swept["surface.viewpoint"] for case in cases] == [0, 1] * 4
+    assert {case.data["sensor"]["noise_sigma"] for case in cases} == {0.01}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "experiments: missing"),
+        ("experiments = []", "experiments = \\[\\]: must have at least 1 item"),
+        ('[[experiments]]\nexperiment = "colon"\nrealisation = 1', "experiments.0.realisation = 1: unknown key; "
+         "allowed: realisations"),
+        ('[[experiments]]\nexperiment = "colon"\npool = 0', "pool = 0: must be greater than or equal to 1"),
+        ('[[experiments]]\nexperiment = "colon"\n[[experiments]]\nexperiment = "colon"', "experiment colon: listed "
+         "twice; give one of them another name"),
+        ('name = "../x"\n[[experiments]]\nexperiment = "colon"', "name = '../x': must match the pattern"),
+    ],
+)  # fmt: skip
+def test_a_malformed_profile_is_refused(tmp_path, text, said):
+    with pytest.raises(InputError, match=f"mine.toml: {said}|mine.toml: .*{said}"):
+        profile_of(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('experiment = "kidney"', "kidney: no such file; shipped by name: anatomy, "),
+        ('experiment = "colon"\nlabels = ["bends"]', "colon has no group 'bends'; allowed: curvature, light beside"),
+        ('experiment = "colon"\nset = { "surface.typo" = 1 }', "surface.typo = 1: unknown key"),
+        ('experiment = "colon"\nestimators = ["magic"]', "estimator 'magic': not installed"),
+    ],
+)
+def test_a_night_refuses_an_experiment_before_it_works(tmp_path, reports, entry, said):
+    profile = profile_of(tmp_path, f"[[experiments]]\n{entry}")
+    with pytest.raises(InputError, match=said):
+        run_nightly(profile, reports)
+    assert contents(reports.root) == {}
+
+
+# A whole night ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.render
+def test_a_night_is_measured_kept_and_published(small, reports):
+    """Twice, with an accept between them: the second has the first's bytes."""
+    profile, steps = load_profile(small), []
+    first = run_nightly(profile, reports, "simtest nightly", progress=lambda *step: steps.append(step))
+    assert (first.exit_code, first.verdict.state) == (0, "no baseline")
+    assert any("simtest nightly accept --profile small" in note for note in first.verdict.notes)
+    (total,) = {total for _, total, _ in steps}
+    assert [done for done, *_ in steps] == sorted(done for done, *_ in steps)
+    assert steps[0][0] == 0
+    assert steps[-1] == (total, total, "done")
+    files = {path.name for path in first.folder.iterdir()}
+    assert {"index.html", "verdict.json", "junit.xml", "summary.md", "badge.svg", "run.json", "rows.parquet",
+            "figures.parquet"} <= files  # fmt: skip
+    history, _ = read_history(reports.history)
+    assert set(history["run_id"]) == {first.night.run["id"]}
+    assert {"setting", "cost"} <= set(history["kind"])
+    costs = history.filter(pl.col("kind") == "cost")
+    assert {"cone_axis", "reconstruct", "night"} <= set(costs["estimator"])
+    assert costs["value"].is_between(0, 1e5, closed="none").all()
+    assert json.loads((first.folder / "run.json").read_text())["command"] == "simtest nightly"
+    assert not [path for path in reports.work.iterdir() if path.is_dir()]
+
+    accept(reports, "small", "first")
+    second = run_nightly(profile.model_copy(update={"costs": False}), reports)
+    assert second.exit_code == 0
+    assert second.night.rows.equals(first.night.rows)
+    settings = [night.figures.filter(pl.col("kind") == "setting") for night in (first.night, second.night)]
+    assert settings[0].equals(settings[1])
+    assert read_history(reports.history)[0]["run_id"].n_unique() == 2
+    assert second.verdict.baseline["reason"] == "first"
+
+
+def test_a_regression_exits_1(measured, reports, monkeypatch):
+    accept_first(reports)
+    monkeypatch.setattr(run_module, "compare", lambda tonight, baseline: regression(tonight))
+    outcome = run_nightly(quick(), reports)
+    assert outcome.exit_code == 1
+    assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
+    history, _ = read_history(reports.history, "quick")
+    assert history.filter(pl.col("run_id") == outcome.night.run["id"])["state"].unique().to_list() == ["regression"]
+
+
+def test_a_failed_canary_is_a_regression_without_a_baseline(measured, reports):
+    measured.insert(0, make_night(canaries=[canary("rotated camera", 0.5, False)]))
+    outcome = run_nightly(quick(), reports)
+    assert outcome.exit_code == 1
+    text = (outcome.folder / "summary.md").read_text()
+    assert "### Canaries failed: 1" in text
+    assert "| rotated camera |" in text
+
+
+@pytest.mark.filterwarnings("ignore:.*; skipped")
+def test_damage_in_the_history_is_told_on_the_page_and_the_night_goes_on(measured, reports):
+    first = run_nightly(quick(), reports)
+    os.truncate(first.history_file, 50)
+    second = run_nightly(quick(), reports)
+    assert [note for note in second.verdict.notes if first.history_file.name in note]
+    assert first.history_file.stat().st_size == 50
+    assert set(read_history(reports.history)[0]["run_id"]) == {second.night.run["id"]}
+
+
+def test_a_clock_that_goes_back_is_told_and_nothing_is_overwritten(measured, reports):
+    measured[0].run["started"] = (STARTED + timedelta(days=30)).isoformat()
+    first, second = (run_nightly(quick(), reports) for _ in range(2))
+    assert [note for note in second.verdict.notes if note.startswith("The clock went back")]
+    assert not [note for note in first.verdict.notes if "clock" in note]
+    history, _ = read_history(reports.history)
+    assert history["run_id"].unique(maintain_order=True).to_list() == [o.night.run["id"] for o in (second, first)]
+
+
+def test_a_damaged_baseline_stops_a_night_before_it_works(measured, reports):
+    accept_first(reports)
+    os.truncate(reports.baseline("quick") / "figures.parquet", 20)
+    before, left = contents(reports.root), len(measured)
+    with pytest.raises(InputError, match=r"baseline/quick/figures.parquet: damaged"):
+        run_nightly(quick(), reports)
+    assert contents(reports.root) == before
+    assert len(measured) == left
+
+
+@pytest.mark.parametrize("at", range(8))
+def test_a_full_disk_is_told_and_nothing_is_lost(measured, reports, monkeypatch, at):
+    """The disk is full from the n-th flush on: while the history, the tables, the outputs are written."""
+    accept_first(reports)
+    before = contents(reports.root)
+    flushed, fsync = [], os.fsync
+
+    def full(descriptor):
+        flushed.append(descriptor)
+        if len(flushed) > at:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(descriptor)
+
+    monkeypatch.setattr("simtest.files.os.fsync", full)
+    with pytest.raises(SimtestError, match=r"the night could not be written .No space left on device.; what earlier"):
+        run_nightly(quick(), reports)
+    monkeypatch.undo()
+    after = contents(reports.root)
+    assert {path: after.get(path) for path in before} == before
+    assert {path.parts[0] for path in after.keys() - before.keys()} <= {"history"}
+
+
+def test_the_next_night_works_after_a_full_disk(measured, reports, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "append", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
+        with pytest.raises(SimtestError):
+            run_nightly(quick(), reports)
+    assert run_nightly(quick(), reports).exit_code == 0
+
+
+# The command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def here(monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["simtest", "nightly", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            command_line.main()
+        output, errors = capfd.readouterr()
+        return stop.value.code, output, [line for line in errors.splitlines() if "━" not in line]
+
+    return run
+
+
+def test_the_command_prints_a_table_and_the_page(measured, here, tmp_path):
+    code, output, errors = here()
+    assert (code, errors) == (0, [])
+    lines = output.splitlines()
+    assert lines[0].strip() == "quick: no baseline"
+    assert lines[-1] == "reports/nightly/quick/index.html"
+    assert any(line.replace("│", " ").split() == ["first", "16", "15", "1", "0"] for line in lines)
+    assert (tmp_path / lines[-1]).is_file()
+
+    code, output, errors = here("accept", "--reason", "first night")
+    assert (code, errors) == (0, [])
+    assert output.endswith(" is the baseline of quick: first night\n")
+    assert load_baseline(Reports(tmp_path / "reports"), "quick").run["reason"] == "first night"
+
+
+def test_the_command_prints_what_is_worse(measured, here, monkeypatch):
+    assert here()[0] == 0
+    assert here("accept", "--reason", "first")[0] == 0
+    monkeypatch.setattr(run_module, "compare", lambda tonight, baseline: regression(tonight))
+    code, output, _ = here()
+    assert code == 1
+    assert "worse: first, plane, tilt_deg=0, cone_axis, mean_deg: 1.1 deg, baseline 1 deg" in output.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (BackendError("no libLLVM"), "no libLLVM"),
+        (SimtestError("processes die"), "processes die"),
+        (RuntimeError("odd"), "internal error, please report it (RuntimeError: odd); --traceback shows where"),
+    ],
+)
+def test_a_night_that_could_not_be_run_exits_2(here, monkeypatch, error, said):
+    """1 would be a regression."""
+
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr(run_module, "measure_night", fails)
+    assert here() == (2, "", [f"simtest: {said}"])
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--profile daily", "daily: no such file; shipped by name: full, quick"),
+        ("--workers 0", "workers = 0: must be 1 to 256"),
+        ("--workers many", "many is not a whole number"),
+        ("accept", 'Command "nightly accept" parameter --reason requires an argument'),
+        ("accept --reason because --profile full", "nightly/full: no night of the profile full; run simtest nightly"),
+    ],
+)
+def test_bad_use_exits_2(here, line, said):
+    code, output, (message,) = here(*line.split())
+    assert (code, output) == (2, "")
+    assert said in message
+
+
+def test_ctrl_c_says_what_is_kept(here, monkeypatch, tmp_path):
+    def stopped(profile, folder, run_id, command, variant, engine, workers, progress):
+        progress(0, 5, "first")
+        os.kill(os.getpid(), signal.SIGINT)
+        progress(1, 5, "first")
+
+    monkeypatch.setattr(run_module, "measure_night", stopped)
+    code, output, errors = here()
+    assert (code, output) == (130, "")
+    assert errors[-1] == (
+        "simtest: stopped; nothing of this night is kept; history, baseline and the last page are as they were"
+    )
+    assert contents(tmp_path / "reports") == {}
+
+
+def test_help_names_the_profiles(here):
+    code, output, _ = here("--help")
+    assert code == 0
+    assert "shipped one: quick, full." in " ".join(output.replace("│", " ").split())
+
+
+def test_the_bar_moves_one_way():
+    """Each part of a night has its share of the bar."""
+    told = []
+    steps = measure._Steps(lambda *step: told.append(step), 10)
+    move = steps.of("experiments")
+    for done in range(11):
+        move(done, 10, "plane")
+    steps.tell("costs")
+    steps.end()
+    assert told[0] == (0, 13, "plane")
+    assert told[10] == (10, 13, "experiments")
+    assert told[-1] == (13, 13, "done")
+    assert measure._Steps(None, 10).of("experiments") is None

@@ -1,0 +1,102 @@
+"""What runs the nightly by itself: workflows and systemd units."""
+
+import configparser
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+UNITS = ROOT / "docs" / "nightly"
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_trust_little(path):
+    text = path.read_text()
+    used = re.findall(r"^\s*(?:- )?uses: (\S+)(.*)$", text, re.MULTILINE)
+    assert used
+    for action, comment in used:
+        assert re.fullmatch(r"actions/[\w/-]+@[0-9a-f]{40}", action)
+        assert re.fullmatch(r" # v\d+\.\d+\.\d+", comment)
+    assert "\npermissions:\n  contents: read\n" in text
+    assert not re.search(r":\s*write\b", text)
+    assert text.count("persist-credentials: false") == sum("checkout@" in action for action, _ in used)
+    assert "secrets." not in text
+    # What is run holds no text of a stranger's, such as a branch's name.
+    runs = re.findall(r"run: (.*)", text)
+    assert runs
+    assert not [line for line in runs if "${{" in line]
+    assert text.count("timeout-minutes:") == text.count("runs-on:")
+
+
+def test_one_action_has_one_version():
+    pins = {}
+    for path in WORKFLOWS:
+        for name, pin in re.findall(r"uses: (actions/[\w-]+)\S*@(\S+ # \S+)", path.read_text()):
+            pins.setdefault(name, set()).add(pin)
+    assert {name: len(found) for name, found in pins.items()} == dict.fromkeys(pins, 1)
+
+
+@pytest.mark.parametrize(
+    "command", [["zizmor", "--offline", "--pedantic"], ["check-jsonschema", "--builtin-schema=vendor.github-workflows"]]
+)
+def test_workflows_pass_their_checkers(command):
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"{command[0]} is not installed")
+    subprocess.run([*command, *map(str, WORKFLOWS)], check=True, capture_output=True, timeout=60)
+
+
+def parsed(name):
+    # A unit's keys may come twice and are case-sensitive.
+    parser = configparser.RawConfigParser(strict=False, comment_prefixes=("#", ";"), delimiters=("=",))
+    parser.optionxform = str
+    parser.read_string((UNITS / name).read_text())
+    return parser
+
+
+def test_the_units_belong_together():
+    service, timer = parsed("simtest-nightly.service"), parsed("simtest-nightly.timer")
+    command = service["Service"]["ExecStart"]
+    assert command.startswith("/")
+    assert command.endswith("simtest nightly --profile full")
+    assert service["Service"]["Type"] == "oneshot"
+    # A timer starts the service of its own name.
+    assert timer["Install"]["WantedBy"] == "timers.target"
+    assert "Unit" not in timer["Timer"]
+    assert timer["Timer"]["Persistent"] == "true"
+
+
+def test_systemd_takes_the_units(tmp_path):
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    tmp_path.chmod(0o700)
+    units = [shutil.copy(path, tmp_path) for path in sorted(UNITS.glob("simtest-nightly.*"))]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = ["systemd-analyze", "verify", "--user", "--man=no", *units]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_systemd_refuses_a_broken_unit(tmp_path):
+    """The check above can fail."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    tmp_path.chmod(0o700)
+    broken = tmp_path / "simtest-nightly.service"
+    text = (UNITS / broken.name).read_text()
+    broken.write_text(text.replace("ExecStart=/usr/bin/env", "ExecStart=/no/such/program"))
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = ["systemd-analyze", "verify", "--user", "--man=no", str(broken)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode != 0
+
+
+def test_systemd_reads_the_time():
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    when = parsed("simtest-nightly.timer")["Timer"]["OnCalendar"]
+    subprocess.run(["systemd-analyze", "calendar", when], check=True, capture_output=True, timeout=30)
