@@ -30,8 +30,8 @@ Array = npt.NDArray[np.float64]
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
-DRIFT_CHI2, SUSPECT_CHI2 = 9.21, 4.61
-"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 1 % and 10 % of normal
+DRIFT_CHI2, SUSPECT_CHI2 = 9.21, 3.22
+"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 1 % and 20 % of normal
 pairs lie beyond. A surface whose curvature does not change drifts by noise alone; on a colon hardly a highlight does,
 and where noise hides the drift, it hides an error several times that of the mean axis."""
 
