@@ -4,8 +4,10 @@ The misfit w between normal and bisector is a two-vector field over the image; i
 from the pixels whose own step lands next to them (theory.md sections 3 and 6).
 """
 
+from dataclasses import fields
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
 from simtest.anatomy.base import SurfacePoints
@@ -24,6 +26,13 @@ SAME_PX = 0.5
 MAX_STEP_PX = 4.0
 MAX_SEEDS = 4000
 
+NEAR_CELLS = 2.0
+"""A seed's own Newton step is shorter than this."""
+
+ROUGH_CELLS, STEEP = 8.0, 0.15
+"""Exact points are found where the misfit of the rendered shape makes the step shorter than this, or changes by more
+within a cell, as at an edge that hides something: there any step may be short."""
+
 
 class Caster(Protocol):
     """What the search needs of a rendering session."""
@@ -34,17 +43,20 @@ class Caster(Protocol):
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
         """Give the exact points on the rays of pixels (see `Session.cast`)."""
 
+    def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
+        """Give points and normals of the rendered shape on the rays of pixels (see `Session.cast_rendered`)."""
+
     def lit(self, positions: Array, light: int) -> Any:
         """Tell which points a light reaches (see `Session.lit`)."""
 
 
-def misfit(points: SurfacePoints, light: Array) -> Array:
+def misfit(position: Array, normal: Array, light: Array) -> Array:
     """Give the normal minus the bisector of the directions to light and camera, across the sightline.
 
     Parameters
     ----------
-    points : SurfacePoints
-        Camera frame.
+    position, normal : ndarray, shape (N, 3)
+        Points of a surface, mm, and its unit normals there, camera frame.
     light : ndarray, shape (3,)
         Camera frame, mm.
 
@@ -53,14 +65,13 @@ def misfit(points: SurfacePoints, light: Array) -> Array:
     ndarray, shape (N, 2)
         Zero exactly where the normal is the bisector; NaN where there is no surface.
     """
-    P = points.position
-    to_camera = -P / np.linalg.norm(P, axis=1, keepdims=True)
-    to_light = light - P
+    to_camera = -position / np.linalg.norm(position, axis=1, keepdims=True)
+    to_light = light - position
     to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
     bisector = to_camera + to_light
     bisector /= np.linalg.norm(bisector, axis=1, keepdims=True)
     first, second = tangent_basis(to_camera)
-    gap = points.normal - bisector
+    gap = normal - bisector
     return np.stack([np.sum(first * gap, axis=1), np.sum(second * gap, axis=1)], axis=1)
 
 
@@ -82,7 +93,8 @@ def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight
         The brightest first.
     """
     camera = session.camera
-    grid, places = _seed_grid(session, stride), session.scene.rig.true_mm()
+    places = session.scene.rig.true_mm()
+    grid = _seed_grid(session, stride, places)
     found = []
     for index, place in enumerate(places):
         seeds = _seeds(grid[0], grid[1], place, stride)
@@ -93,11 +105,53 @@ def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight
     return sorted(found, key=lambda highlight: -highlight.radiance)
 
 
-def _seed_grid(session: Caster, stride: int) -> tuple[Array, SurfacePoints]:
-    """Give pixel centres on a grid, shape (h, w, 2), with their exact points, flattened."""
+def _seed_grid(session: Caster, stride: int, places: Array) -> tuple[Array, SurfacePoints]:
+    """Give pixel centres on a grid, shape (h, w, 2), with exact points, flattened: those that seeds may come of.
+
+    The others' are NaN. Exact points cost tens of times what those of the rendered shape do, and seeds are few.
+    """
     camera = session.camera
     pixels = camera.pixel_centres()[stride // 2 :: stride, stride // 2 :: stride]
-    return pixels, session.cast(pixels.reshape(-1, 2))[0]
+    height, width = pixels.shape[:2]
+    centres = pixels.reshape(-1, 2)
+    asked = np.ones((height, width), dtype=bool)
+    if min(height, width) >= 3:
+        position, normal = session.cast_rendered(centres)
+        asked[:] = False
+        for place in places:
+            asked |= _may_be_near(misfit(position, normal, place).reshape(height, width, 2))
+    chosen = asked.ravel()
+    found = session.cast(centres[chosen])[0]
+    return pixels, SurfacePoints(**{f.name: _spread(getattr(found, f.name), chosen) for f in fields(found)})
+
+
+def _spread(values: Any, chosen: Any) -> Any:
+    """Give rows their places among all; the others' are NaN, or False."""
+    table = np.full((len(chosen), *values.shape[1:]), False if values.dtype == bool else np.nan, dtype=values.dtype)
+    table[chosen] = values
+    return table
+
+
+def _may_be_near(w: Array) -> Any:
+    """Tell on which pixels of a grid exact points are needed to know its seeds, shape (h, w)."""
+    along_x, along_y, step_x, step_y = _newton_steps(w)
+    with np.errstate(invalid="ignore"):
+        short = np.hypot(step_x, step_y) < ROUGH_CELLS
+        smooth = (np.abs(along_x) < STEEP).all(axis=-1) & (np.abs(along_y) < STEEP).all(axis=-1)
+    there = np.isfinite(w).all(axis=-1)
+    # The triangles' misfit is off by less than a cell's, and a step takes those beside its pixel.
+    around = np.ones((5, 5), np.uint8)
+    return cv2.dilate((there & (short | ~smooth)).astype(np.uint8), around) > 0
+
+
+def _newton_steps(w: Array) -> tuple[Array, Array, Array, Array]:
+    """Give the misfit's change per cell, twice shape (h, w, 2), and the step to its zero, cells, twice shape (h, w)."""
+    along_y, along_x = np.asarray(np.gradient(w, axis=0)), np.asarray(np.gradient(w, axis=1))
+    determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step_x = (along_y[..., 1] * w[..., 0] - along_y[..., 0] * w[..., 1]) / determinant
+        step_y = (along_x[..., 0] * w[..., 1] - along_x[..., 1] * w[..., 0]) / determinant
+    return along_x, along_y, step_x, step_y
 
 
 def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> Array:
@@ -105,13 +159,9 @@ def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> A
     height, width = pixels.shape[:2]
     if min(height, width) < 3:
         return np.empty((0, 2))
-    w = misfit(points, light).reshape(height, width, 2)
-    along_y, along_x = np.asarray(np.gradient(w, axis=0)), np.asarray(np.gradient(w, axis=1))
-    determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        step_x = (along_y[..., 1] * w[..., 0] - along_y[..., 0] * w[..., 1]) / determinant
-        step_y = (along_x[..., 0] * w[..., 1] - along_x[..., 1] * w[..., 0]) / determinant
-        near = np.hypot(step_x, step_y) < 2.0
+    _, _, step_x, step_y = _newton_steps(misfit(points.position, points.normal, light).reshape(height, width, 2))
+    with np.errstate(invalid="ignore"):
+        near = np.hypot(step_x, step_y) < NEAR_CELLS
     gain = np.minimum(np.abs(1 + points.distance * points.k_min), np.abs(1 + points.distance * points.k_max))
     near &= gain.reshape(height, width) > MIN_GAIN
     seeds = pixels[near] - stride * np.stack([step_x[near], step_y[near]], axis=1)
@@ -128,7 +178,8 @@ def _newton(session: Caster, seeds: Array, light: Array) -> Array:
         if not len(active):
             break
         stencil = (position[active, None, :] + offsets).reshape(-1, 2)
-        w = misfit(session.cast(stencil)[0], light).reshape(-1, 5, 2)
+        points = session.cast(stencil)[0]
+        w = misfit(points.position, points.normal, light).reshape(-1, 5, 2)
         along_x = (w[:, 1] - w[:, 2]) / (2 * DIFFERENCE_PX)
         along_y = (w[:, 3] - w[:, 4]) / (2 * DIFFERENCE_PX)
         J = np.stack([along_x, along_y], axis=-1)

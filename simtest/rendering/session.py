@@ -268,6 +268,24 @@ class Session:
         """
         return self._cast(*self.sightlines.in_model(points_px))
 
+    def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
+        """Cast rays through pixels onto the rendered shape.
+
+        Parameters
+        ----------
+        points_px : ndarray, shape (N, 2)
+            Pixel positions.
+
+        Returns
+        -------
+        position, normal : ndarray, shape (N, 3)
+            Points, mm, and shading normals, camera frame; NaN where the ray misses.
+        """
+        hits, shading, _ = self._hits(*self.sightlines.in_model(points_px))
+        distance = np.where(np.isfinite(hits.distance), hits.distance, np.nan)
+        position = self.camera.unproject(points_px) * distance[:, None]
+        return position, shading @ self.surface.model_from_camera[:3, :3]
+
     def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
         """Cast rays of the model frame (see `cast`); a direction of NaN hits nothing."""
         hits, shading, geometric = self._hits(origins, directions)

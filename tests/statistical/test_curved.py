@@ -1,14 +1,19 @@
 """Statistics over noise at sigma 5 %: `curved`, `bisector`, the choice of circle pose, and stated uncertainties."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from simtest.calibration import Calibration, Known
+from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.detection import detect
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
+from simtest.geometry import smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
@@ -40,6 +45,22 @@ def saddle(first, second):
     return {"type": "quadric", "k1_per_mm": first / D, "k2_per_mm": second / D, "spin_deg": 30.0}
 
 
+AROUND_PX = 24
+"""Margin of a crop around the region of interest: more than smoothing and noise's estimate reach."""
+
+
+def cropped(image, camera):
+    """Cut a frame and its camera to the surroundings of its one highlight: noise elsewhere is drawn for nothing."""
+    (region,) = detect(smooth(image, DEFAULT_SMOOTHING_PX), 0.0, isolated=False)
+    x, y, width, height = region.box
+    left, top = max(x - AROUND_PX, 0), max(y - AROUND_PX, 0)
+    part = image[top : y + height + AROUND_PX, left : x + width + AROUND_PX]
+    moved = replace(
+        camera, width=part.shape[1], height=part.shape[0], cx=camera.cx - left, cy=camera.cy - top,
+    )  # fmt: skip
+    return np.ascontiguousarray(part), moved
+
+
 class Bench:
     """Renders each surface once and puts noise on it."""
 
@@ -56,20 +77,22 @@ class Bench:
             self.session.update(scene)
             radiance = self.session.radiance()
             (highlight,) = self.session.highlights(radiance)
-            self.kept[key] = np.asarray(radiance.total / radiance.total.max()), highlight
+            image, camera = cropped(np.asarray(radiance.total / radiance.total.max()), self.session.camera)
+            self.kept[key] = image, camera, highlight
         return self.kept[key]
 
     def estimates(self, surface, estimators, known=LOBE, count=15, lights=({},)):
-        image, highlight = self.view(surface, list(lights))
+        image, camera, highlight = self.view(surface, list(lights))
         made = []
         for number in range(count):
             rng = generator(11, "curved", str(surface), number, Stage.SENSOR)
             frame = image + SIGMA * rng.standard_normal(image.shape, dtype=np.float32)
             told = known(number, highlight) if callable(known) else known
-            calibration = Calibration(self.session.camera, known=told)
+            calibration = Calibration(camera, known=told)
             # Every peak: this is about estimators, not about which peaks are looked at.
             (specularity,) = reconstruct(frame.astype(np.float32), calibration, estimators, isolated=False)
-            made.append(specularity.estimates)
+            # Without the contours, of which thousands would fill the memory.
+            made.append({key: replace(e, isophotes=()) for key, e in specularity.estimates.items()})
         return made, highlight
 
 
