@@ -10,8 +10,8 @@ from simtest.gate.records import PLACE
 from simtest.spec import Experiment, load_experiment
 from simtest.validation.runner import run_experiment
 
-CONTENT = {"paper": 200, "curvature": 130, "light_offset": 100, "sensor": 60, "compare": 40, "anatomy": 2}
-"""Realisations of each setting, by shipped experiment: 20,100 in all; an anatomy's are of each of 20 views."""
+CONTENT = {"paper": 320, "curvature": 60, "light_offset": 60, "compare": 40, "anatomy": 2}
+"""Realisations of each setting, by shipped experiment: 20,400 in all; an anatomy's are of each of 20 views."""
 
 SLOW = "inverse_rendering"
 """Left out: a second a realisation."""
