@@ -25,7 +25,7 @@ def alarms() -> str:
 
 def harmless() -> str:
     """Give the table of false alarms on changes that do no harm."""
-    rates = proof.harmless(load_bank(proof.bank_folder()))
+    rates = proof.harmless()
     return _table(("change", "false alarms", "size"), [(rate.name, _percent(rate), rate.about) for rate in rates])
 
 

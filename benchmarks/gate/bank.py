@@ -5,6 +5,7 @@ from pathlib import Path
 import polars as pl
 
 from simtest.engines import make_engine
+from simtest.files import write_atomically
 from simtest.gate.quantities import RESULT_COLUMNS
 from simtest.gate.records import PLACE
 from simtest.spec import Experiment, load_experiment
@@ -33,19 +34,22 @@ def load_bank(folder: Path) -> pl.DataFrame:
     Parameters
     ----------
     folder : Path
-        Holds a run of each experiment.
+        Holds bank.parquet, and while it is made a run of each experiment.
 
     Returns
     -------
     polars.DataFrame
         `COLUMNS`.
     """
-    engine = make_engine("local", WORKERS)
-    tables = [
-        run_experiment(experiment(name, count), folder / name, engine=engine).results.select(COLUMNS)
-        for name, count in CONTENT.items()
-    ]
-    return pl.concat(tables)
+    file = folder / "bank.parquet"
+    if not file.is_file():
+        engine = make_engine("local", WORKERS)
+        tables = [
+            run_experiment(experiment(name, count), folder / name, engine=engine).results.select(COLUMNS)
+            for name, count in CONTENT.items()
+        ]
+        write_atomically(file, pl.concat(tables).write_parquet)
+    return pl.read_parquet(file)
 
 
 def frames_of(rows: pl.DataFrame) -> int:
