@@ -11,7 +11,7 @@ from benchmarks.measuring import Figure
 NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
-ON_REQUEST = ("history", "detection", "dataset_png", "dataset_memory", "dataset_kills", "coverage")
+ON_REQUEST = ("history", "detection", "dataset_png", "dataset_memory", "dataset_kills", "coverage", "gate")
 """The same, run where they are named: they measure no speed, and take minutes."""
 
 

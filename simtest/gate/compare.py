@@ -102,7 +102,7 @@ def _tested(
     unmatched = names.height - len(found)
     if known_versions(baseline.run) != known_versions(tonight.run):
         found = frozenset()
-    every = quantities(limits)
+    every, named = quantities(limits), names.select(PLACE).to_dicts()
     made: list[dict[str, Any]] = []
     # Where all answered, the penalised mean is the mean: it would be tested twice.
     once = (pl.col("quantity") != PENALISED) | pl.col("place").is_in(_with_unanswered(before, after))
@@ -114,11 +114,11 @@ def _tested(
         shared, first, second = _matched(*(table.filter(pl.col("quantity") == name) for table in singles))
         tables.append((shared, unpaired(first, second, quantity), "unpaired"))
         for places, outcomes, method in tables:
-            rows = [_names(names, place) for place in places]
+            rows = [named[place] for place in places]
             made += _as_rows(rows, name, quantity, outcomes, method)
             made += _pooled_rows(rows, name, quantity, outcomes, method)
         if name != PENALISED:
-            made += _unanswerable(names, name, quantity, (before, after), {*own["place"], *shared})
+            made += _unanswerable(named, name, quantity, (before, after), {*own["place"], *shared})
     return _judged(made, limits), unmatched
 
 
@@ -137,10 +137,6 @@ def _matched(first: pl.DataFrame, second: pl.DataFrame) -> tuple[list[int], pl.D
     shared = sorted(set(first["place"].to_list()) & set(second["place"].to_list()))
     kept = [table.filter(pl.col("place").is_in(shared)).sort("place") for table in (first, second)]
     return shared, kept[0], kept[1]
-
-
-def _names(names: pl.DataFrame, place: int) -> dict[str, Any]:
-    return {name: names[name][place] for name in PLACE}
 
 
 def _as_rows(
@@ -188,7 +184,7 @@ def _pooled_rows(
 
 
 def _unanswerable(
-    names: pl.DataFrame, name: str, quantity: Quantity, nights: Iterable[Numbered], tested: set[int]
+    named: list[dict[str, Any]], name: str, quantity: Quantity, nights: Iterable[Numbered], tested: set[int]
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Give the places where a quantity is known in one night alone, or in both but of no pair."""
     table = "frames" if name == "false" else "rows"
@@ -203,7 +199,7 @@ def _unanswerable(
         if quantity.falls:
             before, after = (None if value is None else 1 - value for value in (before, after))
         values = {"baseline": before, "tonight": after, "unit": quantity.unit, "method": "none"}
-        made.append({**_names(names, place), "quantity": name, **values, "settled": outcome})
+        made.append({**named[place], "quantity": name, **values, "settled": outcome})
     return made
 
 

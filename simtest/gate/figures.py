@@ -83,8 +83,10 @@ def _figure(
     quantity: str, unit: str, value: float | None, n: int, low: float | None = None, high: float | None = None,
     about: str = "",
 ) -> dict[str, Any]:  # fmt: skip
-    number = None if value is None else float(value)
-    return {"quantity": quantity, "unit": unit, "value": number, "low": low, "high": high, "n": n, "about": about}
+    known = {"value": value, "low": low, "high": high}
+    # An answer without a number makes a figure of its place unknown, not no number.
+    finite = {name: float(v) if v is not None and np.isfinite(v) else None for name, v in known.items()}
+    return {"quantity": quantity, "unit": unit, **finite, "n": n, "about": about}
 
 
 def _share(quantity: str, count: int, n: int) -> dict[str, Any]:

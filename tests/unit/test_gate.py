@@ -1,0 +1,249 @@
+"""The gate's verdict on nights that were made up: every kind of change has its stated outcome."""
+
+import numpy as np
+import polars as pl
+import pytest
+from gate_nights import changed, night, raised, rows
+
+from simtest.gate.compare import compare
+from simtest.gate.figures import digest, setting_figures
+from simtest.gate.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
+
+FIRST_12 = pl.col("realisation") < 12
+
+
+def one(verdict, quantity, **place):
+    found = verdict.comparisons.filter(pl.col("quantity") == quantity, setting=place.pop("setting", "a"), **place)
+    assert found.height == 1, verdict.comparisons
+    return found.row(0, named=True)
+
+
+def test_the_same_night_is_the_same_without_a_test():
+    table = rows(estimators=("cone_axis", "circle_pose"), settings=("a", "b"))
+    verdict = compare(night(table), night(table.sample(fraction=1, shuffle=True, seed=3)))
+    assert (verdict.state, verdict.bit_equal, verdict.notes) == ("fine", True, ())
+    assert set(verdict.comparisons["outcome"]) == {"same"}
+    assert set(verdict.comparisons["method"]) == {"equal"}
+    assert verdict.comparisons["p"].null_count() == verdict.comparisons.height
+
+
+def test_a_rise_of_one_estimator_is_worse_and_of_no_other():
+    table = rows(estimators=("cone_axis", "circle_pose"), settings=("a", "b"))
+    verdict = compare(night(raised(table, 1.1)), night(table))
+    assert verdict.state == "regression"
+    assert not verdict.bit_equal
+    assert set(verdict.regressions["estimator"]) == {"cone_axis"}
+    assert set(verdict.regressions["quantity"]) == {"mean_deg"}
+    row = one(verdict, "mean_deg", estimator="cone_axis")
+    assert row["difference"] == pytest.approx(0.1 * row["baseline"])
+    assert row["low"] < row["difference"] < row["high"]
+    assert row["margin"] == pytest.approx(0.02 * row["baseline"])
+    assert (row["method"], row["n"]) == ("paired", 20)
+    better = compare(night(table), night(raised(table, 1.1)))
+    assert better.state == "fine"
+    assert one(better, "mean_deg", estimator="cone_axis")["outcome"] == "better"
+
+
+def test_a_rise_within_the_margin_is_equivalent():
+    small = rows(level=0.01)
+    assert one(compare(night(raised(small, 1.1)), night(small)), "mean_deg")["outcome"] == "equivalent"
+    large = rows()
+    assert one(compare(night(raised(large, 1.015)), night(large)), "mean_deg")["outcome"] == "equivalent"
+
+
+def test_another_rounding_is_equivalent_and_said():
+    table = rows()
+    verdict = compare(night(raised(table, 1 + 1e-7), processor="two"), night(table))
+    assert verdict.state == "fine"
+    assert set(verdict.comparisons["outcome"]) == {"equivalent"}
+    assert verdict.notes[0] == "The processor changed from one to two."
+    assert verdict.notes[1].startswith("Medians agree to 0.001 deg at 1 of 1 places")
+    assert "0 differ in status" in verdict.notes[2]
+
+
+def test_answers_that_fail_do_not_vanish():
+    table = rows()
+    failed = changed(table, FIRST_12, status="no_closed_isophote", error_deg=None, mahalanobis2=None, axis_ratio=None)
+    verdict = compare(night(failed), night(table))
+    assert one(verdict, "unanswered")["outcome"] == "worse"
+    assert one(verdict, "unanswered")["tonight"] == pytest.approx(0.6)
+    assert one(verdict, "mean_penalised_deg")["difference"] == pytest.approx(0.6 * 90, abs=1)
+    assert one(verdict, "mean_penalised_deg")["outcome"] == "worse"
+    # Of those that both nights answered, nothing changed.
+    assert one(verdict, "mean_deg")["outcome"] == "equivalent"
+    assert "12 differ in status, 12 of them answered in the baseline alone and 0 tonight alone" in verdict.notes[-1]
+
+
+def test_a_place_without_any_answer():
+    table = rows()
+    none = changed(table, True, status="no_peak", error_deg=None, mahalanobis2=None, axis_ratio=None)
+    gone = compare(night(none), night(table))
+    assert one(gone, "mean_deg")["outcome"] == "gone"
+    assert one(gone, "coverage95")["outcome"] == "gone"
+    assert one(gone, "unanswered")["outcome"] == "worse"
+    other = changed(none, FIRST_12, status="missed")
+    both = compare(night(other), night(none))
+    assert both.state == "fine"
+    assert one(both, "unanswered")["outcome"] == "equivalent"
+    assert one(both, "mean_penalised_deg")["difference"] == 0
+    assert both.comparisons.filter(quantity="mean_deg").is_empty()
+
+
+def test_an_error_that_is_no_number_is_no_answer():
+    table = rows()
+    broken = changed(table, FIRST_12, error_deg=float("nan"))
+    verdict = compare(night(broken), night(table))
+    assert one(verdict, "unanswered")["tonight"] == pytest.approx(0.6)
+    assert np.isfinite(one(verdict, "mean_penalised_deg")["tonight"])
+
+
+def test_one_realisation_decides_nothing_but_that_nothing_changed():
+    table = rows(count=1)
+    verdict = compare(night(raised(table, 2.0)), night(table))
+    row = one(verdict, "mean_deg")
+    assert (row["outcome"], row["p"], row["low"], row["high"]) == ("undecided", None, None, None)
+    assert one(compare(night(raised(table, 1.01)), night(table)), "mean_deg")["outcome"] == "equivalent"
+
+
+def test_many_settings_decide_where_one_cannot():
+    settings = tuple("abcdefghijklmnopqrst")
+    table = rows(count=1, settings=settings, estimators=("cone_axis", "curved"))
+    verdict = compare(night(raised(table, 1.1)), night(table))
+    pooled = one(verdict, "mean_deg", setting=POOLED, estimator="cone_axis")
+    assert (pooled["outcome"], pooled["unit"], pooled["baseline"]) == ("worse", "x", 1.0)
+    assert pooled["tonight"] == pytest.approx(1.1, abs=0.01)
+    assert set(verdict.regressions["setting"]) == {POOLED}
+
+
+def test_places_that_one_night_lacks():
+    table = rows(settings=("a", "b"))
+    verdict = compare(night(table.filter(setting="b")), night(table.filter(setting="a")))
+    outcomes = dict(verdict.comparisons.select("setting", "outcome").iter_rows())
+    assert outcomes == {"a": "gone", "b": "new"}
+    assert not verdict.bit_equal
+
+
+@pytest.mark.parametrize("cause", ["seeds", "versions", "fewer"])
+def test_without_exact_pairs_the_test_is_unpaired(cause):
+    table, run = rows(), {}
+    other = rows(seed=1) if cause == "seeds" else table.head(15) if cause == "fewer" else raised(table, 1 + 1e-9)
+    if cause == "versions":
+        run = {"versions": {"numpy": "2.5", "simtest": "0.1"}}
+    verdict = compare(night(other, **run), night(table))
+    assert set(verdict.comparisons["method"]) == {"unpaired"}
+    assert verdict.state == "fine"
+    told = "Versions changed from numpy 2.4 to numpy 2.5" if cause == "versions" else "of 1 places are not those"
+    assert told in verdict.notes[0]
+    worse = compare(night(raised(other, 3.0), **run), night(table))
+    assert one(worse, "mean_deg")["outcome"] == "worse"
+    better = compare(night(raised(other, 0.3), **run), night(table))
+    assert one(better, "mean_deg")["outcome"] == "better"
+
+
+def test_a_new_version_of_simtest_itself_leaves_pairs_pairs():
+    table = rows()
+    verdict = compare(night(raised(table, 1.1), versions={"numpy": "2.4", "simtest": "0.2"}), night(table))
+    assert set(verdict.comparisons["method"]) == {"paired"}
+
+
+def test_false_detections_are_counted_by_frames():
+    table = rows()
+    false = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)
+    verdict = compare(night(pl.concat([table, false])), night(table))
+    row = one(verdict, "false")
+    assert (row["outcome"], row["baseline"], row["tonight"]) == ("worse", 0.0, 1.0)
+    assert set(verdict.regressions["quantity"]) == {"false"}
+    assert "20 have another number of detections" in verdict.notes[-1]
+
+
+def test_coverage_is_worse_where_it_falls():
+    table = changed(rows(), True, mahalanobis2=1.0)
+    verdict = compare(night(changed(table, FIRST_12, mahalanobis2=50.0)), night(table))
+    row = one(verdict, "coverage95")
+    assert (row["outcome"], row["baseline"]) == ("worse", 1.0)
+    assert row["tonight"] == pytest.approx(0.4)
+    assert row["low"] < row["difference"] < row["high"] < 0
+
+
+def test_the_axis_ratio_is_held_to_its_law():
+    table = rows()
+    verdict = compare(night(changed(table, True, axis_ratio=0.6)), night(table))
+    assert set(verdict.regressions["quantity"]) == {"axis_ratio"}
+    # A law of 0 says nothing.
+    flat = changed(table, True, axis_ratio_law=0.0)
+    assert compare(night(changed(flat, True, axis_ratio=0.6)), night(flat)).state == "fine"
+
+
+def test_canaries_are_judged_without_a_baseline():
+    table = rows()
+    fine = compare(night(table, canaries=[("bird", 0.5, 1.0)]), None)
+    assert (fine.state, fine.bit_equal, fine.baseline) == ("no baseline", None, None)
+    assert fine.comparisons.row(0, named=True)["outcome"] == "new"
+    for value in (2.0, None):
+        dead = compare(night(table, canaries=[("bird", value, 1.0)]), None)
+        assert dead.state == "regression"
+        assert dead.regressions["experiment"].to_list() == ["bird"]
+    assert compare(night(table, canaries=[("bird", 2.0, 1.0)]), night(table)).state == "regression"
+    gone = compare(night(table), night(table, canaries=[("bird", 0.5, 1.0)]))
+    assert gone.comparisons.filter(experiment="bird")["outcome"].to_list() == ["gone"]
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "low", "high", "outcome"),
+    [
+        ("run_time", 2.0, 1.9, 2.1, "worse"),
+        ("run_time", 1.55, 1.4, 1.7, "undecided"),
+        ("run_time", 1.3, 1.2, 1.4, "equivalent"),
+        ("run_time", 0.3, 0.2, 0.4, "better"),
+        ("run_time", 1.0, 0.9, 1.1, "same"),
+        ("peak_memory", 1.3, None, None, "worse"),
+        ("peak_memory", 1.2, None, None, "equivalent"),
+        ("run_time", None, None, None, "gone"),
+    ],
+)
+def test_costs_have_margins_of_their_own(quantity, value, low, high, outcome):
+    table = rows()
+    interval = (0.9, 1.1) if quantity == "run_time" else (None, None)
+    before = night(table, costs=[("piece", quantity, 1.0, *interval)])
+    verdict = compare(night(table, costs=[("piece", quantity, value, low, high)]), before)
+    assert verdict.comparisons.filter(experiment="piece")["outcome"].to_list() == [outcome]
+    assert verdict.state == ("regression" if outcome == "worse" else "fine")
+
+
+def test_tables_keep_to_their_columns():
+    table = rows(estimators=("cone_axis", "curved"))
+    figures = setting_figures(table)
+    assert dict(figures.schema) == FIGURES
+    comparisons = compare(night(raised(table, 1.1)), night(table)).comparisons
+    assert dict(comparisons.schema) == COMPARISONS
+    assert set(comparisons["outcome"]) <= set(OUTCOMES)
+    empty = rows(count=0)
+    assert compare(night(empty), night(empty)).state == "fine"
+
+
+def test_figures_of_a_place():
+    table = rows(count=4)
+    table = changed(
+        table, pl.col("realisation") == 3, status="missed", error_deg=None, mahalanobis2=None, axis_ratio=None
+    )
+    table = changed(table, pl.col("realisation") == 0, mahalanobis2=99.0)
+    found = setting_figures(table)
+    values = dict(found.select("quantity", "value").iter_rows())
+    assert (values["n"], values["n_ok"], values["missed"], values["failed"], values["false"]) == (4, 3, 0.25, 0, 0)
+    assert values["coverage95"] <= 2 / 3
+    assert values["mean_penalised_deg"] == pytest.approx((3 * values["mean_deg"] + 90) / 4)
+    share = found.filter(quantity="missed").row(0, named=True)
+    # Clopper and Pearson's interval of 1 in 4.
+    assert (share["low"], share["high"]) == (pytest.approx(0.0063, abs=1e-4), pytest.approx(0.8059, abs=1e-4))
+    assert found["digest"].n_unique() == 1
+
+
+def test_the_hash_is_that_of_the_numbers():
+    table = rows(count=5)
+    assert digest(table) == digest(table.reverse())
+    next_number = np.nextafter(table["error_deg"][2], 9)
+    assert digest(table) != digest(changed(table, pl.col("realisation") == 2, error_deg=next_number))
+    nothing = changed(table, pl.col("realisation") == 2, choice_margin=0.0)
+    assert digest(nothing) != digest(table)
+    assert digest(changed(table, True, flags="12 points")) == digest(table)
+    assert digest(changed(table, pl.col("realisation") == 1, status="missed")) != digest(table)
