@@ -103,7 +103,7 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
 
 
 def _names(column: pl.Series) -> list[str]:
-    return [str(name) for name in column.drop_nulls().unique(maintain_order=True)]
+    return [str(name) for name in column.drop_nulls().unique(maintain_order=True) if name]
 
 
 def _estimators(night: Night, verdict: Verdict, items: Iterable[GalleryItem], past: Trends | None) -> list[str]:

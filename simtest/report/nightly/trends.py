@@ -88,7 +88,7 @@ def trends(history: pl.DataFrame, night: Night, budget: int = BUDGET_BYTES) -> T
     rows, nights = _numbered(rows)
     keys, values = _matrix(rows, nights.height)
     keys, values = _with_medians(_named(keys), values)
-    shown = _room(values.shape[0], values.shape[1], budget)
+    shown = _room(values, budget)
     left_out = nights.height - shown
     values, nights = values[:, left_out:], nights.slice(left_out)
     seen = np.asarray(np.isfinite(values).any(axis=1))
@@ -139,6 +139,8 @@ def _matrix(rows: pl.DataFrame, nights: int) -> tuple[pl.DataFrame, Array]:
 def _named(keys: pl.DataFrame) -> pl.DataFrame:
     """Give what the curves are called: costs stand together, each experiment a curve."""
     cost = pl.col("kind") == "cost"
+    # A name that does not apply is null or empty.
+    keys = keys.with_columns(pl.col(pl.String).replace("", None))
     named = keys.with_columns(
         estimator=pl.coalesce("estimator", pl.when(cost).then("experiment"), pl.lit("all")),
         experiment=pl.when(cost).then(pl.lit(COSTS)).otherwise(pl.coalesce("experiment", pl.lit("all"))),
@@ -172,18 +174,25 @@ def _median(values: Array) -> Array:
     return made
 
 
-def _room(curves: int, nights: int, budget: int) -> int:
+def _changing(values: Array) -> Mask:
+    """Tell which curves are no level lines: the others need no values."""
+    return np.asarray(np.nanmax(values, axis=1) > np.nanmin(values, axis=1))
+
+
+def _room(values: Array, budget: int) -> int:
     """Give for how many nights there is room where each curve has the least number of points."""
-    left = budget - curves * (_NAMES_BYTES + 2 * LEAST_POINTS * 4 / 3)
-    return int(min(nights, max(left / (curves / 6 + _NIGHT_BYTES), LEAST_POINTS)))
+    curves, nights = values.shape
+    changing = int(np.count_nonzero(_changing(values)))
+    left = budget - curves * _NAMES_BYTES - changing * LEAST_POINTS * 8 / 3
+    return int(min(nights, max(left / (changing / 6 + _NIGHT_BYTES), LEAST_POINTS)))
 
 
 def _points(values: Array, budget: int) -> int:
     """Give how many points a curve may have: 2 bytes each, and a bit a night; 4 characters hold 3 bytes."""
     curves, nights = values.shape
-    changing = int(np.count_nonzero(np.nanmax(values, axis=1) > np.nanmin(values, axis=1)))
-    left = budget - curves * (_NAMES_BYTES + nights / 6) - nights * _NIGHT_BYTES
-    return int(np.clip(left / (2 * 4 / 3 * max(changing, 1)), LEAST_POINTS, MOST_POINTS))
+    changing = max(int(np.count_nonzero(_changing(values))), 1)
+    left = budget - curves * _NAMES_BYTES - changing * nights / 6 - nights * _NIGHT_BYTES
+    return int(np.clip(left / (changing * 8 / 3), LEAST_POINTS, MOST_POINTS))
 
 
 def _thinned(values: Array, points: int) -> Mask:
@@ -204,7 +213,7 @@ def _thinned(values: Array, points: int) -> Mask:
     # A stretch without a value gives its first night, which is not held.
     for lowest in (np.where(np.isnan(stretches), np.inf, stretches), np.where(np.isnan(stretches), np.inf, -stretches)):
         np.put_along_axis(kept, np.minimum(lowest.argmin(axis=2) + first, old - 1), True, axis=1)
-    return np.asarray(kept & held)
+    return np.asarray(np.where(_changing(values)[:, None], kept, True) & held)
 
 
 def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame) -> dict[str, Any]:
@@ -213,6 +222,8 @@ def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame)
     span = np.where(high > low, high - low, 1.0)[:, None]
     codes = np.rint((values - low[:, None]) / span * 65535)
     coded = kept & (high > low)[:, None]
+    # Most curves of quiet nights have the same points.
+    masks, mask_of = np.unique(np.packbits(kept, axis=1), axis=0, return_inverse=True)
     return {
         "nights": {
             "started": nights["started"].dt.strftime("%Y-%m-%dT%H:%M:%SZ").to_list(),
@@ -223,7 +234,8 @@ def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame)
         "series": {name: _places(keys[name], names[name]) for name in keys.columns},
         "low": [float(f"{v:.7g}") for v in low],
         "high": [float(f"{v:.7g}") for v in high],
-        "kept": _text(np.packbits(kept, axis=1)),
+        "kept": _text(masks),
+        "kept_of": mask_of.ravel().tolist(),
         "values": _text(codes[coded].astype("<u2")),
     }
 
