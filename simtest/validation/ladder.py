@@ -210,9 +210,7 @@ class Rung:
         return mean_interval(self.errors_deg)
 
 
-def error_ladder(
-    scenes: Sequence[ClosedScene] = SCENES, realisations: int = REALISATIONS, seed: int = 0
-) -> list[Rung]:
+def error_ladder(scenes: Sequence[ClosedScene] = SCENES, realisations: int = REALISATIONS, seed: int = 0) -> list[Rung]:
     """Compute the ladder of each scene and estimator.
 
     Parameters

@@ -11,7 +11,7 @@ from simtest.report.nightly.extras import Extras
 from simtest.report.run import GalleryItem, read_item
 
 MOST_CASES = 12
-PICTURE_BYTES = 60_000
+PICTURE_BYTES = 48_000
 
 
 def read_cases(extras: Extras) -> tuple[list[GalleryItem], list[str]]:

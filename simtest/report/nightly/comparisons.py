@@ -9,7 +9,7 @@ from simtest.gate.records import Verdict
 from simtest.report.nightly.words import MEANINGS, interval, measure, scaled, signed
 from simtest.report.style import number
 
-MOST_ROWS = 1200
+MOST_ROWS = 800
 """Rows of the table; what is equal or equivalent is left out first. verdict.json holds all."""
 
 

@@ -17,7 +17,7 @@ from simtest.report.nightly.comparisons import comparisons
 from simtest.report.nightly.errors import error_figures
 from simtest.report.nightly.extras import Extras
 from simtest.report.nightly.ladder import ladder, marks_of
-from simtest.report.nightly.trends import LADDER, MEDIAN, NEWEST, Trends, trends
+from simtest.report.nightly.trends import MEDIAN, NEWEST, Trends, trends
 from simtest.report.run import GalleryItem
 
 NO_EXTRAS = Extras()
@@ -103,7 +103,7 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
 
 
 def _names(column: pl.Series) -> list[str]:
-    return [str(name) for name in column.drop_nulls().unique(maintain_order=True)]
+    return [str(name) for name in column.drop_nulls().unique(maintain_order=True) if name]
 
 
 def _estimators(night: Night, verdict: Verdict, items: Iterable[GalleryItem], past: Trends | None) -> list[str]:
@@ -132,5 +132,5 @@ def _trends_section(past: Trends, verdict: Verdict, colours: dict[str, str]) -> 
     }
     return {
         "nights": past.nights, "points": past.points, "thinned": past.nights > past.points, "newest": NEWEST,
-        "data": Markup(script_json(data)), "ladder": LADDER,
+        "left_out": past.left_out, "data": Markup(script_json(data)),
     }  # fmt: skip

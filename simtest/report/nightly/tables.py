@@ -6,7 +6,7 @@ import polars as pl
 from scipy.stats import chi2
 
 from simtest.gate.records import Night, Verdict
-from simtest.report.nightly.words import interval, measure
+from simtest.report.nightly.words import bounds, interval, measure
 from simtest.report.style import estimator_order
 from simtest.report.words import flattened
 
@@ -21,7 +21,7 @@ def canaries(night: Night) -> list[dict[str, Any]]:
         {
             "name": row["experiment"] or "–", "quantity": row["quantity"] or "–", "about": row["about"] or "",
             "value": measure(row["value"], row["unit"]), "passed": row["passed"], "sort": row["value"],
-            "allowed": interval(row["low"], row["high"], row["unit"]), "where": row["setting"] or row["label"] or "",
+            "allowed": bounds(row["low"], row["high"], row["unit"]), "where": row["setting"] or row["label"] or "",
         }
         for row in rows.iter_rows(named=True)
     ]  # fmt: skip

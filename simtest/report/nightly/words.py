@@ -74,6 +74,15 @@ def interval(low: float | None, high: float | None, unit: str | None = "") -> st
     return f"{number(scaled(low, unit))} to {number(scaled(high, unit))}".replace("-", "−")
 
 
+def bounds(low: float | None, high: float | None, unit: str | None = "") -> str:
+    """Write what a value may be."""
+    if low is not None and low == high:
+        return f"exactly {number(scaled(low, unit))}"
+    if number(high) == "–":
+        return "–" if number(low) == "–" else f"at least {number(scaled(low, unit))}"
+    return f"at most {number(scaled(high, unit))}" if number(low) == "–" else interval(low, high, unit)
+
+
 def headline(verdict: Verdict) -> str:
     """Say in one sentence what the gate says of the night."""
     if verdict.state != "regression":

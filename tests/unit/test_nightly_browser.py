@@ -1,0 +1,195 @@
+"""The nightly page in a real browser: Chromium of the system, driven by playwright."""
+
+import shutil
+from datetime import UTC, datetime
+
+import pytest
+from test_nightly_page import rows_of
+from test_report import make_item
+
+from benchmarks.nights import history_of, night_of, verdict_of
+from simtest.report.nightly import Extras, write_nightly_page
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: browser)")
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system")
+
+DESKTOP, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 844}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("browser")
+    night = night_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
+    make_item(folder / "worst-00.npz", detail=3)
+    extras = Extras(gallery=(folder / "worst-00.npz",))
+    page = write_nightly_page(folder / "page", night, verdict_of(night), history_of(night, 30), extras)
+    return page.as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def opened(browser, address):
+    """Open the page; afterwards, nothing may have complained and nothing been asked of the network."""
+    complaints, asked, contexts = [], [], []
+
+    def opener(viewport=DESKTOP, **more):
+        contexts.append(browser.new_context(viewport=viewport, **more))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(60_000)
+        page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(address)
+        page.wait_for_selector("#trend-chart .main-svg")
+        return page
+
+    yield opener
+    for context in contexts:
+        context.close()
+    assert complaints == []
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def visible_rows(page):
+    return page.locator("#comparisons tbody tr:visible")
+
+
+def test_all_plots_are_drawn_where_the_reader_comes_by(opened):
+    page = opened()
+    for box in page.locator("[data-chart]:visible").all():
+        box.scroll_into_view_if_needed()
+        box.locator(".main-svg").first.wait_for()
+        assert box.locator(".scatterlayer .trace").count() > 0
+    assert page.locator("#trend-chart .scatterlayer .trace").count() == 3
+
+
+def test_filters_choose_rows_and_say_how_many(opened):
+    page = opened()
+    outcomes = set(page.locator("#comparisons tbody tr:visible td:first-child").all_inner_texts())
+    assert outcomes
+    assert not outcomes & {"same", "equivalent"}
+    page.select_option("#filter-outcome", "worse")
+    page.select_option("#filter-estimator", "cone_axis")
+    shown = visible_rows(page)
+    assert shown.count() > 0
+    for row in shown.all():
+        assert row.locator("td").nth(0).inner_text().endswith("worse")
+        assert row.locator("td").nth(3).inner_text() == "cone_axis"
+    assert f"Showing {shown.count()} of {shown.count()} figures that fit" in page.inner_text("#filtered")
+    page.select_option("#filter-outcome", "")
+    page.select_option("#filter-estimator", "")
+    assert visible_rows(page).count() == 100
+    page.click("#more")
+    assert visible_rows(page).count() > 100
+
+
+def test_headings_sort_what_the_filters_left(opened):
+    page = opened()
+    page.select_option("#filter-outcome", "worse")
+    before = visible_rows(page).count()
+    head = page.locator("#comparisons thead button", has_text="difference")
+    head.focus()
+    page.keyboard.press("Enter")
+    values = [
+        float(cell.get_attribute("data-v"))
+        for cell in page.locator("#comparisons tbody tr:visible td:nth-child(6)").all()
+    ]
+    assert values == sorted(values, reverse=True)
+    assert len(values) == before
+    assert page.locator("#comparisons th[aria-sort=descending]").count() == 1
+
+
+def test_a_row_leads_to_its_trend(opened):
+    page = opened()
+    row = visible_rows(page).nth(2)
+    experiment, setting, quantity = (row.locator("td").nth(i).inner_text() for i in (1, 2, 4))
+    row.locator("a.trend").click()
+    assert page.inner_text("#trend-shown") == f"{experiment}, {setting}, {quantity}"
+    assert page.evaluate("location.hash") == "#trends"
+    assert page.input_value("#trend-setting") == setting
+    newest = page.evaluate("document.getElementById('trend-chart').data[0].x.at(-1)")
+    assert newest == "2026-03-01T02:30:00Z"
+    page.select_option("#trend-period", "30")
+    assert page.evaluate("document.getElementById('trend-chart').layout.xaxis.range[0]").startswith("2026-01-30")
+
+
+def test_hover_tells_commit_and_night(opened):
+    page = opened()
+    page.locator("#trend-chart").scroll_into_view_if_needed()
+    place = page.evaluate(
+        """() => {
+          const box = document.getElementById("trend-chart"), trace = box.data[0], {xaxis, yaxis} = box._fullLayout;
+          const area = box.getBoundingClientRect();
+          return [area.x + xaxis._offset + xaxis.d2p(trace.x[5]), area.y + yaxis._offset + yaxis.d2p(trace.y[5])];
+        }"""
+    )
+    page.mouse.move(place[0] - 30, place[1])
+    page.mouse.move(*place, steps=4)
+    told = page.locator("#trend-chart .hoverlayer .hovertext")
+    told.first.wait_for()
+    commit = page.evaluate("document.getElementById('trend-chart').data[0].customdata[5][0]")
+    assert commit in told.first.text_content()
+    assert "UTC" in told.first.text_content()
+
+
+def test_links_lead_to_their_sections(opened):
+    page = opened()
+    links = page.locator("nav a")
+    assert links.count() > 6
+    for link in links.all():
+        target = link.get_attribute("href")
+        link.click()
+        page.wait_for_function(
+            "id => Math.abs(document.querySelector(id).getBoundingClientRect().top) < innerHeight", arg=target
+        )
+
+
+def test_one_experiment_is_shown_at_a_time(opened):
+    page = opened()
+    choice = page.locator("[data-switch=curvature]")
+    shown = page.locator("figure[data-of=curvature]:visible")
+    assert shown.count() == 1
+    last = choice.locator("option").last.get_attribute("value")
+    choice.select_option(last)
+    assert shown.count() == 1
+    assert shown.first.get_attribute("data-key") == last
+    shown.scroll_into_view_if_needed()
+    shown.locator(".main-svg").first.wait_for()
+
+
+def test_a_phone_needs_no_sideways_scrolling(opened):
+    page = opened(PHONE, is_mobile=True, has_touch=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    assert visible_rows(page).first.locator("td").nth(6).is_visible()
+
+
+def test_dark_colours_reach_the_plots(opened):
+    page = opened(color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 23, 27)"
+    assert page.evaluate("document.getElementById('trend-chart').layout.font.color") == "#e7eaee"
+    page.emulate_media(color_scheme="light")
+    page.wait_for_function("document.getElementById('trend-chart').layout.font.color === '#1b1f24'")
+
+
+def test_paper_shows_what_was_folded_and_no_buttons(opened):
+    page = opened(color_scheme="dark")
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    # The headings that sort are buttons too, but look like text.
+    assert page.locator(":not(th) > button:visible, select:visible, nav:visible").count() == 0
+    assert page.locator("details:not(.nights):not([open])").count() == 0
+    for box in page.locator("[data-chart]:visible").all():
+        box.locator(".main-svg").first.wait_for()
+        assert box.evaluate("box => box.layout.font.color") == "#1b1f24"
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.evaluate("document.getElementById('trend-chart').layout.font.color") == "#e7eaee"
