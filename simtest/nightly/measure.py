@@ -64,6 +64,8 @@ def measure_night(
         If an experiment is malformed or cannot be run.
     """
     started, clock = datetime.now(UTC), time.monotonic()
+    # Told at the start: the checkout may have moved on before the night ends.
+    origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
     experiments = experiments_of(profile)
     steps = _Steps(progress, sum(case.realisations for experiment in experiments for case in expand(experiment)))
     with PeakMemory(os.getpid(), _LOOK_S) as peak:
@@ -90,8 +92,7 @@ def measure_night(
         "experiments_s": round(took_s, 1),
         "workers": workers,
         "command": command,
-        **provenance.environment(),
-        "source_hash": provenance.source_hash(),
+        **origin,
         "variant": backend.requested_variant(variant),
         "llvm": backend.library_in_use(),
     }
