@@ -14,7 +14,7 @@ from simtest.engines.base import Engine
 from simtest.gate.records import FIGURES, Night
 from simtest.measuring import PeakMemory
 from simtest.nightly import cost
-from simtest.nightly.pending import run_canaries, setting_figures
+from simtest.nightly.pending import ladder_figures, run_canaries, setting_figures
 from simtest.rendering import backend
 from simtest.spec import Profile, experiments_of
 from simtest.validation.cases import expand
@@ -78,7 +78,7 @@ def measure_night(
         figures = [setting_figures(rows)]
         if profile.canaries:
             steps.tell("canaries")
-            figures.append(run_canaries(rows, variant))
+            figures += [run_canaries(rows, variant), ladder_figures()]
     if profile.costs:
         steps.tell("costs")
         figures += [cost.run_times(variant), cost.memory(peak.peak_mib, workers)]
