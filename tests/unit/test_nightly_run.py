@@ -27,6 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked wit
 
 SMALL = """
 title = "Small"
+canaries = false
 [[experiments]]
 experiment = "planes.toml"
 [[experiments]]
