@@ -14,7 +14,7 @@ from simtest.engines.base import Engine
 from simtest.gate.records import FIGURES, Night
 from simtest.measuring import PeakMemory
 from simtest.nightly import cost
-from simtest.nightly.pending import run_canaries, setting_figures
+from simtest.nightly.pending import ladder_figures, run_canaries, setting_figures
 from simtest.rendering import backend
 from simtest.spec import Profile, experiments_of
 from simtest.validation.cases import expand
@@ -64,6 +64,8 @@ def measure_night(
         If an experiment is malformed or cannot be run.
     """
     started, clock = datetime.now(UTC), time.monotonic()
+    # Told at the start: the checkout may have moved on before the night ends.
+    origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
     experiments = experiments_of(profile)
     steps = _Steps(progress, sum(case.realisations for experiment in experiments for case in expand(experiment)))
     with PeakMemory(os.getpid(), _LOOK_S) as peak:
@@ -76,7 +78,7 @@ def measure_night(
         figures = [setting_figures(rows)]
         if profile.canaries:
             steps.tell("canaries")
-            figures.append(run_canaries(rows, variant))
+            figures += [run_canaries(rows, variant), ladder_figures()]
     if profile.costs:
         steps.tell("costs")
         figures += [cost.run_times(variant), cost.memory(peak.peak_mib, workers)]
@@ -90,8 +92,7 @@ def measure_night(
         "experiments_s": round(took_s, 1),
         "workers": workers,
         "command": command,
-        **provenance.environment(),
-        "source_hash": provenance.source_hash(),
+        **origin,
         "variant": backend.requested_variant(variant),
         "llvm": backend.library_in_use(),
     }

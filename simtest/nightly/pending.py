@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import polars as pl
 
 from simtest.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.spec import Experiment
 
 
 def _module(name: str) -> ModuleType | None:
@@ -40,6 +42,22 @@ def run_canaries(rows: pl.DataFrame, variant: str | None) -> pl.DataFrame:
     if module := _module("simtest.nightly.canaries"):
         return module.run_canaries(rows, variant)
     return pl.DataFrame(schema=FIGURES)
+
+
+def ladder_figures() -> pl.DataFrame:
+    """Compute the error ladder."""
+    if module := _module("simtest.nightly.ladder"):
+        return module.ladder_figures()
+    return pl.DataFrame(schema=FIGURES)
+
+
+def worst_cases(
+    rows: pl.DataFrame, worse: pl.DataFrame, experiments: Sequence[Experiment], folder: Path, variant: str | None
+) -> tuple[Path, ...]:
+    """Make the worst cases again; gives their files."""
+    if module := _module("simtest.validation.worst"):
+        return module.save_worst(module.worst_cases(rows, worse), experiments, folder, variant)
+    return ()
 
 
 def compare(tonight: Night, baseline: Night | None) -> Verdict:

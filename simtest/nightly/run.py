@@ -17,10 +17,11 @@ from simtest.nightly.history import append, clock_note, history_rows, read_histo
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.measure import measure_night
 from simtest.nightly.outputs import FILES, write_outputs
-from simtest.nightly.pending import compare, write_page
+from simtest.nightly.overview import ordered, without_canaries
+from simtest.nightly.pending import compare, worst_cases, write_page
 from simtest.nightly.storage import TONIGHT_ROWS, save_night
 from simtest.resources import shown
-from simtest.spec import Profile
+from simtest.spec import Profile, experiments_of
 from simtest.validation.runner import Progress
 
 FINE, REGRESSION, COULD_NOT_RUN = 0, 1, 2
@@ -112,7 +113,9 @@ def run_nightly(
             rows = history_rows(night, verdict)
             file = append(reports.history, rows)
             history = pl.concat([history, rows]).sort("started", "run_id", maintain_order=True)
-            target = publish(reports, folder, night, verdict, history)
+            worse = ordered(without_canaries(night, verdict), "worse")
+            worst = worst_cases(night.rows, worse, experiments_of(profile), folder / "worst", variant)
+            target = publish(reports, folder, night, verdict, history, worst)
     return Outcome(night, verdict, target, file)
 
 
@@ -129,13 +132,37 @@ def judge(night: Night, baseline: Night | None) -> Verdict:
     return dataclasses.replace(verdict, notes=(*verdict.notes, note))
 
 
-def publish(reports: Reports, scratch_folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame) -> Path:
-    """Write the page and all that lies beside it, and put it in the place of the last night's."""
+def publish(
+    reports: Reports, scratch_folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame,
+    worst: tuple[Path, ...] = (),
+) -> Path:  # fmt: skip
+    """Write the page and all that lies beside it, and put it in the place of the last night's.
+
+    Parameters
+    ----------
+    reports : Reports
+        Where it goes.
+    scratch_folder : Path
+        Where it is made.
+    night : Night
+        The night.
+    verdict : Verdict
+        Of the gate.
+    history : polars.DataFrame
+        Columns `HISTORY`, the night's own among them.
+    worst : tuple of Path
+        Gallery items of the worst cases.
+
+    Returns
+    -------
+    Path
+        The page's folder.
+    """
     new, target = scratch_folder / "tonight", reports.tonight(night.run["profile"])
     new.mkdir()
     save_night(new, night, TONIGHT_ROWS)
     write_outputs(new, night, verdict)
-    write_page(new, night, verdict, history, files=FILES)
+    write_page(new, night, verdict, history, gallery=worst, files=FILES)
     with turn(target):
         replace_folder(new, target)
     return target

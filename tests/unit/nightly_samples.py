@@ -50,7 +50,7 @@ def make_night(run=None, rows=None, canaries=()):
 
 def compared(night, outcomes, **more):
     """Give comparisons of a night's places, with outcomes in turn."""
-    places = night.figures.filter(pl.col("kind") == "setting").select(*PLACE).rows()
+    places = night.figures.filter(pl.col("kind") == "setting").select(*PLACE).unique(maintain_order=True).rows()
     made = [
         dict(zip(PLACE, place, strict=True))
         | {"quantity": "mean_deg", "unit": "deg", "method": "paired", "n": 4, "baseline": 1.0, "tonight": 1.1,

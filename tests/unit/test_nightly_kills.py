@@ -1,0 +1,168 @@
+"""Nights in processes of their own: two at once, killed at any moment, and on a disk that fills up."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from simtest.nightly.baseline import load_baseline
+from simtest.nightly.history import read_history
+from simtest.nightly.layout import Reports
+from simtest.nightly.storage import TONIGHT_ROWS, load_night
+
+MAIN = "from simtest.cli.main import main; main()"
+KILLS = 12
+
+# The published protocol renders nothing: a night of a second.
+TINY = """
+canaries = false
+costs = false
+[[experiments]]
+experiment = "paper"
+labels = ["noise"]
+realisations = 2
+"""
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def profile(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return path
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-c", MAIN, "nightly", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def night(profile, reports, *more):
+    return start("--profile", profile, "--reports", reports.root, "--workers", "1", *more)
+
+
+def finish(process, code=0):
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == code, (output, errors)
+    return errors.decode()
+
+
+def accept(profile, reports, reason):
+    return start("accept", "--profile", profile, "--reports", reports.root, "--reason", reason)
+
+
+def kept(reports):
+    """Give the bytes of the history's files."""
+    return {path: path.read_bytes() for path in reports.history.rglob("*.parquet") if not path.name.startswith(".")}
+
+
+def check_whole(reports):
+    """All that is there can be read, and belongs together."""
+    history, notes = read_history(reports.history)
+    assert notes == []
+    assert history["run_id"].n_unique() == len(kept(reports))
+    last = load_night(reports.tonight("tiny"), TONIGHT_ROWS)
+    assert last.run["id"] in set(history["run_id"])
+    page = (reports.tonight("tiny") / "index.html").read_text()
+    assert page
+    assert {"verdict.json", "junit.xml", "summary.md", "badge.svg"} <= {
+        path.name for path in reports.tonight("tiny").iterdir()
+    }
+
+
+def test_two_nights_at_once_do_each_other_no_harm(tmp_path, profile):
+    reports = Reports(tmp_path / "reports")
+    for process in [night(profile, reports) for _ in range(2)]:
+        finish(process)
+    assert len(kept(reports)) == 2
+    check_whole(reports)
+    assert not [path for path in reports.work.iterdir() if path.is_dir()]
+    # The same rows: neither has seen the other's work.
+    history, _ = read_history(reports.history)
+    digests = history.filter(kind="setting").group_by("run_id", maintain_order=True).agg("digest", "value")
+    assert digests.height == 2
+    assert digests["digest"].n_unique() == digests["value"].n_unique() == 1
+
+
+def test_a_night_killed_at_any_moment_loses_nothing(tmp_path, profile):
+    """Kills spread over a whole night, most of them over its end, where it writes; acceptances are killed too."""
+    reports, rng = Reports(tmp_path / "reports"), random.Random(1)
+    clock = time.monotonic()
+    finish(night(profile, reports))
+    whole_s = time.monotonic() - clock
+    finish(accept(profile, reports, "first"))
+    killed = 0
+    for number in range(KILLS):
+        before, accepted = kept(reports), load_baseline(reports, "tiny").run
+        late = number % 3
+        process = night(profile, reports) if late else accept(profile, reports, f"number {number}")
+        time.sleep(rng.uniform(0.5 * late, 1.0 if late else 0.6) * whole_s)
+        process.kill()
+        killed += process.wait() == -signal.SIGKILL
+        process.stdout.close()
+        process.stderr.close()
+        after = kept(reports)
+        assert {path: after.get(path) for path in before} == before
+        assert load_baseline(reports, "tiny").run["reason"] in (accepted["reason"], f"number {number}")
+    assert killed >= KILLS // 3
+    finish(night(profile, reports))
+    check_whole(reports)
+    finish(accept(profile, reports, "last"))
+    assert load_baseline(reports, "tiny").run["reason"] == "last"
+    assert not [path for path in reports.work.iterdir() if path.is_dir()]
+    assert not [path for path in reports.history.rglob("*.part*")]
+    assert {path.name for path in reports.baseline("tiny").parent.iterdir()} == {"tiny", ".tiny.lock"}
+
+
+@contextmanager
+def small_disk(folder, size):
+    """Mount a file system of so many bytes; skip where that is not allowed."""
+    folder.mkdir()
+    mount = shutil.which("mount")
+    if mount is None or os.geteuid() != 0:
+        pytest.skip("a small file system can be mounted by root alone")
+    options = ["-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
+    if subprocess.run([mount, *options], capture_output=True, check=False).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_told_and_the_next_night_works(tmp_path, profile):
+    """The disk is filled so far that a night is stopped sooner or later in its work."""
+    disk = tmp_path / "disk"
+    with small_disk(disk, 8 << 20):
+        reports = Reports(disk / "reports")
+        finish(night(profile, reports))
+        finish(accept(profile, reports, "first"))
+        stopped = 0
+        for left_kib in (4, 24, 48, 96, 160):
+            before, accepted = kept(reports), load_baseline(reports, "tiny").run
+            filler = disk / "filler"
+            usage = shutil.disk_usage(disk)
+            filler.write_bytes(bytes(max(0, usage.free - (left_kib << 10))))
+            process = night(profile, reports)
+            output, errors = process.communicate(timeout=120)
+            if process.returncode:
+                stopped += 1
+                assert (process.returncode, output) == (2, b""), errors
+                last = errors.decode().splitlines()[-1]
+                assert last.startswith("simtest: --reports ")
+                assert "No space left on device" in last
+            after = kept(reports)
+            assert {path: after.get(path) for path in before} == before
+            assert load_baseline(reports, "tiny").run == accepted
+            filler.unlink()
+        assert stopped >= 2
+        finish(night(profile, reports))
+        check_whole(reports)
