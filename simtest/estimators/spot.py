@@ -38,7 +38,7 @@ and where noise hides the drift, it hides an error several times that of the mea
 MEAN_SHARE = 0.5
 """Variance of the mean axis along the drift, over the squared drift: the peak lies there, by 0.8 to 1.7 times it."""
 
-PEAK_SHARE, PEAK_PX2 = 0.02, 0.01
+PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
 """Variance of the axis at the peak over the squared drift, and what is added to it, px^2, where there is a drift: terms
 of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE are what 614 highlights of the
 generated colon showed, on viewpoints that no figure of the page is from."""
