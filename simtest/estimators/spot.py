@@ -30,10 +30,10 @@ Array = npt.NDArray[np.float64]
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
-DRIFT_CHI2, SUSPECT_CHI2 = 9.21, 3.22
-"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 1 % and 20 % of normal
+DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
+"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 0.1 % and 20 % of normal
 pairs lie beyond. A surface whose curvature does not change drifts by noise alone; on a colon hardly a highlight does,
-and where noise hides the drift, it hides an error several times that of the mean axis."""
+and where noise hides the drift, it hides an error several times the mean axis' noise."""
 
 MEAN_SHARE = 0.5
 """Variance of the mean axis along the drift, over the squared drift: the peak lies there, by 0.8 to 1.7 times it."""

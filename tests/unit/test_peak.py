@@ -95,7 +95,7 @@ def test_noise_alone_drifts_as_often_as_is_said():
         fit_spot(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=seed), CAMERA, ISOVALUES)._drift_chi2
         for seed in range(count)
     ]
-    for limit, share in ((DRIFT_CHI2, 0.01), (SUSPECT_CHI2, 0.2)):
+    for limit, share in ((DRIFT_CHI2, 0.001), (SUSPECT_CHI2, 0.2)):
         beyond = int(np.count_nonzero(np.array(chi2) > limit))
         low, high = stats.binom.ppf([0.0025, 0.9975], count, share)
         assert low <= beyond <= high, (limit, beyond)
