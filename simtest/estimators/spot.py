@@ -266,13 +266,13 @@ class Spot:
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        return np.asarray(both @ covariance @ both.T + self._left_open)
+        noise = np.asarray(both @ covariance @ both.T)
+        # Noise that drifts far has moved this axis far: more for a mere suspicion would be for such noise.
+        return noise + self._left_open if self.drift_is_real else noise
 
     @property
     def _left_open(self) -> Array:
-        """What a lopsided highlight leaves open about its peak, rad^2, shape (2, 2); 0 where it may be none."""
-        if self._drift_chi2 <= SUSPECT_CHI2:
-            return np.zeros((2, 2))
+        """What a lopsided highlight leaves open about its peak, rad^2, shape (2, 2)."""
         return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self._px2)
 
     def tangents(self, points: Array) -> Array:
