@@ -33,7 +33,8 @@ def curved(
 
     The normal is the cones' mean axis as in `cone_axis`, followed to t -> 1 where the axis drifts by more than the
     noise explains. The lobe's second moments at the peak, 1/H, give the rest: with m = 1 + d k and c the curvature of
-    the lobe, H = c m^2 + 2 m along each principal direction. Where c is not known, m is known up to scale, and the 2 m
+    the lobe, H = c m^2 + 2 m along each principal direction; the directions are those of the isophotes' mean moments,
+    whose noise is a quarter of that. Where c is not known, m is known up to scale, and the 2 m
     of the falloff is neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
 
     Parameters
@@ -85,12 +86,13 @@ def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
 
 def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
     """Give the curvature, and whether the spot is round within the noise."""
-    values, vectors = np.linalg.eigh(spot.moments)
+    values = np.linalg.eigvalsh(spot.moments)
     if values[0] <= 0:
         return Failure(Reason.DEGENERATE_CONIC, f"moments at the peak {values[0]:.3g}, {values[1]:.3g} rad^2")
     shrunk, is_round = _without_noise(values, spot.moments_covariance)
-    # The longer axis lies along the smaller gain.
+    # The longer axis lies along the smaller gain. Following the moments to t -> 1 would turn it by noise alone.
     stiffness = 1 / shrunk[::-1]
+    vectors = np.linalg.eigh(spot.mean_moments)[1]
     directions = vectors.T[::-1] @ spot.basis
     if lobe is None:
         ratio = float(np.sqrt(stiffness[0] / stiffness[1]))

@@ -4,8 +4,7 @@ Near its peak the lobe is Gaussian to second order: -log(I / I0) = w^T H w / 2, 
 isophote at t is then an ellipse with second moments E(t) = -2 ln t / H, and the axis of its cone is the peak's
 sightline. Terms of higher order in w make E(t) / (-2 ln t) and the axis run linearly with -ln t to leading order, so
 both are followed to the peak by a straight line (theory.md section 3, items 3 and 4; section 6). The axis is followed
-over the isophote's area, which is as good as -ln t where the lobe stands on no base and better where it does, and to
-the peak of the lobe as it was before smoothing (`Spot.peak_axis`).
+over the isophote's area, and to the peak of the lobe as it was before smoothing (`simtest.estimators.peak`).
 """
 
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.base import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.peak import weights_at_zero, weights_of_axes
 from simtest.estimators.propagation import gram
 from simtest.estimators.spot_crossings import SpotCrossings
 from simtest.estimators.top import Top, fit_top
@@ -30,21 +30,18 @@ Array = npt.NDArray[np.float64]
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
-DRIFT_CHI2, SUSPECT_CHI2 = 9.21, 3.22
-"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 1 % and 20 % of normal
+DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
+"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 0.1 % and 20 % of normal
 pairs lie beyond. A surface whose curvature does not change drifts by noise alone; on a colon hardly a highlight does,
-and where noise hides the drift, it hides an error several times that of the mean axis."""
+and where noise hides the drift, it hides an error several times the mean axis' noise."""
 
 MEAN_SHARE = 0.5
 """Variance of the mean axis along the drift, over the squared drift: the peak lies there, by 0.8 to 1.7 times it."""
 
-PEAK_SHARE, PEAK_PX2 = 0.02, 0.01
+PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
 """Variance of the axis at the peak over the squared drift, and what is added to it, px^2, where there is a drift: terms
 of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE are what 614 highlights of the
 generated colon showed, on viewpoints that no figure of the page is from."""
-
-LEAST_VARIANCE_PX2 = 4.0
-"""A lobe's variance is not trusted below this: a pixel's width and the smoothing's are then all that is left of it."""
 
 NOISE_FACTOR = 2.0
 """How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
@@ -108,29 +105,13 @@ class Spot:
 
     @cached_property
     def _level_weights(self) -> Array:
-        return _to_peak(self.levels)
+        return weights_at_zero(self.levels)
 
     @cached_property
     def _weights(self) -> Array:
-        """Weights of the cones' axes in the axis at the peak, shape (K,).
-
-        Let log I have terms of third order in w. Smoothing by s moves the peak by as much as the isophotes' centres run
-        while -ln t grows by 2 s^2 / V, V the lobe's variance before smoothing; where it differs between the lobe's
-        axes, something between both, and as a rule near that of the longer axis. So far the run is followed beyond
-        area 0.
-        """
-        a, b, c = self._crossings.conics.T[:3]
-        px2, smoothing = self._px2, self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2
-        # 11, 12, 22 of each isophote's E(t), with what interpolation takes off all of them put back.
-        p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4) + LINEAR_INTERPOLATION_PX2 * px2[_UPPER][:, None]
-        areas = np.sqrt(np.maximum(p * r - q * q, 0.0))
-        # The smoothed lobe's variance, px^2, needs no more of the peak's value than the highest pixel.
-        sums = np.array([[p.sum(), q.sum()], [q.sum(), r.sum()]]) / float(-2 * np.log(self._crossings.isovalues).sum())
-        lobe = np.linalg.solve(px2, sums)
-        half, product = float(np.trace(lobe)) / 2, float(np.linalg.det(lobe))
-        longer = half + np.sqrt(max(half * half - product, 0.0)) - smoothing
-        beyond = 4 * smoothing * np.sqrt(max(product, 0.0) * np.linalg.det(px2)) / max(longer, LEAST_VARIANCE_PX2)
-        return _to_peak(areas + float(beyond))
+        """Weights of the cones' axes in the axis at the peak, shape (K,)."""
+        crossings = self._crossings
+        return weights_of_axes(crossings.conics, crossings.isovalues, self._px2, self.patch.smoothing_px)
 
     @property
     def can_extrapolate(self) -> bool:
@@ -175,8 +156,16 @@ class Spot:
     def _moments_at(self, shift: float) -> Array:
         """Give the moments with the levels moved by a shift."""
         levels = self.levels + shift
-        each = self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2
-        return np.asarray(np.einsum("k,kij->ij", _to_peak(levels) / (2 * levels), each))
+        return np.asarray(np.einsum("k,kij->ij", weights_at_zero(levels) / (2 * levels), self._narrowed(levels)))
+
+    @property
+    def mean_moments(self) -> Array:
+        """The same without the way to t -> 1, shape (2, 2): of less noise, and of the same principal directions."""
+        return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
+
+    def _narrowed(self, levels: Array) -> Array:
+        """Give E(t) of each isophote less what smoothing and interpolation add to it, shape (K, 2, 2)."""
+        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)
 
     @cached_property
     def _tangent_moments(self) -> Array:
@@ -259,13 +248,13 @@ class Spot:
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        return np.asarray(both @ covariance @ both.T + self._left_open)
+        noise = np.asarray(both @ covariance @ both.T)
+        # Noise that drifts far has moved this axis far: more for a mere suspicion would be for such noise.
+        return noise + self._left_open if self.drift_is_real else noise
 
     @property
     def _left_open(self) -> Array:
-        """What a lopsided highlight leaves open about its peak, rad^2, shape (2, 2); 0 where it may be none."""
-        if self._drift_chi2 <= SUSPECT_CHI2:
-            return np.zeros((2, 2))
+        """What a lopsided highlight leaves open about its peak, rad^2, shape (2, 2)."""
         return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self._px2)
 
     def tangents(self, points: Array) -> Array:
@@ -304,15 +293,6 @@ class Spot:
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
-
-
-def _to_peak(levels: Array) -> Array:
-    """Give the weights of values at some levels in the value at level 0 of the straight line through them."""
-    gaps = levels - levels.mean()
-    spread = float(gaps @ gaps)
-    # One level alone, or several that are the same, leave the slope open: it is then taken as 0.
-    slope = gaps / spread if spread > 0 else np.zeros_like(levels)
-    return np.asarray(1 / len(levels) - levels.mean() * slope)
 
 
 def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot | Failure:

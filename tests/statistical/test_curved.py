@@ -55,9 +55,7 @@ def cropped(image, camera):
     x, y, width, height = region.box
     left, top = max(x - AROUND_PX, 0), max(y - AROUND_PX, 0)
     part = image[top : y + height + AROUND_PX, left : x + width + AROUND_PX]
-    moved = replace(
-        camera, width=part.shape[1], height=part.shape[0], cx=camera.cx - left, cy=camera.cy - top,
-    )  # fmt: skip
+    moved = replace(camera, width=part.shape[1], height=part.shape[0], cx=camera.cx - left, cy=camera.cy - top)
     return np.ascontiguousarray(part), moved
 
 
@@ -107,8 +105,9 @@ def below(values, limit, members=1):
 
 
 SHAPES = [tube(-0.7), tube(-0.5), tube(1.0), tube(3.0), ball(-0.5), ball(3.0), saddle(0.7, -0.7), saddle(0.5, -0.5)]
+SHAPES += [tube(0.12)]
 
-QUICK = (tube(-0.5), ball(3.0), saddle(0.5, -0.5))
+QUICK = (tube(-0.5), tube(0.12), ball(3.0), saddle(0.5, -0.5))
 MARKED_SHAPES = [shape if shape in QUICK else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
 
 

@@ -1,0 +1,102 @@
+"""The axis at a lopsided lobe's peak, and what a spot states about it."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from simtest.estimators.peak import weights_at_zero, weights_of_axes
+from simtest.estimators.spot import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_spot
+from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.vectors import angle_deg
+
+CAMERA = Camera(200, 160, 300.0, 300.0, 100.0, 80.0)
+ISOVALUES = (0.3, 0.4, 0.5, 0.6, 0.7)
+PLACE = np.array([103.3, 76.8])
+PIXEL_DEG = float(np.degrees(1 / 300.0))
+
+
+def lopsided(cubic, widths=(7.0, 7.0), base=0.0, smoothing=2.0, sigma=0.0, seed=0):
+    """A Gaussian lobe whose logarithm has terms x^3, x y^2 and y^3, x and y over its widths, on a base."""
+    x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(160) + 0.5)
+    x, y = (x - PLACE[0]) / widths[0], (y - PLACE[1]) / widths[1]
+    r2 = x * x + y * y
+    # The terms are turned off where the expansion says nothing any more.
+    odd = (cubic[0] * x**3 + cubic[1] * x * y * y + cubic[2] * y**3) * np.exp(-((r2 / 12) ** 3))
+    frame = (np.exp(-r2 / 2 + odd) + base) / (1 + base)
+    frame = frame + sigma * np.random.default_rng(seed).standard_normal(frame.shape)
+    smoothed = smooth(frame.astype(np.float32), smoothing).astype(float)
+    patch = Patch.cut(smoothed, (40, 20, 130, 120), noise=sigma or 1e-9, smoothing_px=smoothing)
+    assert isinstance(patch, Patch)
+    return patch
+
+
+def errors_px(patch):
+    """How far mean axis, peak of the smoothed lobe, and axis at the peak lie from the true one, px."""
+    spot, true = fit_spot(patch, CAMERA, ISOVALUES), CAMERA.unproject(PLACE)
+    places = np.array([pose.axis for pose in spot.poses])
+    smoothed = weights_at_zero(spot.levels) @ places
+    axes = (spot.axis, smoothed / np.linalg.norm(smoothed), spot.peak_axis)
+    return [float(angle_deg(axis, true)) / PIXEL_DEG for axis in axes]
+
+
+@pytest.mark.parametrize("cubic", [(0.02, 0.0, 0.0), (0.0, 0.04, 0.0), (0.015, 0.015, 0.01)])
+def test_the_peak_before_smoothing_is_found(cubic):
+    mean, smoothed, peak = errors_px(lopsided(cubic))
+    assert peak < 0.006
+    # Negative controls: smoothing moves the peak by 2 s^2 / V of the run, and the mean axis lies by the run from it.
+    assert smoothed > 4 * peak
+    assert mean > 3.5 * smoothed
+
+
+def test_of_a_long_lobe_the_longer_axis_tells_how_far():
+    mean, smoothed, peak = errors_px(lopsided((0.02, 0.0, 0.0), widths=(10.0, 5.0)))
+    assert peak < 0.35 * smoothed < 0.1 * mean
+
+
+def test_on_a_base_the_axis_runs_with_the_area():
+    patch = lopsided((0.02, 0.0, 0.0), widths=(12.0, 12.0), base=0.25, smoothing=0.0)
+    mean, by_level, peak = errors_px(patch)
+    assert peak < 0.02
+    # Negative control: over -ln t the run is bent there, and a straight line misses.
+    assert by_level > 3 * peak
+    assert mean > 4 * by_level
+
+
+def test_weights_sum_to_one_and_leave_a_common_axis():
+    spot = fit_spot(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
+    weights = weights_of_axes(spot._crossings.conics, spot._crossings.isovalues, spot._px2, 2.0)
+    assert weights.sum() == pytest.approx(1)
+    assert angle_deg(spot.peak_axis, spot.axis) < 0.01 * PIXEL_DEG
+    one = spot._crossings
+    assert weights_of_axes(one.conics[:1], one.isovalues[:1], spot._px2, 2.0) == pytest.approx([1])
+
+
+def test_what_a_drift_adds_and_where_it_adds_nothing():
+    plain = fit_spot(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
+    assert not plain.drift_is_real
+    np.testing.assert_array_equal(plain.axis_covariance, plain.axes_covariance[:2, :2])
+    spot = fit_spot(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
+    assert spot.drift_is_real
+    added = spot.axis_covariance - spot.axes_covariance[:2, :2]
+    along = spot.drift / np.linalg.norm(spot.drift)
+    across = np.array([-along[1], along[0]])
+    # What the line to the peak leaves open lies in all directions; that the mean axis is not the peak's, along the run.
+    left_open = across @ added @ across
+    assert along @ added @ along == pytest.approx(left_open + MEAN_SHARE * spot.drift @ spot.drift, rel=1e-6)
+    assert np.sqrt(left_open) > np.radians(0.08 * PIXEL_DEG)
+    noise = np.hstack([np.eye(2)] * 2) @ spot.axes_covariance @ np.vstack([np.eye(2)] * 2)
+    np.testing.assert_allclose(spot.peak_covariance - noise, left_open * np.eye(2), rtol=1e-2, atol=1e-10)
+
+
+def test_noise_alone_drifts_as_often_as_is_said():
+    """Shares of 150 lobes without a drift beyond both limits, at a level of 1 % together; a control with a drift."""
+    count = 150
+    chi2 = [
+        fit_spot(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=seed), CAMERA, ISOVALUES)._drift_chi2
+        for seed in range(count)
+    ]
+    for limit, share in ((DRIFT_CHI2, 0.001), (SUSPECT_CHI2, 0.2)):
+        beyond = int(np.count_nonzero(np.array(chi2) > limit))
+        low, high = stats.binom.ppf([0.0025, 0.9975], count, share)
+        assert low <= beyond <= high, (limit, beyond)
+    assert fit_spot(lopsided((0.02, 0.0, 0.0), sigma=0.005), CAMERA, ISOVALUES)._drift_chi2 > DRIFT_CHI2
