@@ -42,7 +42,8 @@ def compare(tonight: Night, baseline: Night | None, limits: Limits = DEFAULTS) -
         "regression" where a comparison is worse, else "no baseline" or "fine".
     """
     before = None if baseline is None else baseline.figures
-    made = known.canaries(tonight.figures, before) + known.costs(tonight.figures, before, limits)
+    same_machine = baseline is None or baseline.run.get("processor") == tonight.run.get("processor")
+    made = known.canaries(tonight.figures, before) + known.costs(tonight.figures, before, limits, same_machine)
     bit_equal: bool | None = None
     notes: tuple[str, ...] = ("There is no baseline: nothing but the canaries was judged.",)
     if baseline is not None:

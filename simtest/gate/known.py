@@ -40,7 +40,9 @@ def canaries(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> list[dict[
     return made
 
 
-def costs(tonight: pl.DataFrame, baseline: pl.DataFrame | None, limits: Limits) -> list[dict[str, Any]]:
+def costs(
+    tonight: pl.DataFrame, baseline: pl.DataFrame | None, limits: Limits, same_machine: bool = True
+) -> list[dict[str, Any]]:
     """Give the comparisons of costs: worse where tonight's whole interval lies beyond the baseline's and the margin.
 
     Parameters
@@ -49,6 +51,8 @@ def costs(tonight: pl.DataFrame, baseline: pl.DataFrame | None, limits: Limits) 
         Figures of two nights; no baseline where there is none. A figure without an interval stands for itself.
     limits : Limits
         `memory` is the margin of quantities whose name holds "memory", `run_time` that of all others.
+    same_machine : bool
+        Whether both nights ran on the same processor; costs of different ones are shown and not judged.
 
     Returns
     -------
@@ -65,7 +69,9 @@ def costs(tonight: pl.DataFrame, baseline: pl.DataFrame | None, limits: Limits) 
             continue
         first = (_or(row["low_before"], before), _or(row["high_before"], before))
         second = (_or(row["low"], after), _or(row["high"], after))
-        if before == after:
+        if not same_machine:
+            outcome = "undecided"
+        elif before == after:
             outcome = "same"
         elif second[0] > first[1] * (1 + share):
             outcome = "worse"

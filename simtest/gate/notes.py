@@ -50,8 +50,8 @@ def _differing(before: dict[str, Any], after: dict[str, Any]) -> tuple[str, str]
 def _other(what: str, before: str | None, after: str | None) -> str:
     if before == after:
         return ""
-    tested = " All places were compared unpaired." if what == "Versions" else ""
-    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}.{tested}"
+    more = "All places were compared unpaired." if what == "Versions" else "Costs were not judged."
+    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}. {more}"
 
 
 def _numbers(baseline: Night, tonight: Night, limits: Limits) -> list[str]:

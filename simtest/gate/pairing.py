@@ -8,8 +8,6 @@ from simtest.gate.quantities import ANSWERED, HARMS, IS_TRUE, KEY, harms_of_fram
 from simtest.gate.records import PLACE
 from simtest.gate.units import UNIT
 
-FRAME = ("place", "realisation", "seed")
-
 
 @dataclass(frozen=True)
 class Numbered:
@@ -34,22 +32,18 @@ class Numbered:
 
 
 def paired_places(before: Numbered, after: Numbered) -> frozenset[int]:
-    """Give the places all of whose frames and true highlights are in both nights, once, with the same seed."""
-    sound: list[set[int]] = []
-    for key, first, second in (
-        (FRAME, before.frames, after.frames),
-        (("place", "realisation", "true_id", "seed"), before.rows, after.rows),
-    ):
-        counted = [
-            table.group_by(key).agg(pl.len().alias(name)) for table, name in ((first, "once"), (second, "again"))
-        ]
-        both = counted[0].join(counted[1], on=key, how="full", coalesce=True)
-        alike = both.group_by("place").agg(
-            alike=((pl.col("once") == 1) & (pl.col("again") == 1)).fill_null(False).all()
-        )
-        sound.append(set(alike.filter(~pl.col("alike"))["place"].to_list()))
+    """Give the places all of whose true highlights are in both nights, once, and whose frames have the same seeds."""
+    key = ("place", "realisation", "true_id", "seed")
+    counted = [
+        night.rows.group_by(key).agg(pl.len().alias(name)) for night, name in ((before, "once"), (after, "again"))
+    ]
+    rows = counted[0].join(counted[1], on=key, how="full", coalesce=True)
+    unlike = rows.filter(~((pl.col("once") == 1) & (pl.col("again") == 1)).fill_null(False))
+    # A frame without a highlight has rows only where something was found in it.
+    frames = before.frames.join(after.frames, on=("place", "realisation"), suffix="_2")
+    moved = frames.filter(pl.col("seed").ne_missing(pl.col("seed_2")))
     every = set(before.frames["place"].to_list()) & set(after.frames["place"].to_list())
-    return frozenset(every - sound[0] - sound[1])
+    return frozenset(every - set(unlike["place"].to_list()) - set(moved["place"].to_list()))
 
 
 def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataFrame:
@@ -58,8 +52,10 @@ def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataF
     rows = _long(before.rows.filter(kept), "baseline").join(
         _long(after.rows.filter(kept), "tonight"), on=(*UNIT, "true_id")
     )
-    frames = _frames(before.frames.filter(kept), "baseline").join(
-        _frames(after.frames.filter(kept), "tonight"), on=UNIT
+    frames = (
+        _frames(before.frames.filter(kept), "baseline")
+        .join(_frames(after.frames.filter(kept), "tonight"), on=UNIT, how="full", coalesce=True)
+        .with_columns(pl.col("baseline", "tonight").fill_null(0.0))
     )
     return pl.concat([table.select(*UNIT, "baseline", "tonight") for table in (rows, frames)])
 

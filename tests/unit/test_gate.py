@@ -56,7 +56,7 @@ def test_another_rounding_is_equivalent_and_said():
     verdict = compare(night(raised(table, 1 + 1e-7), processor="two"), night(table))
     assert verdict.state == "fine"
     assert set(verdict.comparisons["outcome"]) == {"equivalent"}
-    assert verdict.notes[0] == "The processor changed from one to two."
+    assert verdict.notes[0] == "The processor changed from one to two. Costs were not judged."
     assert verdict.notes[1].startswith("Medians agree to 0.001 deg at 1 of 1 places")
     assert "0 differ in status" in verdict.notes[2]
 
@@ -208,6 +208,28 @@ def test_costs_have_margins_of_their_own(quantity, value, low, high, outcome):
     verdict = compare(night(table, costs=[("piece", quantity, value, low, high)]), before)
     assert verdict.comparisons.filter(experiment="piece")["outcome"].to_list() == [outcome]
     assert verdict.state == ("regression" if outcome == "worse" else "fine")
+
+
+def test_costs_of_another_processor_are_not_judged():
+    table = rows()
+    nights = [
+        night(table, costs=[("piece", "run_time", value, value, value)], processor=p)
+        for value, p in ((9, "b"), (1, "a"))
+    ]
+    verdict = compare(*nights)
+    assert verdict.state == "fine"
+    assert verdict.comparisons.filter(experiment="piece")["outcome"].to_list() == ["undecided"]
+
+
+def test_a_find_in_a_frame_without_highlights_leaves_the_others_pairs():
+    table = rows()
+    find = changed(
+        table.head(1), True, realisation=77, seed=77, true_id=None, error_deg=None, mahalanobis2=None, axis_ratio=None
+    )
+    verdict = compare(night(pl.concat([table, find])), night(table))
+    row = one(verdict, "false")
+    assert (row["method"], row["n"], row["tonight"]) == ("paired", 21, pytest.approx(1 / 21))
+    assert one(verdict, "mean_deg")["n"] == 20
 
 
 def test_tables_keep_to_their_columns():
