@@ -11,7 +11,7 @@ from benchmarks.measuring import Figure
 NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
-ON_REQUEST = ("detection", "dataset_png", "dataset_memory", "dataset_kills")
+ON_REQUEST = ("detection", "dataset_png", "dataset_memory", "dataset_kills", "nightly_page")
 """The same, run where they are named: they measure no speed, and take minutes."""
 
 
