@@ -77,7 +77,7 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         commit=words.short_commit(night.run.get("commit")),
         state=verdict.state,
         mark=words.MARKS.get(verdict.state, "•"),
-        headline=words.headline(verdict),
+        headline=words.headline(night, verdict),
         lines=words.lines(night, verdict),
         notes=[*verdict.notes, *(f"history, skipped: {line}" for line in extras.damaged), *unread],
         counts=words.counts(verdict),
