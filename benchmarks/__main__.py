@@ -11,7 +11,16 @@ from benchmarks.measuring import Figure
 NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
-ON_REQUEST = ("history", "detection", "dataset_png", "dataset_memory", "dataset_kills", "coverage", "gate")
+ON_REQUEST = (
+    "history",
+    "detection",
+    "dataset_png",
+    "dataset_memory",
+    "dataset_kills",
+    "coverage",
+    "gate",
+    "nightly_page",
+)
 """The same, run where they are named: they measure no speed, and take minutes."""
 
 

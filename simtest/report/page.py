@@ -8,7 +8,7 @@ from simtest.files import write_atomically
 from simtest.report import fineness, static, style, words
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.gallery import isophote_colour, isovalues
-from simtest.report.html import environment, picture, plotly_script
+from simtest.report.html import environment, packed_plotly, picture
 from simtest.report.laws.section import laws_section
 from simtest.report.pairs import pairs
 from simtest.report.paper.section import paper_section
@@ -167,5 +167,5 @@ def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], c
         truth_colour=style.TRUTH,
         isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(run.gallery)],
         charts={key: Markup(text) for key, text in charts.items()},
-        plotly=Markup(plotly_script()) if charts else None,
+        plotly=packed_plotly() if charts else None,
     )

@@ -229,8 +229,8 @@ def _upright(points: Array) -> tuple[Array, Array, Array]:
     return points[:, 0], points[:, 2], -points[:, 1]
 
 
-def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folder: Path) -> list[Path]:
+def draw_gallery(
+    items: Sequence[GalleryItem], colours: Mapping[str, str], folder: Path, dpi: int = GALLERY_DPI
+) -> list[Path]:
     """Write gallery_000.png, ... and give their paths."""
-    return [
-        save(draw_item(item, colours), folder / f"gallery_{i:03d}.png", GALLERY_DPI) for i, item in enumerate(items)
-    ]
+    return [save(draw_item(item, colours), folder / f"gallery_{i:03d}.png", dpi) for i, item in enumerate(items)]

@@ -10,7 +10,7 @@ from test_report import make_item
 from benchmarks.nights import history_of, night_of, verdict_of
 from simtest.report.nightly import Extras, write_nightly_page
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: browser)")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )

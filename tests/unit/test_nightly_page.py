@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import zlib
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
@@ -11,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 import polars as pl
 import pytest
+from plotly.offline import get_plotlyjs
 from test_report import EVIL, make_item, make_rows
 
 from benchmarks.nights import history_of, night_of, verdict_of
@@ -18,7 +20,7 @@ from simtest.gate.records import COMPARISONS, FIGURES, Night, Verdict
 from simtest.report.nightly import Extras, write_nightly_page
 from simtest.report.nightly.comparisons import comparisons
 from simtest.report.nightly.ladder import FLOOR_DEG, ladder
-from simtest.report.nightly.trends import MEDIAN, NEWEST, trends
+from simtest.report.nightly.trends import COSTS, MEDIAN, NEWEST, trends
 from simtest.report.nightly.words import bounds, headline, measure, short_commit, signed
 from simtest.report.style import colours
 from simtest.validation.metrics import SCHEMA
@@ -114,7 +116,8 @@ def test_the_page_stands_alone_and_is_sound_html(whole):
     assert "http" not in re.sub(
         r'http-equiv|<script type="application/json".*?</script>', "", without_scripts, flags=re.S
     )
-    assert text.count("plotly.js v") == 1
+    (packed,) = re.findall(r'<script type="application/octet-stream" id="plotly-packed">(.*?)</script>', text)
+    assert zlib.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
 
 
 def test_the_page_can_be_read_without_eyes_or_mouse(whole):
@@ -186,6 +189,23 @@ def test_each_state_is_told(tmp_path, night, state, told):
     assert bit_equal in page.text
 
 
+def test_a_canary_alone_can_make_a_regression(tmp_path, night):
+    verdict = replace(verdict_of(night, state="fine"), state="regression")
+    _, page = written(tmp_path, night, verdict)
+    assert "Regression: no figure is worse than the baseline, but 1 canary is out of bounds: far ellipse." in page.text
+
+
+def test_a_name_that_does_not_apply_is_a_dash_not_a_blank_choice(tmp_path, night):
+    verdict = verdict_of(night)
+    blank = verdict.comparisons.with_columns(pl.lit("").alias("estimator"), pl.lit(None, pl.String).alias("experiment"))
+    made = comparisons(replace(verdict, comparisons=blank))
+    assert made.choices["estimator"] == made.choices["experiment"] == ["–"]
+    assert headline(night, replace(verdict, comparisons=blank)).endswith("than the baseline.")
+    empty = night.figures.with_columns(pl.col("estimator").fill_null(""), pl.col("setting").fill_null(""))
+    costs = [name for name in unpacked(trends(pl.DataFrame(), replace(night, figures=empty))) if name[0] == COSTS]
+    assert {name[2] for name in costs} == {"overview", "noise", "all"}
+
+
 def test_an_empty_night_has_a_page(tmp_path):
     empty = Night(
         {"id": "a", "profile": "quick", "started": STARTED.isoformat()},
@@ -223,7 +243,7 @@ def test_the_worst_come_first_and_nothing_vanishes_unsaid(night):
     sizes = [abs(row["difference"][1]) / row["margin"][1] for row in table.rows[: worse.height]]
     assert sizes == sorted(sizes, reverse=True)
     assert len(table.rows) + sum(table.left_out.values()) == verdict.comparisons.height
-    assert headline(verdict).startswith(f"Regression: {worse.height} of {verdict.comparisons.height} figures")
+    assert headline(night, verdict).startswith(f"Regression: {worse.height} of {verdict.comparisons.height} figures")
 
 
 def test_numbers_have_signs_units_and_dashes():

@@ -217,7 +217,7 @@ def read_page(path):
         for key in ("src", "href"):
             value = attrs.get(key) or "#"
             assert value.startswith(("#", "data:", "figures/")), value
-    assert html.count("plotly.js v") <= 1
+    assert html.count('id="plotly-packed"') <= 1
     assert all(attrs.get("alt") for tag, attrs in page.tags if tag == "img")
     assert not re.search(r"@import|url\(", html[: html.index("</style>")])
     return page

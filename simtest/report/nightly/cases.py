@@ -11,7 +11,7 @@ from simtest.report.nightly.extras import Extras
 from simtest.report.run import GalleryItem, read_item
 
 MOST_CASES = 12
-PICTURE_BYTES = 48_000
+PICTURE_BYTES, PICTURE_DPI = 48_000, 130
 
 
 def read_cases(extras: Extras) -> tuple[list[GalleryItem], list[str]]:
@@ -28,7 +28,7 @@ def read_cases(extras: Extras) -> tuple[list[GalleryItem], list[str]]:
 def draw_cases(items: list[GalleryItem], colours: Mapping[str, str], folder: Path) -> list[dict[str, Any]]:
     """Draw the cases as PNG files in a folder; gives what the template shows of each."""
     with static.settings():
-        paths = static.draw_gallery(items, colours, folder)
+        paths = static.draw_gallery(items, colours, folder, PICTURE_DPI)
     return [
         {
             **words.gallery_caption(item),

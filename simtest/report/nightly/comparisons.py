@@ -51,13 +51,12 @@ def comparisons(verdict: Verdict, most: int = MOST_ROWS) -> Comparisons:
     table = verdict.comparisons.with_columns(rank.alias("rank"), size.alias("size"))
     table = table.sort("rank", "size", descending=[False, True], nulls_last=True, maintain_order=True)
     shown, rest = table.head(most), table.slice(most)
-    choices = {
-        name: sorted(shown[name].drop_nulls().unique().to_list()) for name in ("experiment", "estimator", "quantity")
-    }
-    present = set(shown["outcome"].to_list())
+    rows = [_row(row) for row in shown.iter_rows(named=True)]
+    choices = {name: sorted({row[name] for row in rows}) for name in ("experiment", "estimator", "quantity")}
+    present = {row["outcome"] for row in rows}
     choices["outcome"] = [name for name in MEANINGS if name in present]
     left = {name: count for name, count in rest["outcome"].value_counts(sort=True).iter_rows()}
-    return Comparisons([_row(row) for row in shown.iter_rows(named=True)], left, choices)
+    return Comparisons(rows, left, choices)
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:

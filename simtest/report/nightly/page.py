@@ -10,7 +10,7 @@ from simtest.files import write_atomically
 from simtest.gate.records import Night, Verdict
 from simtest.report import style
 from simtest.report.gallery import isophote_colour, isovalues
-from simtest.report.html import environment, plotly_script, script_json
+from simtest.report.html import environment, packed_plotly, script_json
 from simtest.report.nightly import tables, words
 from simtest.report.nightly.cases import draw_cases, read_cases
 from simtest.report.nightly.comparisons import comparisons
@@ -77,7 +77,7 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         commit=words.short_commit(night.run.get("commit")),
         state=verdict.state,
         mark=words.MARKS.get(verdict.state, "•"),
-        headline=words.headline(verdict),
+        headline=words.headline(night, verdict),
         lines=words.lines(night, verdict),
         notes=[*verdict.notes, *(f"history, skipped: {line}" for line in extras.damaged), *unread],
         counts=words.counts(verdict),
@@ -98,7 +98,7 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         files=extras.files,
         colours={name: colours[name] for name in style.estimator_order(_names(night.rows["estimator"]))},
         charts={key: Markup(text) for key, text in charts.items()},
-        plotly=Markup(plotly_script()) if charts or past else None,
+        plotly=packed_plotly() if charts or past else None,
     )
 
 

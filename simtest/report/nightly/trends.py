@@ -25,7 +25,7 @@ NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
 HISTORY_COLUMNS = ("kind", *PLACE, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
 """All that the page reads of the history; a history of other columns may leave the rest out."""
 
-BUDGET_BYTES = 1_800_000
+BUDGET_BYTES = 2_800_000
 """Most that the curves may take in the page."""
 
 MOST_POINTS = 500

@@ -83,21 +83,27 @@ def bounds(low: float | None, high: float | None, unit: str | None = "") -> str:
     return f"at most {number(scaled(high, unit))}" if number(low) == "–" else interval(low, high, unit)
 
 
-def headline(verdict: Verdict) -> str:
+def headline(night: Night, verdict: Verdict) -> str:
     """Say in one sentence what the gate says of the night."""
     if verdict.state != "regression":
         return STATES.get(verdict.state, f"{verdict.state}.")
-    worse = verdict.regressions
+    worse, out = verdict.regressions, out_of_bounds(night)
     if worse.is_empty():
-        return "Regression."
-    total = verdict.comparisons.height
-    counts = (
-        worse["estimator"].drop_nulls().value_counts(sort=True).sort("count", "estimator", descending=[True, False])
-    )
-    names = [f"{name} ({count})" for name, count in counts.iter_rows()]
+        verb = "canary is" if len(out) == 1 else "canaries are"
+        why = f"{len(out)} {verb} out of bounds: {labelled(out)}" if out else "the gate says so"
+        return f"Regression: no figure is worse than the baseline, but {why}."
+    named = worse["estimator"].replace("", None).drop_nulls()
+    counted = named.value_counts().sort("count", "estimator", descending=[True, False])
+    names = [f"{name} ({count})" for name, count in counted.iter_rows()]
     which = f": {labelled(names)}" if names else ""
     verb = "is" if worse.height == 1 else "are"
-    return f"Regression: {worse.height} of {total} figures {verb} worse than the baseline{which}."
+    return f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} worse than the baseline{which}."
+
+
+def out_of_bounds(night: Night) -> list[str]:
+    """Name the canaries that did not pass."""
+    failed = night.figures.filter((pl.col("kind") == "canary") & ~pl.col("passed").fill_null(False))
+    return list(dict.fromkeys(str(name) for name in failed["experiment"]))
 
 
 def lines(night: Night, verdict: Verdict) -> list[tuple[str, str]]:
@@ -109,9 +115,10 @@ def lines(night: Night, verdict: Verdict) -> list[tuple[str, str]]:
         made.append(("Baseline", f"{text}: {base['reason']}" if base.get("reason") else text))
     else:
         made.append(("Baseline", f"none; `{_ACCEPT}` makes this night the baseline"))
-    canaries = night.figures.filter(pl.col("kind") == "canary")
-    if canaries.height:
-        made.append(("Canaries", _canaries(canaries)))
+    count = night.figures.filter(pl.col("kind") == "canary").height
+    if count:
+        out = out_of_bounds(night)
+        made.append(("Canaries", f"out of bounds: {labelled(out)}" if out else f"all {count} figures within bounds"))
     return made
 
 
@@ -121,14 +128,6 @@ def _bit_equal(verdict: Verdict) -> str:
     if verdict.bit_equal:
         return "yes: all rows are the same bytes as the baseline's"
     return "no: some rows differ from the baseline's"
-
-
-def _canaries(rows: pl.DataFrame) -> str:
-    out = rows.filter(~pl.col("passed").fill_null(False))
-    if out.is_empty():
-        return f"all {rows.height} within their bounds" if rows.height > 1 else "the one there is within its bounds"
-    names = list(dict.fromkeys(str(name) for name in out["experiment"]))
-    return f"{out.height} of {rows.height} out of bounds: {labelled(names)}"
 
 
 def counts(verdict: Verdict) -> list[tuple[str, int, str]]:
