@@ -93,7 +93,7 @@ JUNIT = {
     "failure": {"type", "message"},
     "skipped": {"type", "message"},
 }
-"""Elements and attributes of the schema that the Jenkins plugin xunit publishes (junit-10.xsd), less what we never use."""
+"""Elements and attributes of the schema that the Jenkins plugin xunit publishes (junit-10.xsd), those that we use."""
 
 
 def test_junit_has_what_its_readers_know(night):
