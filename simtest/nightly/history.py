@@ -26,6 +26,9 @@ HISTORY: dict[str, pl.DataType] = {
 _NEEDED = ("kind", "experiment", "estimator", "quantity", "value", "run_id", "started", "profile")
 """Without these a file is no night's; the others, which a later version may have added, are null where they lack."""
 
+DIGEST_DIGITS = 16
+"""Digits of a place's hash that are kept: enough to see whether two nights are the same."""
+
 TRENDS = ("mean_deg", "unanswered", "coverage95")
 """Quantities of settings whose course over the nights the page shows."""
 
@@ -54,6 +57,8 @@ def history_rows(night: Night, verdict: Verdict) -> pl.DataFrame:
         "source_hash": run["source_hash"],
     }
     figures = night.figures.select(pl.col(name).cast(dtype) for name, dtype in FIGURES.items())
+    # Whole, it would be most of the file.
+    figures = figures.with_columns(pl.col("digest").str.slice(0, DIGEST_DIGITS))
     return figures.with_columns(pl.lit(value, dtype=HISTORY[name]).alias(name) for name, value in constant.items())
 
 
