@@ -16,7 +16,7 @@ import polars as pl
 from benchmarks.measuring import Figure
 from simtest.gate.records import PLACE, Night, Verdict
 from simtest.nightly.baseline import accept
-from simtest.nightly.history import append, history_rows, read_history
+from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
 from simtest.nightly.layout import Reports
 from simtest.nightly.run import judge, publish, run_nightly
 from simtest.spec import load_profile
@@ -39,7 +39,7 @@ def figures() -> list[Figure]:
         accept(reports, "quick", "first night")
         generate(reports, outcome.night, NIGHTS)
         start = time.perf_counter()
-        history, _ = read_history(reports.history, "quick")
+        history, _ = read_history(reports.history, "quick", TREND_COLUMNS, TRENDS)
         read_s = time.perf_counter() - start
         verdict = judge(outcome.night, outcome.night)
         folder = reports.work / "page"
@@ -104,7 +104,7 @@ def _main(folder: str, profile: str = "quick") -> None:
     outcome = run_nightly(described, reports, workers=2)
     accept(reports, described.name, "first night")
     generate(reports, outcome.night)
-    history, _ = read_history(reports.history, described.name)
+    history, _ = read_history(reports.history, described.name, TREND_COLUMNS, TRENDS)
     scratch = reports.work / "page"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()

@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 import polars as pl
 
 from simtest.files import sync_folder, write_atomically
-from simtest.gate.records import FIGURES, Night, Verdict
+from simtest.gate.records import FIGURES, PLACE, Night, Verdict
 from simtest.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
@@ -25,6 +25,17 @@ HISTORY: dict[str, pl.DataType] = {
 
 _NEEDED = ("kind", "experiment", "estimator", "quantity", "value", "run_id", "started", "profile")
 """Without these a file is no night's; the others, which a later version may have added, are null where they lack."""
+
+DIGEST_DIGITS = 16
+"""Digits of a place's hash that are kept: enough to see whether two nights are the same."""
+
+TRENDS = ("mean_deg", "unanswered", "coverage95")
+"""Quantities of settings whose course over the nights the page shows."""
+
+TREND_COLUMNS = (
+    "kind", *PLACE, "quantity", "unit", "value", "run_id", "started", "commit", "state", "profile",
+)  # fmt: skip
+"""Columns that the page needs of the history: all of 1,000 nights would take gigabytes."""
 
 MAX_NAMED = 5
 """Damaged files that the notes name one by one."""
@@ -46,6 +57,8 @@ def history_rows(night: Night, verdict: Verdict) -> pl.DataFrame:
         "source_hash": run["source_hash"],
     }
     figures = night.figures.select(pl.col(name).cast(dtype) for name, dtype in FIGURES.items())
+    # Whole, it would be most of the file.
+    figures = figures.with_columns(pl.col("digest").str.slice(0, DIGEST_DIGITS))
     return figures.with_columns(pl.lit(value, dtype=HISTORY[name]).alias(name) for name, value in constant.items())
 
 
@@ -85,7 +98,12 @@ def short_commit(commit: str | None) -> str:
     return "".join(found.groups()) if found else "unknown"
 
 
-def read_history(folder: Path, profile: str | None = None) -> tuple[pl.DataFrame, list[str]]:
+def read_history(
+    folder: Path,
+    profile: str | None = None,
+    columns: Sequence[str] = tuple(HISTORY),
+    quantities: Sequence[str] | None = None,
+) -> tuple[pl.DataFrame, list[str]]:
     """Read the history; files that are damaged or foreign are skipped, with a warning each.
 
     Parameters
@@ -94,18 +112,22 @@ def read_history(folder: Path, profile: str | None = None) -> tuple[pl.DataFrame
         The history; may be missing.
     profile : str, optional
         Only the nights of this profile.
+    columns : sequence of str
+        Of `HISTORY`, `run_id`, `started`, `profile`, `kind` and `quantity` among them.
+    quantities : sequence of str, optional
+        Of the settings' figures, only these; default all.
 
     Returns
     -------
     rows : polars.DataFrame
-        Columns `HISTORY`, night after night by the time they started, whatever their folders are called.
+        The columns, night after night by the time they started, whatever their folders are called.
     notes : list of str
         What was skipped, for the page.
     """
     files = sorted(path for path in folder.glob("date=*/commit=*/*.parquet") if not path.name.startswith("."))
     # Reading waits for the disk more than it works.
     with ThreadPoolExecutor(4) as pool:
-        read = list(pool.map(_read, files))
+        read = list(pool.map(lambda file: _read(file, columns, quantities), files))
     nights: dict[str, pl.DataFrame] = {}
     skipped = []
     for file, found in zip(files, read, strict=True):
@@ -117,7 +139,16 @@ def read_history(folder: Path, profile: str | None = None) -> tuple[pl.DataFrame
             nights[found["run_id"][0]] = found
     wanted = [night for night in nights.values() if profile in (None, night["profile"][0])]
     wanted.sort(key=lambda night: (night["started"][0], night["run_id"][0]))
-    return pl.concat([pl.DataFrame(schema=HISTORY), *wanted]), _told(skipped)
+    return pl.concat([trend_columns(pl.DataFrame(schema=HISTORY), columns), *wanted]), _told(skipped)
+
+
+def trend_columns(
+    rows: pl.DataFrame, columns: Sequence[str] = TREND_COLUMNS, quantities: Sequence[str] | None = None
+) -> pl.DataFrame:
+    """Give the columns and figures of some rows of the history that `read_history` would give."""
+    if quantities is not None:
+        rows = rows.filter((pl.col("kind") != "setting") | pl.col("quantity").is_in(quantities))
+    return rows.select(columns)
 
 
 def _twice(found: pl.DataFrame, nights: Mapping[str, pl.DataFrame]) -> str:
@@ -132,25 +163,26 @@ def _told(skipped: list[str]) -> list[str]:
     return [f"History: {len(skipped)} {files} skipped: {'; '.join(skipped[:MAX_NAMED])}{more}."]
 
 
-def _read(file: Path) -> pl.DataFrame | str:
+def _read(file: Path, columns: Sequence[str], quantities: Sequence[str] | None) -> pl.DataFrame | str:
     """Read one night's file; text says why it cannot be used."""
     try:
-        found = pl.read_parquet(file, hive_partitioning=False, memory_map=False)
+        held = pl.read_parquet_schema(file)
+        if missing := [name for name in _NEEDED if name not in held]:
+            return f"no night's figures: no column {missing[0]}"
+        wanted = [name for name in columns if name in held]
+        found = pl.read_parquet(file, columns=wanted, hive_partitioning=False, memory_map=False)
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         return f"not a readable Parquet file: {_first_line(error)}"
-    if missing := [name for name in _NEEDED if name not in found.columns]:
-        return f"no night's figures: no column {missing[0]}"
-    columns = [
-        (pl.col(name) if name in found.columns else pl.lit(None)).cast(dtype).alias(name)
-        for name, dtype in HISTORY.items()
+    as_written = [
+        (pl.col(name) if name in wanted else pl.lit(None)).cast(HISTORY[name]).alias(name) for name in columns
     ]
     try:
-        found = found.select(columns)
+        found = found.select(as_written)
     except pl.exceptions.PolarsError as error:
         return f"no night's figures: {_first_line(error)}"
     if not found.height or found["run_id"].n_unique() > 1 or found.select(_NEEDED[5:]).null_count().row(0) != (0, 0, 0):
         return "no night's figures: must be those of one run, with its id, start and profile"
-    return found
+    return trend_columns(found, columns, quantities)
 
 
 def _first_line(error: Exception) -> str:

@@ -36,7 +36,8 @@ def by_experiment(night: Night, verdict: Verdict) -> list[dict[str, Any]]:
     )
     table = {str(row["experiment"]): row for row in counted.iter_rows(named=True)}
     compared = without_canaries(night, verdict).group_by("experiment", "outcome").len().sort("experiment")
-    for name, outcome, number in compared.rows():
+    # Without a baseline there are no outcomes to count.
+    for name, outcome, number in compared.rows() if verdict.baseline is not None else ():
         empty = {"experiment": name, "rows": None, "answered": None, "missed": None, "false": None}
         table.setdefault(str(name), empty)[outcome] = number
     return [{**dict.fromkeys(OUTCOMES, 0), **row} for row in table.values()]

@@ -13,7 +13,15 @@ from simtest.engines.base import Engine
 from simtest.errors import SimtestError
 from simtest.gate.records import Night, Verdict
 from simtest.nightly.baseline import load_baseline
-from simtest.nightly.history import append, clock_note, history_rows, read_history
+from simtest.nightly.history import (
+    TREND_COLUMNS,
+    TRENDS,
+    append,
+    clock_note,
+    history_rows,
+    read_history,
+    trend_columns,
+)
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.measure import measure_night
 from simtest.nightly.outputs import FILES, write_outputs
@@ -107,12 +115,12 @@ def run_nightly(
         with scratch(reports, run_id) as folder:
             night = measure_night(profile, folder, run_id, command, variant, engine, workers, progress)
             verdict = judge(night, baseline)
-            history, notes = read_history(reports.history, profile.name)
+            history, notes = read_history(reports.history, profile.name, TREND_COLUMNS, TRENDS)
             late = clock_note(history, datetime.fromisoformat(night.run["started"]))
             verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *([late] if late else []), *notes))
             rows = history_rows(night, verdict)
             file = append(reports.history, rows)
-            history = pl.concat([history, rows]).sort("started", "run_id", maintain_order=True)
+            history = pl.concat([history, trend_columns(rows, quantities=TRENDS)])
             worse = ordered(without_canaries(night, verdict), "worse")
             worst = worst_cases(night.rows, worse, experiments_of(profile), folder / "worst", variant)
             target = publish(reports, folder, night, verdict, history, worst)
@@ -149,7 +157,7 @@ def publish(
     verdict : Verdict
         Of the gate.
     history : polars.DataFrame
-        Columns `HISTORY`, the night's own among them.
+        Columns `TREND_COLUMNS`, the night's own among them.
     worst : tuple of Path
         Gallery items of the worst cases.
 

@@ -13,7 +13,7 @@ from polars.testing import assert_frame_equal
 from simtest.errors import InputError
 from simtest.nightly import layout
 from simtest.nightly.baseline import accept, load_baseline
-from simtest.nightly.history import HISTORY, append, clock_note, history_rows, read_history, short_commit
+from simtest.nightly.history import HISTORY, TREND_COLUMNS, append, clock_note, history_rows, read_history, short_commit
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.storage import BASELINE_ROWS, TONIGHT_ROWS, load_night, save_night
 from tests.unit.nightly_samples import STARTED, make_night, make_rows, no_baseline
@@ -149,6 +149,18 @@ def test_a_column_that_an_older_night_lacks_is_null(tmp_path):
     read, notes = read_history(tmp_path)
     assert notes == []
     assert read["digest"].null_count() == read.height > 0
+
+
+def test_the_page_reads_what_it_shows(tmp_path):
+    keep(tmp_path, 0)
+    keep(tmp_path, 1)
+    every, _ = read_history(tmp_path)
+    few, _ = read_history(tmp_path, None, TREND_COLUMNS, ("median_deg",))
+    assert few.columns == list(TREND_COLUMNS)
+    kept = every.filter((pl.col("kind") != "setting") | (pl.col("quantity") == "median_deg"))
+    assert_frame_equal(few, kept.select(TREND_COLUMNS))
+    assert 0 < few.height < every.height
+    assert read_history(tmp_path / "none", None, TREND_COLUMNS)[0].columns == list(TREND_COLUMNS)
 
 
 def test_a_clock_that_went_back_is_told(tmp_path):

@@ -3,9 +3,11 @@
 import errno
 import json
 import os
+import re
 import signal
 import sys
 from datetime import timedelta
+from pathlib import Path
 
 import polars as pl
 import pytest
@@ -22,6 +24,8 @@ from simtest.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
 from tests.unit.nightly_samples import STARTED, canary, make_night, regression
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
@@ -130,6 +134,13 @@ def test_a_profile_cuts_experiments_down(tmp_path):
     cases = expand(experiment)
     assert [case.swept["surface.viewpoint"] for case in cases] == [0, 1] * 4
     assert {case.data["sensor"]["noise_sigma"] for case in cases} == {0.01}
+
+
+def test_the_profile_of_the_page_on_the_nightly_is_sound(tmp_path):
+    (text,) = re.findall(r"```toml\n(.*?)```", (DOCS / "nightly.md").read_text(), re.DOTALL)
+    profile = profile_of(tmp_path, text)
+    curvature, dark = experiments_of(profile)
+    assert (curvature.realisations, dark.name, len(expand(dark))) == (8, "colon_dark", 4)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,55 @@
+"""Run time and memory, as benchmarks and the nightly measure them."""
+
+import os
+import subprocess
+import sys
+
+from simtest.measuring import PeakMemory, in_turns, memory_of_tree_mib, times_in_turns
+
+
+def test_functions_are_timed_in_turns():
+    called, now = [], iter(range(100))
+
+    def work(name, ticks):
+        def run():
+            called.append(name)
+            for _ in range(ticks):
+                next(now)
+
+        return run
+
+    times = times_in_turns({"a": work("a", 1), "b": work("b", 3)}, 2, clock=lambda: next(now))
+    # Once beforehand, then in turns; the clock itself ticks once.
+    assert called == ["a", "b"] * 3
+    assert times == {"a": [2, 2], "b": [4, 4]}
+
+
+def test_the_median_is_given():
+    durations = iter([5.0, 1.0, 3.0, 9.0])
+    clock = [0.0]
+
+    def run():
+        clock[0] += next(durations)
+
+    times = times_in_turns({"a": run}, 3, clock=lambda: clock[0])
+    assert times == {"a": [1.0, 3.0, 9.0]}
+    assert 0 <= in_turns({"a": lambda: None}, 3)["a"] < 1
+
+
+def test_memory_of_all_processes_is_seen():
+    """A child's memory counts, and the peak outlasts it."""
+    size_mib = 120
+    code = f"held = bytearray({size_mib} << 20); held[::4096] = b'x' * len(held[::4096]); print(flush=True); input()"
+    alone = memory_of_tree_mib(os.getpid())
+    with PeakMemory(os.getpid(), step_s=0.01) as memory:
+        child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        child.stdout.readline()
+        together = memory_of_tree_mib(os.getpid())
+        child.communicate("\n")
+    assert together > alone + 0.9 * size_mib
+    assert memory.peak_mib >= together - 10
+    assert memory_of_tree_mib(os.getpid()) < alone + 0.5 * size_mib
+
+
+def test_the_memory_of_no_process_is_unknown():
+    assert memory_of_tree_mib(2**22 + 1) is None
