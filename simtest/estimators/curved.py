@@ -86,7 +86,7 @@ def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
 
 def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
     """Give the curvature, and whether the spot is round within the noise."""
-    values = np.linalg.eigvalsh(spot.moments)
+    values = np.asarray(np.linalg.eigvalsh(spot.moments), dtype=np.float64)
     if values[0] <= 0:
         return Failure(Reason.DEGENERATE_CONIC, f"moments at the peak {values[0]:.3g}, {values[1]:.3g} rad^2")
     shrunk, is_round = _without_noise(values, spot.moments_covariance)

@@ -12,6 +12,7 @@ from simtest.detection import detect
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.estimators.lobe_models import ColocatedQuadric
 from simtest.estimators.photometric import photometric
 from simtest.geometry import smooth
 from simtest.geometry.vectors import angle_deg
@@ -145,6 +146,33 @@ def test_without_its_corrections_the_axis_ratio_is_noticeably_off(bench):
     made, true = bench.estimates(tube(3.0), {"cone_axis": cone_axis})
     raw = np.array([e["cone_axis"].axis_ratio for e in made]) * (1 + true.kd_max) / (1 + true.kd_min)
     assert stats.ttest_1samp(raw, 1.01, alternative="greater").pvalue < ALPHA
+
+
+def direction_bound_deg(camera, kd, spin_deg=20.0):
+    """Cramer-Rao bound of a cylinder's principal direction from all pixels of its lobe, n known, standard deviation."""
+    rays = camera.unproject(camera.pixel_centres().reshape(-1, 2))
+    along = np.radians(spin_deg)
+    cos, sin = np.cos(along), np.sin(along)
+    K = kd * np.array([cos * cos, cos * sin, sin * sin])
+    intensity, J = ColocatedQuadric(rays, np.eye(3), K, 0.0, EXPONENT).evaluate()
+    covariance = np.linalg.inv(J.T @ J) * (SIGMA * intensity.max()) ** 2
+    difference, twice = K[0] - K[2], 2 * K[1]
+    # The direction is atan(2 K12 / (K11 - K22)) / 2.
+    slope = np.array([0, 0, -twice, 2 * difference, twice, 0]) / (2 * (difference**2 + twice**2))
+    return float(np.degrees(np.sqrt(slope @ covariance @ slope)))
+
+
+@pytest.mark.render
+def test_principal_directions_come_near_their_bound(bench):
+    """Squared errors over the bound's square are chi-squared for the best estimator; this one may have 2.5 times it."""
+    count, kd = 40, 0.12
+    made, true = bench.estimates(tube(kd), {"curved": curved}, count=count)
+    errors = np.array([curvature_errors(e["curved"], true)["direction_error_deg"] for e in made])
+    bound = direction_bound_deg(bench.view(tube(kd), [{}])[1], kd)
+    assert 0.4 < bound < 0.6
+    share = float(np.sum((errors / bound) ** 2))
+    assert share >= stats.chi2.ppf(ALPHA, count)
+    assert share <= 2.5 * stats.chi2.ppf(1 - ALPHA, count)
 
 
 @pytest.mark.render
