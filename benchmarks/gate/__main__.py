@@ -43,7 +43,8 @@ def faults() -> str:
         canaries = ", ".join(caught.canaries[:3]) + (
             f" and {len(caught.canaries) - 3} more" * (len(caught.canaries) > 3)
         )
-        rows.append((caught.name, canaries or "none", _percent(caught.paired), _percent(caught.fresh)))
+        stops = "; the night stops" if caught.stops else ""
+        rows.append((caught.name + stops, canaries or "none", _percent(caught.paired), _percent(caught.fresh)))
     return _table(("planted fault", "canaries that fail", "gate, same seeds", "gate, fresh seeds"), rows)
 
 

@@ -71,12 +71,15 @@ class Caught:
         Those that failed.
     paired, fresh : Rate
         Of nights of the same seeds, and of others.
+    stops : bool
+        Whether the night could not be run: exit 2, which is seen as well.
     """
 
     name: str
     canaries: tuple[str, ...]
     paired: Rate
     fresh: Rate
+    stops: bool
 
     @property
     def share(self) -> float:
@@ -209,7 +212,7 @@ def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS
             equal = equal_places(sound, rows) if rows.height == sound.height else None
             after = Source.of(rows)
             both = tuple(_rate(name, draw, nights) for draw in _draws(before, after, equal))
-        made.append(Caught(name, watch, *both))
+        made.append(Caught(name, watch, *both, rows is None))
     return made
 
 

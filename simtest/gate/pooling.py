@@ -15,6 +15,9 @@ MIN_PLACES = 10
 MIN_UNITS = 5
 """Of fewer places, each must have as many units, for the places' own standard errors to be taken."""
 
+MOST_SHARE = 2.0
+"""A difference over the mean of both nights is no larger."""
+
 
 def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     """Test many places at once.
@@ -38,7 +41,9 @@ def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     if quantity.relative:
         scale = np.maximum((found.baseline + found.tonight) / 2, quantity.scale_floor)
         shares, deviations = shares / scale, deviations / scale
-    mean, deviation, freedom = _mean(shares, deviations, found, quantity.is_rate)
+    mean, deviation, freedom = _mean(
+        shares, deviations, found, MOST_SHARE if quantity.relative and quantity.span else quantity.span
+    )
     half = half_width(deviation, freedom)
     baseline = np.ones(1) if quantity.relative else np.array([found.baseline.mean()])
     return Outcomes(
@@ -48,15 +53,15 @@ def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     )  # fmt: skip
 
 
-def _mean(shares: Array, deviations: Array, found: Outcomes, is_rate: bool) -> tuple[Array, Array, Array]:
+def _mean(shares: Array, deviations: Array, found: Outcomes, span: float) -> tuple[Array, Array, Array]:
     """Give the mean over places, its standard error and degrees of freedom, each of shape (1,)."""
     count = len(shares)
     mean = np.array([shares.mean()])
     if count >= MIN_PLACES:
         residuals = shares - mean
-        if is_rate:
+        if span:
             # Two invented units, as in each place.
-            extra = float(np.mean(1 / found.n))
+            extra = span * float(np.mean(1 / found.n))
             residuals = np.append(residuals, [extra, -extra])
         deviation = np.sqrt(np.sum(residuals**2) / (count - 1) / count)
         return mean, np.array([deviation]), np.array([count - 1.0])

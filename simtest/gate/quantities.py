@@ -33,8 +33,9 @@ class Quantity:
         Margin as a share of the baseline.
     absolute : float
         Margin in the unit; the larger of the two counts.
-    is_rate : bool
-        Whether rows are 0 or 1, or counts: two invented units then keep small samples from showing no variance.
+    span : float
+        From the least to the most harm of a row, where rows as a rule are at one of both: two invented units then keep
+        small samples, which may all be alike by chance, from showing no variance. 0 where rows differ by nature.
     falls : bool
         Whether the figure shown is 1 less the harm: coverage is worse where it falls.
     """
@@ -42,7 +43,7 @@ class Quantity:
     unit: str
     relative: float
     absolute: float
-    is_rate: bool = False
+    span: float = 0.0
     falls: bool = False
 
     @property
@@ -56,11 +57,11 @@ def quantities(limits: Limits) -> dict[str, Quantity]:
     error = Quantity("deg", limits.relative, limits.absolute_deg)
     return {
         "mean_deg": error,
-        "mean_penalised_deg": error,
+        "mean_penalised_deg": Quantity("deg", limits.relative, limits.absolute_deg, span=PENALTY_DEG),
         "axis_ratio": Quantity("", limits.relative, limits.absolute_ratio),
-        "unanswered": Quantity("", 0.0, limits.rate, is_rate=True),
-        "false": Quantity("a frame", 0.0, limits.rate, is_rate=True),
-        "coverage95": Quantity("", 0.0, limits.coverage, is_rate=True, falls=True),
+        "unanswered": Quantity("", 0.0, limits.rate, span=1.0),
+        "false": Quantity("a frame", 0.0, limits.rate, span=1.0),
+        "coverage95": Quantity("", 0.0, limits.coverage, span=1.0, falls=True),
     }
 
 
