@@ -33,7 +33,7 @@ def rises() -> str:
     """Give the table of a rise of one estimator's errors."""
     found = proof.rises(load_bank(proof.bank_folder()))
     rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh in found]
-    return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "size"), rows)
+    return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "10 % is beyond the margin in"), rows)
 
 
 def faults() -> str:

@@ -13,6 +13,9 @@ from benchmarks.gate.nights import Draw, Found, Fresh, Paired, Source, equal_pla
 from benchmarks.measuring import Figure
 from simtest.engines import make_engine
 from simtest.errors import SimtestError
+from simtest.gate.contrasts import margin_of
+from simtest.gate.limits import Limits
+from simtest.gate.quantities import quantities
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.noise import noises
 from simtest.spec import Experiment
@@ -157,8 +160,9 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
     for estimator in sorted(bank["estimator"].unique()):
         after = Source(raised(bank, estimator, RISE), source.unit, source.setting)
         own = bank.filter(pl.col("estimator") == estimator).group_by("experiment", "setting")
-        means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls()
-        about = f"{int((means > 0.02).sum())} of {means.len()} settings have a mean above 0.02 deg"
+        means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls().to_numpy()
+        margins = RISE * means / margin_of(quantities(Limits())["mean_deg"], means)
+        about = f"{(margins > 1).sum()} of {len(means)} settings; {margins.mean():.2g} margins in the mean"
         made.append(
             (
                 _rate(estimator, Paired(source, after, N), nights, about=about),

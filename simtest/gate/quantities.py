@@ -71,7 +71,11 @@ ANSWERED = IS_TRUE & (pl.col("status") == "ok") & pl.col("error_deg").is_finite(
 """Rows of true highlights with a normal; an error that is no number is no answer."""
 
 RATIO_OFF = (
-    pl.when(ANSWERED & pl.col("axis_ratio").is_finite() & (pl.col("axis_ratio_law") > 0))
+    pl.when(
+        ANSWERED
+        & pl.all_horizontal(pl.col("axis_ratio", "axis_ratio_law").is_finite())
+        & (pl.col("axis_ratio_law") > 0)
+    )
     .then((pl.col("axis_ratio") / pl.col("axis_ratio_law") - 1).abs().clip(upper_bound=WORST_RATIO))
     .otherwise(None)
 )
