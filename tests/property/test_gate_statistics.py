@@ -164,7 +164,7 @@ def test_places_together_keep_their_level_under_heavy_tails(units):
 
 def test_few_places_of_few_units_say_nothing_together():
     x = pairs_of(np.ones(2), np.array([2.0, 3.0]))
-    table = paired_sums(pl.concat([x, x.with_columns(place=pl.lit(1, pl.Int64))])).sort("place")
+    table = paired_sums(pl.concat([x, x.with_columns(pl.lit(1, x["place"].dtype).alias("place"))])).sort("place")
     found = pooled(paired(table, ERROR), ERROR)
     assert np.isnan(found.worse).all()
     np.testing.assert_allclose(found.difference, [2 * 1.5 / 3.5], rtol=1e-12, atol=1e-300)
