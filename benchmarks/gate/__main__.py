@@ -33,7 +33,7 @@ def rises() -> str:
     """Give the table of a rise of one estimator's errors."""
     found = proof.rises(load_bank(proof.bank_folder()))
     rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh in found]
-    return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "size"), rows)
+    return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "10 % is beyond the margin in"), rows)
 
 
 def faults() -> str:
@@ -43,7 +43,8 @@ def faults() -> str:
         canaries = ", ".join(caught.canaries[:3]) + (
             f" and {len(caught.canaries) - 3} more" * (len(caught.canaries) > 3)
         )
-        rows.append((caught.name, canaries or "none", _percent(caught.paired), _percent(caught.fresh)))
+        stops = "; the night stops" if caught.stops else ""
+        rows.append((caught.name + stops, canaries or "none", _percent(caught.paired), _percent(caught.fresh)))
     return _table(("planted fault", "canaries that fail", "gate, same seeds", "gate, fresh seeds"), rows)
 
 

@@ -13,6 +13,9 @@ from benchmarks.gate.nights import Draw, Found, Fresh, Paired, Source, equal_pla
 from benchmarks.measuring import Figure
 from simtest.engines import make_engine
 from simtest.errors import SimtestError
+from simtest.gate.contrasts import margin_of
+from simtest.gate.limits import Limits
+from simtest.gate.quantities import quantities
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.noise import noises
 from simtest.spec import Experiment
@@ -71,12 +74,15 @@ class Caught:
         Those that failed.
     paired, fresh : Rate
         Of nights of the same seeds, and of others.
+    stops : bool
+        Whether the night could not be run: exit 2, which is seen as well.
     """
 
     name: str
     canaries: tuple[str, ...]
     paired: Rate
     fresh: Rate
+    stops: bool
 
     @property
     def share(self) -> float:
@@ -154,8 +160,9 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
     for estimator in sorted(bank["estimator"].unique()):
         after = Source(raised(bank, estimator, RISE), source.unit, source.setting)
         own = bank.filter(pl.col("estimator") == estimator).group_by("experiment", "setting")
-        means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls()
-        about = f"{int((means > 0.02).sum())} of {means.len()} settings have a mean above 0.02 deg"
+        means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls().to_numpy()
+        margins = RISE * means / margin_of(quantities(Limits())["mean_deg"], means)
+        about = f"{(margins > 1).sum()} of {len(means)} settings; {margins.mean():.2g} margins in the mean"
         made.append(
             (
                 _rate(estimator, Paired(source, after, N), nights, about=about),
@@ -209,7 +216,7 @@ def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS
             equal = equal_places(sound, rows) if rows.height == sound.height else None
             after = Source.of(rows)
             both = tuple(_rate(name, draw, nights) for draw in _draws(before, after, equal))
-        made.append(Caught(name, watch, *both))
+        made.append(Caught(name, watch, *both, rows is None))
     return made
 
 

@@ -103,11 +103,13 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
     baseline, difference = s["x"] / rows, s["d"] / rows
     margin = margin_of(quantity, baseline)
     moments = dict(s)
-    if quantity.is_rate:
-        # Two invented units, one worse and one better: without them few units that agree would show no variance.
+    if quantity.span:
+        # Two invented units, one that harms tonight alone and one that harmed before alone.
         size = rows / units
-        moments |= {"units": units + 2, "rows": rows + 2 * size, "dd": s["dd"] + 2 * size**2}
-        moments["nn"] = s["nn"] + 2 * size**2
+        most = quantity.span * size
+        moments |= {"units": units + 2, "rows": rows + 2 * size, "x": s["x"] + most, "nn": s["nn"] + 2 * size**2}
+        moments |= {"dd": s["dd"] + 2 * most**2, "xx": s["xx"] + most**2, "dx": s["dx"] - most**2}
+        moments["xn"] = s["xn"] + most * size
 
     def contrast(share: float, shift: float, sign: float) -> tuple[Array, Array]:
         """Give sign d - share x - shift, mean and standard error."""
@@ -152,7 +154,7 @@ def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> O
     Outcomes
         `within` is false: there are no pairs.
     """
-    x, y = (_Arm.of(table, quantity.is_rate) for table in (before, after))
+    x, y = (_Arm.of(table, quantity.span) for table in (before, after))
     margin = margin_of(quantity, x.shown)
 
     def test(worse: _Arm, better: _Arm, share_of: _Arm) -> Array:
@@ -177,7 +179,7 @@ def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> O
 
 @dataclass(frozen=True)
 class _Arm:
-    """One night's means at N places: `shown` as they are, `mean` with the invented units of a rate."""
+    """One night's means at N places: `shown` as they are, `mean` with the invented units."""
 
     units: Array
     shown: Array
@@ -186,15 +188,16 @@ class _Arm:
     freedom: Array
 
     @classmethod
-    def of(cls, table: pl.DataFrame, is_rate: bool) -> "_Arm":
+    def of(cls, table: pl.DataFrame, span: float) -> "_Arm":
         units, rows, x, xx, nn, xn = (
             table[name].to_numpy().astype(float) for name in ("units", "rows", "x", "xx", "nn", "xn")
         )
         shown, seen = x / rows, units
-        if is_rate:
+        if span:
             # One that harms and one that does not [Agresti and Caffo 2000].
             size = rows / units
-            x, xx, nn, xn = x + size, xx + size**2, nn + 2 * size**2, xn + size**2
+            most = span * size
+            x, xx, nn, xn = x + most, xx + most**2, nn + 2 * size**2, xn + most * size
             rows, units = rows + 2 * size, units + 2
         mean = x / rows
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -9,11 +9,14 @@ import numpy as np
 from simtest.gate.contrasts import Array, Outcomes, half_width, tail
 from simtest.gate.quantities import Quantity
 
-MIN_PLACES = 10
-"""From this many places on, the places themselves are the sample."""
-
 MIN_UNITS = 5
-"""Of fewer places, each must have as many units, for the places' own standard errors to be taken."""
+"""Where each place has as many units, the places' own standard errors are taken."""
+
+MIN_PLACES = 10
+"""Where not, but there are as many places, the places themselves are the sample."""
+
+MOST_SHARE = 2.0
+"""A difference over the mean of both nights is no larger."""
 
 
 def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
@@ -38,7 +41,9 @@ def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     if quantity.relative:
         scale = np.maximum((found.baseline + found.tonight) / 2, quantity.scale_floor)
         shares, deviations = shares / scale, deviations / scale
-    mean, deviation, freedom = _mean(shares, deviations, found, quantity.is_rate)
+    mean, deviation, freedom = _mean(
+        shares, deviations, found, MOST_SHARE if quantity.relative and quantity.span else quantity.span
+    )
     half = half_width(deviation, freedom)
     baseline = np.ones(1) if quantity.relative else np.array([found.baseline.mean()])
     return Outcomes(
@@ -48,21 +53,21 @@ def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     )  # fmt: skip
 
 
-def _mean(shares: Array, deviations: Array, found: Outcomes, is_rate: bool) -> tuple[Array, Array, Array]:
+def _mean(shares: Array, deviations: Array, found: Outcomes, span: float) -> tuple[Array, Array, Array]:
     """Give the mean over places, its standard error and degrees of freedom, each of shape (1,)."""
     count = len(shares)
     mean = np.array([shares.mean()])
-    if count >= MIN_PLACES:
-        residuals = shares - mean
-        if is_rate:
-            # Two invented units, as in each place.
-            extra = float(np.mean(1 / found.n))
-            residuals = np.append(residuals, [extra, -extra])
-        deviation = np.sqrt(np.sum(residuals**2) / (count - 1) / count)
-        return mean, np.array([deviation]), np.array([count - 1.0])
-    if (found.n < MIN_UNITS).any():
+    if (found.n >= MIN_UNITS).all():
+        variances = deviations**2 / count**2
+        whole = variances.sum()
+        freedom = whole**2 / np.sum(variances**2 / found.freedom) if whole > 0 else float(found.freedom.min())
+        return mean, np.array([np.sqrt(whole)]), np.array([freedom])
+    if count < MIN_PLACES:
         return mean, np.array([np.nan]), np.zeros(1)
-    variances = deviations**2 / count**2
-    whole = variances.sum()
-    freedom = whole**2 / np.sum(variances**2 / found.freedom) if whole > 0 else float(found.freedom.min())
-    return mean, np.array([np.sqrt(whole)]), np.array([freedom])
+    residuals = shares - mean
+    if span:
+        # Two invented units, as in each place.
+        extra = span * float(np.mean(1 / found.n))
+        residuals = np.append(residuals, [extra, -extra])
+    deviation = np.sqrt(np.sum(residuals**2) / (count - 1) / count)
+    return mean, np.array([deviation]), np.array([count - 1.0])

@@ -33,8 +33,9 @@ class Quantity:
         Margin as a share of the baseline.
     absolute : float
         Margin in the unit; the larger of the two counts.
-    is_rate : bool
-        Whether rows are 0 or 1, or counts: two invented units then keep small samples from showing no variance.
+    span : float
+        From the least to the most harm of a row, where rows as a rule are at one of both: two invented units then keep
+        small samples, which may all be alike by chance, from showing no variance. 0 where rows differ by nature.
     falls : bool
         Whether the figure shown is 1 less the harm: coverage is worse where it falls.
     """
@@ -42,7 +43,7 @@ class Quantity:
     unit: str
     relative: float
     absolute: float
-    is_rate: bool = False
+    span: float = 0.0
     falls: bool = False
 
     @property
@@ -56,11 +57,11 @@ def quantities(limits: Limits) -> dict[str, Quantity]:
     error = Quantity("deg", limits.relative, limits.absolute_deg)
     return {
         "mean_deg": error,
-        "mean_penalised_deg": error,
+        "mean_penalised_deg": Quantity("deg", limits.relative, limits.absolute_deg, span=PENALTY_DEG),
         "axis_ratio": Quantity("", limits.relative, limits.absolute_ratio),
-        "unanswered": Quantity("", 0.0, limits.rate, is_rate=True),
-        "false": Quantity("a frame", 0.0, limits.rate, is_rate=True),
-        "coverage95": Quantity("", 0.0, limits.coverage, is_rate=True, falls=True),
+        "unanswered": Quantity("", 0.0, limits.rate, span=1.0),
+        "false": Quantity("a frame", 0.0, limits.rate, span=1.0),
+        "coverage95": Quantity("", 0.0, limits.coverage, span=1.0, falls=True),
     }
 
 
@@ -70,7 +71,11 @@ ANSWERED = IS_TRUE & (pl.col("status") == "ok") & pl.col("error_deg").is_finite(
 """Rows of true highlights with a normal; an error that is no number is no answer."""
 
 RATIO_OFF = (
-    pl.when(ANSWERED & pl.col("axis_ratio").is_finite() & (pl.col("axis_ratio_law") > 0))
+    pl.when(
+        ANSWERED
+        & pl.all_horizontal(pl.col("axis_ratio", "axis_ratio_law").is_finite())
+        & (pl.col("axis_ratio_law") > 0)
+    )
     .then((pl.col("axis_ratio") / pl.col("axis_ratio_law") - 1).abs().clip(upper_bound=WORST_RATIO))
     .otherwise(None)
 )

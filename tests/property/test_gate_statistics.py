@@ -4,15 +4,17 @@ import itertools
 
 import numpy as np
 import polars as pl
+import pytest
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from simtest.gate.compare import compare
-from simtest.gate.contrasts import paired, unpaired
+from simtest.gate.contrasts import Outcomes, paired, unpaired
 from simtest.gate.figures import setting_figures
 from simtest.gate.holm import holm
 from simtest.gate.limits import Limits
+from simtest.gate.pooling import pooled
 from simtest.gate.quantities import quantities
 from simtest.gate.records import OUTCOMES, Night
 from simtest.gate.units import paired_sums, sums
@@ -37,8 +39,8 @@ def closed(p, weights):
 @settings(max_examples=60, deadline=None)
 def test_holm_is_closed_testing(p, data):
     weights = data.draw(st.lists(st.floats(0.1, 10), min_size=len(p), max_size=len(p)))
-    np.testing.assert_allclose(holm(p, weights), closed(p, weights), rtol=1e-12)
-    np.testing.assert_allclose(holm(p), closed(p, [1.0] * len(p)), rtol=1e-12)
+    np.testing.assert_allclose(holm(p, weights), closed(p, weights), rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(holm(p), closed(p, [1.0] * len(p)), rtol=1e-12, atol=1e-300)
 
 
 def pairs_of(x, y):
@@ -128,3 +130,41 @@ def test_any_two_nights_have_a_verdict_without_a_nan(first, second):
     p = comparisons["p"].drop_nulls().to_numpy()
     assert ((p >= 0) & (p <= 1)).all()
     assert verdict.state in ("fine", "regression")
+
+
+PLACES, NIGHTS = 12, 300
+
+
+def pooled_p(units, factor):
+    """Give the pooled p-values of nights of heavy-tailed errors, tonight's times a factor."""
+    rng = np.random.default_rng(units)
+    shape = (NIGHTS * PLACES, units)
+    nights = [np.exp(1.2 * rng.standard_normal(shape)), factor * np.exp(1.2 * rng.standard_normal(shape))]
+    place, realisation = (axis.ravel() for axis in np.indices(shape))
+    tables = [
+        sums(pl.DataFrame({"place": place, "quantity": "q", "realisation": realisation, "value": v.ravel()})).sort(
+            "place"
+        )
+        for v in nights
+    ]
+    found = unpaired(*tables, ERROR)
+    parts = [np.s_[first : first + PLACES] for first in range(0, NIGHTS * PLACES, PLACES)]
+    return np.array(
+        [pooled(Outcomes(**{k: v[part] for k, v in vars(found).items()}), ERROR).worse[0] for part in parts]
+    )
+
+
+@pytest.mark.parametrize("units", [1, 2, 8])
+def test_places_together_keep_their_level_under_heavy_tails(units):
+    """At 0.05: as many of 300 nights as have a chance below 1e-3 / 3 are too many; a tenfold error must be seen."""
+    most = stats.binom.isf(1e-3 / 3, NIGHTS, 0.05)
+    assert (pooled_p(units, 1.0) <= 0.05).sum() <= most
+    assert (pooled_p(units, 10.0) <= 0.05).mean() > 0.8
+
+
+def test_few_places_of_few_units_say_nothing_together():
+    x = pairs_of(np.ones(2), np.array([2.0, 3.0]))
+    table = paired_sums(pl.concat([x, x.with_columns(pl.lit(1, x["place"].dtype).alias("place"))])).sort("place")
+    found = pooled(paired(table, ERROR), ERROR)
+    assert np.isnan(found.worse).all()
+    np.testing.assert_allclose(found.difference, [2 * 1.5 / 3.5], rtol=1e-12, atol=1e-300)
