@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 TEMPLATES = Path(__file__).parent
 _WORSE = ((640, 85), (640, 70), (560, 60), (480, 50), (420, 40))
@@ -26,8 +27,15 @@ def environment() -> "Environment":
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    made.filters["degrees"], made.filters["number"] = style.degrees, style.number
+    made.filters |= {"degrees": style.degrees, "number": style.number, "breakable": breakable}
     return made
+
+
+def breakable(name: str) -> "Markup":
+    """Give a name that may be broken behind its underscores, where a column is narrow."""
+    from markupsafe import Markup, escape
+
+    return Markup(str(escape(name)).replace("_", "_<wbr>"))
 
 
 def script_text(text: str) -> str:

@@ -37,35 +37,60 @@ def browser():
         launched.close()
 
 
-@pytest.fixture
-def opened(browser, address):
-    """Open the page; afterwards, nothing may have complained and nothing been asked of the network."""
-    complaints, asked, contexts = [], [], []
+class Reader:
+    """Opens the page, and hears what it complains of and what it asks of the network."""
 
-    def opener(viewport=DESKTOP, **more):
-        contexts.append(browser.new_context(viewport=viewport, **more))
-        page = contexts[-1].new_page()
+    def __init__(self, browser, address):
+        self.browser, self.address, self.complaints, self.asked, self.contexts = browser, address, [], [], []
+
+    def open(self, viewport=DESKTOP, **more):
+        self.contexts.append(self.browser.new_context(viewport=viewport, **more))
+        page = self.contexts[-1].new_page()
         page.set_default_timeout(60_000)
-        page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(address)
+        page.on(
+            "console", lambda said: self.complaints.append(said.text) if said.type in ("error", "warning") else None
+        )
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", lambda request: self.asked.append(request.url))
+        page.goto(self.address)
         page.wait_for_selector("#trend-chart .main-svg")
         return page
 
-    yield opener
-    for context in contexts:
-        context.close()
-    assert complaints == []
-    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    def close(self):
+        for context in self.contexts:
+            context.close()
+        assert self.complaints == []
+        assert [url for url in self.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+@pytest.fixture
+def opened(browser, address):
+    reader = Reader(browser, address)
+    yield reader.open
+    reader.close()
+
+
+@pytest.fixture(scope="module")
+def desktop(browser, address):
+    """A page that several tests use, each after a reset."""
+    reader = Reader(browser, address)
+    yield reader.open()
+    reader.close()
+
+
+@pytest.fixture
+def page(desktop):
+    desktop.click("#filters [type=reset]")
+    desktop.wait_for_function("document.getElementById('filter-outcome').value === '*changed'")
+    desktop.evaluate("scrollTo(0, 0)")
+    return desktop
 
 
 def visible_rows(page):
     return page.locator("#comparisons tbody tr:visible")
 
 
-def test_all_plots_are_drawn_where_the_reader_comes_by(opened):
-    page = opened()
+def test_all_plots_are_drawn_where_the_reader_comes_by(page):
     for box in page.locator("[data-chart]:visible").all():
         box.scroll_into_view_if_needed()
         box.locator(".main-svg").first.wait_for()
@@ -73,8 +98,7 @@ def test_all_plots_are_drawn_where_the_reader_comes_by(opened):
     assert page.locator("#trend-chart .scatterlayer .trace").count() == 3
 
 
-def test_filters_choose_rows_and_say_how_many(opened):
-    page = opened()
+def test_filters_choose_rows_and_say_how_many(page):
     outcomes = set(page.locator("#comparisons tbody tr:visible td:first-child").all_inner_texts())
     assert outcomes
     assert not outcomes & {"same", "equivalent"}
@@ -93,8 +117,7 @@ def test_filters_choose_rows_and_say_how_many(opened):
     assert visible_rows(page).count() > 100
 
 
-def test_headings_sort_what_the_filters_left(opened):
-    page = opened()
+def test_headings_sort_what_the_filters_left(page):
     page.select_option("#filter-outcome", "worse")
     before = visible_rows(page).count()
     head = page.locator("#comparisons thead button", has_text="difference")
@@ -109,8 +132,7 @@ def test_headings_sort_what_the_filters_left(opened):
     assert page.locator("#comparisons th[aria-sort=descending]").count() == 1
 
 
-def test_a_row_leads_to_its_trend(opened):
-    page = opened()
+def test_a_row_leads_to_its_trend(page):
     row = visible_rows(page).nth(2)
     experiment, setting, quantity = (row.locator("td").nth(i).inner_text() for i in (1, 2, 4))
     row.locator("a.trend").click()
@@ -121,10 +143,10 @@ def test_a_row_leads_to_its_trend(opened):
     assert newest == "2026-03-01T02:30:00Z"
     page.select_option("#trend-period", "30")
     assert page.evaluate("document.getElementById('trend-chart').layout.xaxis.range[0]").startswith("2026-01-30")
+    page.select_option("#trend-period", "")
 
 
-def test_hover_tells_commit_and_night(opened):
-    page = opened()
+def test_hover_tells_commit_and_night(page):
     page.locator("#trend-chart").scroll_into_view_if_needed()
     place = page.evaluate(
         """() => {
@@ -142,8 +164,7 @@ def test_hover_tells_commit_and_night(opened):
     assert "UTC" in told.first.text_content()
 
 
-def test_links_lead_to_their_sections(opened):
-    page = opened()
+def test_links_lead_to_their_sections(page):
     links = page.locator("nav a")
     assert links.count() > 6
     for link in links.all():
@@ -154,8 +175,7 @@ def test_links_lead_to_their_sections(opened):
         )
 
 
-def test_one_experiment_is_shown_at_a_time(opened):
-    page = opened()
+def test_one_experiment_is_shown_at_a_time(page):
     choice = page.locator("[data-switch=curvature]")
     shown = page.locator("figure[data-of=curvature]:visible")
     assert shown.count() == 1
@@ -173,16 +193,11 @@ def test_a_phone_needs_no_sideways_scrolling(opened):
     assert visible_rows(page).first.locator("td").nth(6).is_visible()
 
 
-def test_dark_colours_reach_the_plots(opened):
+def test_dark_colours_reach_the_plots_and_paper_shows_what_was_folded(opened):
     page = opened(color_scheme="dark")
+    ink = "document.getElementById('trend-chart').layout.font.color"
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 23, 27)"
-    assert page.evaluate("document.getElementById('trend-chart').layout.font.color") == "#e7eaee"
-    page.emulate_media(color_scheme="light")
-    page.wait_for_function("document.getElementById('trend-chart').layout.font.color === '#1b1f24'")
-
-
-def test_paper_shows_what_was_folded_and_no_buttons(opened):
-    page = opened(color_scheme="dark")
+    assert page.evaluate(ink) == "#e7eaee"
     page.emulate_media(media="print")
     page.evaluate("dispatchEvent(new Event('beforeprint'))")
     # The headings that sort are buttons too, but look like text.
@@ -192,4 +207,6 @@ def test_paper_shows_what_was_folded_and_no_buttons(opened):
         box.locator(".main-svg").first.wait_for()
         assert box.evaluate("box => box.layout.font.color") == "#1b1f24"
     page.evaluate("dispatchEvent(new Event('afterprint'))")
-    assert page.evaluate("document.getElementById('trend-chart').layout.font.color") == "#e7eaee"
+    assert page.evaluate(ink) == "#e7eaee"
+    page.emulate_media(media="screen", color_scheme="light")
+    page.wait_for_function(ink + " === '#1b1f24'")

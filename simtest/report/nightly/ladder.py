@@ -99,8 +99,9 @@ def _chart(names: list[str], rows: list[dict[str, Any]], colours: Mapping[str, s
         named.add(name)
     drawn = [v for row in rows for v in row["values"] if v is not None]
     low, high = max(min(drawn), FLOOR_DEG) / 2, max(max(drawn), FLOOR_DEG) * 2
-    x = {"tickvals": list(range(len(names))), "ticktext": names, "zeroline": False, "automargin": True,
-         "range": [-0.3, len(names) - 0.7]}  # fmt: skip
+    texts = [escape(name).replace(" ", "<br>") for name in names]
+    x = {"tickvals": list(range(len(names))), "ticktext": texts, "tickangle": 0, "tickfont": {"size": 11},
+         "zeroline": False, "automargin": True, "range": [-0.4, len(names) - 0.6]}  # fmt: skip
     y = {"title": {"text": "mean error (deg)"}, "type": "log", "range": [float(np.log10(low)), float(np.log10(high))],
          "dtick": 1, "exponentformat": "power", "automargin": True}  # fmt: skip
     figure.update_layout(layout(440, xaxis=x, yaxis=y))
