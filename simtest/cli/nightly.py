@@ -35,6 +35,19 @@ def run(
 
     The night is kept in the history, compared with the accepted baseline, and its page written.
     """
+    try:
+        outcome = _run(profile, reports, variant, engine, workers, address)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            "nothing of this night is kept; history, baseline and the last page are as they were"
+        ) from None
+    _print(outcome)
+    return outcome.exit_code
+
+
+def _run(
+    profile: str, reports: Path, variant: str | None, engine: str, workers: int | None, address: str | None
+) -> "Outcome":
     import shlex
     import sys
 
@@ -48,17 +61,9 @@ def run(
     described = load_profile(profile)
     command = shlex.join(["simtest", *sys.argv[1:]])
     count = _cores() if workers is None else workers
-    gpu = requested_variant(variant).startswith("cuda")
-    chosen = make_engine(engine, count, address, gpu)
-    try:
-        with progress_bar("writing the page") as progress:
-            outcome = run_nightly(described, Reports(reports), command, variant, chosen, count, progress)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            "nothing of this night is kept; history, baseline and the last page are as they were"
-        ) from None
-    _print(outcome)
-    return outcome.exit_code
+    chosen = make_engine(engine, count, address, gpu=requested_variant(variant).startswith("cuda"))
+    with progress_bar("writing the page") as progress:
+        return run_nightly(described, Reports(reports), command, variant, chosen, count, progress)
 
 
 @nightly.command

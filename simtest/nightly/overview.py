@@ -4,7 +4,7 @@ from typing import Any
 
 import polars as pl
 
-from simtest.gate.records import OUTCOMES, Night, Verdict
+from simtest.gate.records import OUTCOMES, PLACE, Night, Verdict
 
 MISSED = "missed"
 
@@ -50,8 +50,10 @@ def failed_canaries(night: Night) -> pl.DataFrame:
 
 def without_canaries(night: Night, verdict: Verdict) -> pl.DataFrame:
     """Give the comparisons but those of canaries, which are told by what they may be."""
-    names = night.figures.filter(pl.col("kind") == "canary")["experiment"].unique()
-    return verdict.comparisons.filter(~pl.col("experiment").is_in(names.to_list()))
+    # A canary may watch an experiment, and have its name.
+    key = (*PLACE, "quantity")
+    canaries = night.figures.filter(pl.col("kind") == "canary").select(key)
+    return verdict.comparisons.join(canaries, on=key, how="anti", nulls_equal=True, maintain_order="left")
 
 
 def ordered(comparisons: pl.DataFrame, outcome: str) -> pl.DataFrame:

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import polars as pl
 import pytest
 
-from simtest.gate.records import COMPARISONS, OUTCOMES, Verdict
+from simtest.gate.records import COMPARISONS, OUTCOMES, PLACE, Verdict
 from simtest.nightly.badge import COLOURS, badge
 from simtest.nightly.junit import junit
 from simtest.nightly.outputs import write_outputs
@@ -125,6 +125,25 @@ def test_junit_bears_any_label(night):
     text = junit(make_night(rows=rows), no_baseline())
     names = [case.get("name") for case in ET.fromstring(text.encode()).iter("testcase")]
     assert any('a<b> & "c"' in name for name in names)
+
+
+def test_canaries_are_told_apart_from_what_they_watch():
+    """A canary that has failed, of the name of an experiment; the gate's comparisons hold it too."""
+    watching = canary("first", 0.5, False)
+    night = make_night(canaries=[watching])
+    own = {name: watching[name] for name in (*PLACE, "quantity", "unit", "value", "low", "high")}
+    row = {**own, "tonight": own.pop("value"), "method": "none", "outcome": "worse"}
+    row.pop("value")
+    comparisons = pl.concat([compared(night, ("same",)), pl.DataFrame([row], schema=COMPARISONS)])
+    verdict = Verdict("regression", False, comparisons, (), RUN)
+    root = ET.fromstring(junit(night, verdict))
+    (suite,) = [suite for suite in root if suite.get("name") == "quick.first"]
+    assert (suite.get("tests"), suite.get("failures")) == ("4", "0")
+    assert int(root.get("failures")) == 1
+    text = summary(night, verdict)
+    assert "### Worse" not in text
+    assert "### Canaries failed: 1" in text
+    assert "| first | 16 | 15 | 1 | 0 | 4 | 0 | 0 | 0 | 0 | 0 | 0 |" in text
 
 
 # Markdown --------------------------------------------------------------------------------------------------------
