@@ -32,7 +32,7 @@ def harmless() -> str:
 def rises() -> str:
     """Give the table of a rise of one estimator's errors."""
     found = proof.rises(load_bank(proof.bank_folder()))
-    rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh in found]
+    rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh, _ in found]
     return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "10 % is beyond the margin in"), rows)
 
 
