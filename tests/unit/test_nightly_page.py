@@ -48,7 +48,7 @@ def history(night):
 class Page(HTMLParser):
     """What a reader without eyes, or a test, finds in a page."""
 
-    VOID = ("meta", "img", "br", "input", "link", "hr")
+    VOID = ("meta", "img", "br", "wbr", "input", "link", "hr")
 
     def __init__(self, text):
         super().__init__()
