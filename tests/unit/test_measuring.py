@@ -1,6 +1,5 @@
 """Run time and memory, as benchmarks and the nightly measure them."""
 
-import os
 import subprocess
 import sys
 
@@ -37,18 +36,23 @@ def test_the_median_is_given():
 
 
 def test_memory_of_all_processes_is_seen():
-    """A child's memory counts, and the peak outlasts it."""
+    """Of a process that holds little and its child that holds much; the peak outlasts both.
+
+    Pages that are shared count by shares, which change with what else runs: this process's own memory is no measure.
+    """
     size_mib = 120
-    code = f"held = bytearray({size_mib} << 20); held[::4096] = b'x' * len(held[::4096]); print(flush=True); input()"
-    alone = memory_of_tree_mib(os.getpid())
-    with PeakMemory(os.getpid(), step_s=0.01) as memory:
-        child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        child.stdout.readline()
-        together = memory_of_tree_mib(os.getpid())
-        child.communicate("\n")
-    assert together > alone + 0.9 * size_mib
-    assert memory.peak_mib >= together - 10
-    assert memory_of_tree_mib(os.getpid()) < alone + 0.5 * size_mib
+    holder = f"held = bytearray({size_mib} << 20); held[::4096] = b'x' * len(held[::4096]); print(flush=True); input()"
+    starter = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {holder!r}])"
+    process = subprocess.Popen(
+        [sys.executable, "-c", starter], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with PeakMemory(process.pid, step_s=0.01) as memory:
+        process.stdout.readline()
+        together = memory_of_tree_mib(process.pid)
+        process.communicate("\n")
+    assert size_mib < together < 3 * size_mib
+    assert size_mib < memory.peak_mib < 3 * size_mib
+    assert memory_of_tree_mib(process.pid) is None
 
 
 def test_the_memory_of_no_process_is_unknown():
