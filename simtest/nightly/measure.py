@@ -11,10 +11,12 @@ import polars as pl
 from simtest import provenance
 from simtest.engines import make_engine
 from simtest.engines.base import Engine
+from simtest.gate.figures import setting_figures
 from simtest.gate.records import FIGURES, Night
 from simtest.measuring import PeakMemory
 from simtest.nightly import cost
-from simtest.nightly.pending import ladder_figures, run_canaries, setting_figures
+from simtest.nightly.canaries import run_canaries
+from simtest.nightly.ladder import ladder_figures
 from simtest.rendering import backend
 from simtest.spec import Profile, experiments_of
 from simtest.validation.cases import expand

@@ -11,6 +11,7 @@ import polars as pl
 
 from simtest.engines.base import Engine
 from simtest.errors import SimtestError
+from simtest.gate.compare import compare
 from simtest.gate.records import Night, Verdict
 from simtest.nightly.baseline import load_baseline
 from simtest.nightly.history import (
@@ -26,11 +27,12 @@ from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_fol
 from simtest.nightly.measure import measure_night
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.overview import ordered, without_canaries
-from simtest.nightly.pending import compare, worst_cases, write_page
 from simtest.nightly.storage import TONIGHT_ROWS, save_night
+from simtest.report.nightly import Extras, write_nightly_page
 from simtest.resources import shown
 from simtest.spec import Profile, experiments_of
 from simtest.validation.runner import Progress
+from simtest.validation.worst import save_worst, worst_cases
 
 FINE, REGRESSION, COULD_NOT_RUN = 0, 1, 2
 """Exit codes of a night."""
@@ -122,7 +124,7 @@ def run_nightly(
             file = append(reports.history, rows)
             history = pl.concat([history, trend_columns(rows, quantities=TRENDS)])
             worse = ordered(without_canaries(night, verdict), "worse")
-            worst = worst_cases(night.rows, worse, experiments_of(profile), folder / "worst", variant)
+            worst = save_worst(worst_cases(night.rows, worse), experiments_of(profile), folder / "worst", variant)
             target = publish(reports, folder, night, verdict, history, worst)
     return Outcome(night, verdict, target, file)
 
@@ -170,7 +172,7 @@ def publish(
     new.mkdir()
     save_night(new, night, TONIGHT_ROWS)
     write_outputs(new, night, verdict)
-    write_page(new, night, verdict, history, gallery=worst, files=FILES)
+    write_nightly_page(new, night, verdict, history, Extras(gallery=worst, files=FILES))
     with turn(target):
         replace_folder(new, target)
     return target
