@@ -81,14 +81,16 @@ def raw_moves(
     margin = int(np.ceil(KERNEL_SIGMAS * smoothing_px))
     wide, high = right - left + 2 * margin, bottom - top + 2 * margin
     place = (rows - (top - margin)) * wide + (columns - (left - margin))
+    # The noise comes in first: what it does has the size of an angle, whatever the unit of the intensities.
+    scale = float(noise.max()) if isinstance(noise, np.ndarray) else noise
     # Single precision from here on: these are standard deviations, and it takes half the time.
     raw = np.empty((len(moves), high * wide), np.float32)
     for image, each in zip(raw, moves, strict=True):
-        image[:] = np.bincount(place, each, high * wide)
+        image[:] = np.bincount(place, scale * each, high * wide)
     # Margins keep the images apart, so that one call smooths all.
     smoothed = _smooth_transposed(raw.reshape(-1, wide), smoothing_px, margin).reshape(len(moves), high, wide)
-    level = np.pad(noise[top:bottom, left:right], margin, mode="edge") if isinstance(noise, np.ndarray) else noise
-    smoothed *= np.float32(level)
+    if isinstance(noise, np.ndarray) and scale > 0:
+        smoothed *= np.pad(noise[top:bottom, left:right] / np.float32(scale), margin, mode="edge")
     return smoothed.reshape(len(moves), -1)
 
 
