@@ -118,7 +118,8 @@ def _split(data: bytes) -> tuple[tuple[int, int, int, int], bytes] | None:
     width, height, bits, colour, *rest = struct.unpack(">IIBBBBB", data[16:29])
     length = struct.unpack(">I", data[33:37])[0]
     end = 41 + length
-    if bits not in (8, 16) or colour not in _COLOURS or any(rest) or data[end + 8 : end + 12] != b"IEND":
+    plain = bits in (8, 16) and colour in _COLOURS and not any(rest)
+    if not (plain and width and height) or data[end + 8 : end + 12] != b"IEND":
         return None
     packed = data[41:end]
     if struct.unpack(">I", data[end : end + 4])[0] != isal_zlib.crc32(packed, isal_zlib.crc32(b"IDAT")):

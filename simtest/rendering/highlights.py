@@ -188,7 +188,8 @@ def _newton(session: Caster, seeds: Array, light: Array) -> Array:
         step = np.full((len(active), 2), np.nan)
         step[solvable] = -np.linalg.solve(J[solvable], w[solvable, 0, :, None])[..., 0]
         length = np.linalg.norm(step, axis=1)
-        with np.errstate(invalid="ignore"):
+        # A seed may be the very place already.
+        with np.errstate(invalid="ignore", divide="ignore"):
             step *= np.minimum(1.0, MAX_STEP_PX / length)[:, None]
         position[active] += step
         step_length[active] = length

@@ -1,6 +1,8 @@
 """PNG files of datasets: any image comes back, any reader opens them, and any PNG is read."""
 
 import contextlib
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -50,7 +52,14 @@ def test_damaged_files_give_an_error_or_an_image(data):
         assert decode(bad).dtype in (np.uint8, np.uint16)
 
 
-@pytest.mark.parametrize("data", [b"", b"no", b"\x89PNG\r\n\x1a\n"])
+def without_rows():
+    head = struct.pack(">IIBBBBB", 5, 0, 16, 0, 0, 0, 0)
+    chunks = (b"IHDR", head), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")
+    made = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(made)
+
+
+@pytest.mark.parametrize("data", [b"", b"no", b"\x89PNG\r\n\x1a\n", without_rows()])
 def test_what_is_no_png_is_refused(data):
     with pytest.raises(ValueError, match="no PNG"):
         decode(data)
