@@ -10,7 +10,9 @@ from simtest.gate.quantities import ANSWERED
 from simtest.gate.records import PLACE, Night
 
 
-def notes_on(baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, limits: Limits) -> tuple[str, ...]:
+def notes_on(
+    baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, short: int, limits: Limits
+) -> tuple[str, ...]:
     """Say in what two nights differ beside their numbers.
 
     Parameters
@@ -21,6 +23,8 @@ def notes_on(baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, l
         Whether all results are the same bytes.
     unmatched : int
         Places whose results differ and whose rows are no exact pairs.
+    short : int
+        Places that have lost highlights of the baseline.
     limits : Limits
         `medians_deg`.
 
@@ -36,6 +40,8 @@ def notes_on(baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, l
             f"Seeds, or the rows, of {unmatched} places are not those of the baseline: these places were compared "
             "unpaired."
         )
+    if short:
+        made.append(f"At {short} places highlights of the baseline are missing tonight, in frames of the same seeds.")
     if not bit_equal:
         made += _numbers(baseline, tonight, limits)
     return tuple(note for note in made if note)

@@ -119,14 +119,62 @@ def test_places_that_one_night_lacks():
     table = rows(settings=("a", "b"))
     verdict = compare(night(table.filter(setting="b")), night(table.filter(setting="a")))
     outcomes = dict(verdict.comparisons.select("setting", "outcome").iter_rows())
-    assert outcomes == {"a": "gone", "b": "new"}
-    assert not verdict.bit_equal
+    assert outcomes == {"a": "worse", "b": "new"}
+    assert (verdict.bit_equal, verdict.state) == (False, "regression")
+    row = one(verdict, "n")
+    assert (row["baseline"], row["tonight"], row["difference"], row["method"]) == (20, 0, -20, "none")
+    # More than before does no harm; nothing at all, or other names alone, does.
+    assert compare(night(table), night(table.filter(setting="a"))).state == "fine"
+    assert compare(night(rows(count=0)), night(table)).state == "regression"
+    renamed = compare(night(changed(table, True, experiment="f")), night(table))
+    assert (renamed.state, renamed.regressions.height) == ("regression", 2)
 
 
-@pytest.mark.parametrize("cause", ["seeds", "versions", "fewer"])
+def test_highlights_that_are_lost_make_nothing_better():
+    table = rows()
+    easy = table.filter(pl.col("error_deg") < pl.col("error_deg").median())
+    verdict = compare(night(easy), night(table))
+    assert verdict.state == "regression"
+    assert set(verdict.regressions["quantity"]) == {"n"}
+    row = one(verdict, "n")
+    assert (row["baseline"], row["tonight"], row["difference"]) == (20, 10, -10)
+    # What both nights have is compared pair by pair, and is the same.
+    assert (one(verdict, "mean_deg")["method"], one(verdict, "mean_deg")["outcome"]) == ("paired", "equivalent")
+    assert one(verdict, "mean_deg")["n"] == 10
+    assert "better" not in set(verdict.comparisons["outcome"])
+    assert verdict.notes[0].startswith("At 1 places highlights of the baseline are missing")
+    worse = compare(night(raised(easy, 1.1)), night(table))
+    assert set(worse.regressions["quantity"]) == {"n", "mean_deg"}
+
+
+def test_lost_frames_are_no_frames_without_false_detections():
+    table = rows()
+    find = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)
+    verdict = compare(night(pl.concat([table, find]).filter(~FIRST_12)), night(pl.concat([table, find])))
+    row = one(verdict, "false")
+    assert (row["n"], row["baseline"], row["tonight"], row["outcome"]) == (8, 1.0, 1.0, "equivalent")
+
+
+def test_highlights_that_are_lost_beside_new_ones_are_told():
+    table = rows()
+    moved = changed(table, FIRST_12, true_id=7)
+    verdict = compare(night(moved), night(table))
+    assert (one(verdict, "n")["outcome"], one(verdict, "n")["tonight"]) == ("worse", 8)
+    # New ones alone are judged with all others, unpaired.
+    more = compare(night(pl.concat([table, changed(table, True, true_id=7)])), night(table))
+    assert (more.state, set(more.comparisons["method"])) == ("fine", {"unpaired"})
+
+
+def test_with_other_versions_a_loss_is_told_and_not_judged():
+    table = rows()
+    verdict = compare(night(table.head(15), versions={"numpy": "2.5", "simtest": "0.1"}), night(table))
+    assert (verdict.state, one(verdict, "n")["outcome"]) == ("fine", "undecided")
+
+
+@pytest.mark.parametrize("cause", ["seeds", "versions", "more"])
 def test_without_exact_pairs_the_test_is_unpaired(cause):
     table, run = rows(), {}
-    other = rows(seed=1) if cause == "seeds" else table.head(15) if cause == "fewer" else raised(table, 1 + 1e-9)
+    other = rows(seed=1) if cause == "seeds" else rows(count=25) if cause == "more" else raised(table, 1 + 1e-9)
     if cause == "versions":
         run = {"versions": {"numpy": "2.5", "simtest": "0.1"}}
     verdict = compare(night(other, **run), night(table))
@@ -185,7 +233,8 @@ def test_canaries_are_judged_without_a_baseline():
         assert dead.regressions["experiment"].to_list() == ["bird"]
     assert compare(night(table, canaries=[("bird", 2.0, 1.0)]), night(table)).state == "regression"
     gone = compare(night(table), night(table, canaries=[("bird", 0.5, 1.0)]))
-    assert gone.comparisons.filter(experiment="bird")["outcome"].to_list() == ["gone"]
+    assert gone.comparisons.filter(experiment="bird")["outcome"].to_list() == ["worse"]
+    assert gone.state == "regression"
 
 
 @pytest.mark.parametrize(
