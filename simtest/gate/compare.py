@@ -13,7 +13,7 @@ from simtest.gate.limits import Limits
 from simtest.gate.notes import notes_on
 from simtest.gate.pairing import Numbered, alone, pairing, pairs
 from simtest.gate.pooling import pooled
-from simtest.gate.quantities import Quantity, quantities
+from simtest.gate.quantities import WHERE_MIXED, Quantity, quantities
 from simtest.gate.records import COMPARISONS, PLACE, POOLED, Night, Verdict
 from simtest.gate.units import paired_sums, sums
 
@@ -95,6 +95,8 @@ def _tested(
     made = missing.highlights(matched.lost, named, comparable)
     # Where all answered, the penalised mean is the mean: it would be tested twice.
     once = (pl.col("quantity") != PENALISED) | pl.col("place").is_in(_with_unanswered(before, after))
+    for name in WHERE_MIXED:
+        once &= (pl.col("quantity") != name) | pl.col("place").is_in(_mixed(name, before, after))
     sums_of_pairs = paired_sums(pairs(before, after, found).filter(once))
     singles = [sums(alone(night, found).filter(once)) for night in (before, after)]
     for name, quantity in every.items():
@@ -106,7 +108,7 @@ def _tested(
             rows = [named[place] for place in places]
             made += _as_rows(rows, name, quantity, outcomes, method)
             made += _pooled_rows(rows, name, quantity, outcomes, method)
-        if name != PENALISED:
+        if name != PENALISED and name not in WHERE_MIXED:
             made += _unanswerable(named, name, quantity, (before, after), {*own["place"], *shared})
     return _judged(made, limits), names.height - len(matched.places), matched.lost.height
 
@@ -114,6 +116,13 @@ def _tested(
 def _with_unanswered(*nights: Numbered) -> list[int]:
     """Give the places where a highlight went unanswered in one of the nights."""
     return sorted({place for night in nights for place in night.rows.filter(pl.col("unanswered") > 0)["place"]})
+
+
+def _mixed(name: str, *nights: Numbered) -> list[int]:
+    """Give the places where what a quantity counts is so of some answers and not of others, of both nights together."""
+    both = pl.concat([night.rows.select("place", name) for night in nights]).drop_nulls()
+    found = both.group_by("place").agg(pl.col(name).n_unique().alias("kinds")).filter(pl.col("kinds") > 1)
+    return sorted(found["place"].to_list())
 
 
 def known_versions(run: Mapping[str, Any]) -> dict[str, str]:
