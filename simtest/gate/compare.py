@@ -10,7 +10,7 @@ from simtest.gate import known, missing
 from simtest.gate.contrasts import Outcomes, paired, unpaired
 from simtest.gate.holm import holm
 from simtest.gate.limits import Limits
-from simtest.gate.notes import notes_on
+from simtest.gate.notes import notes_on, redefined
 from simtest.gate.pairing import Numbered, alone, pairing, pairs
 from simtest.gate.pooling import pooled
 from simtest.gate.quantities import WHERE_MIXED, Quantity, quantities
@@ -87,7 +87,8 @@ def _tested(
     names = differing.with_row_index("place").with_columns(pl.col("place").cast(pl.Int64))
     before, after = (Numbered.of(night.rows, names) for night in (baseline, tonight))
     matched = pairing(before, after)
-    comparable = frozenset(range(names.height))
+    moved = redefined(baseline.run, tonight.run)
+    comparable = frozenset(names.filter(~pl.col("experiment").is_in(moved))["place"].to_list())
     if known_versions(baseline.run) != known_versions(tonight.run):
         comparable = frozenset()
     found = matched.places & comparable

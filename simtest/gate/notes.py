@@ -1,5 +1,6 @@
 """What a reader of the verdict must know beside its comparisons."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import polars as pl
@@ -8,6 +9,20 @@ from simtest.gate.limits import Limits
 from simtest.gate.pairing import changes
 from simtest.gate.quantities import ANSWERED
 from simtest.gate.records import PLACE, Night
+
+_FOLLOWS = {"Versions": "All places were compared unpaired.", "The processor": "Costs were not judged."}
+
+
+def redefined(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """Name the experiments whose definition is known in both records, and another.
+
+    Parameters
+    ----------
+    before, after : mapping
+        `Night.run`; `definitions` is a hash by experiment, or missing where it is not known.
+    """
+    first, second = (dict(run.get("definitions") or {}) for run in (before, after))
+    return sorted(name for name in first.keys() & second.keys() if first[name] != second[name])
 
 
 def notes_on(
@@ -35,6 +50,12 @@ def notes_on(
     """
     made = [_other("Versions", *_differing(baseline.run, tonight.run))]
     made.append(_other("The processor", baseline.run.get("processor"), tonight.run.get("processor")))
+    for key in ("profile", "variant", "llvm", "python"):
+        # A record that does not have it says nothing of it.
+        if baseline.run.get(key) and tonight.run.get(key):
+            made.append(_other(f"The {key}", str(baseline.run[key]), str(tonight.run[key])))
+    if changed := redefined(baseline.run, tonight.run):
+        made.append(f"The definition changed of {', '.join(changed)}: their places were compared unpaired.")
     if unmatched:
         made.append(
             f"Seeds, or the rows, of {unmatched} places are not those of the baseline: these places were compared "
@@ -56,8 +77,8 @@ def _differing(before: dict[str, Any], after: dict[str, Any]) -> tuple[str, str]
 def _other(what: str, before: str | None, after: str | None) -> str:
     if before == after:
         return ""
-    more = "All places were compared unpaired." if what == "Versions" else "Costs were not judged."
-    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}. {more}"
+    more = _FOLLOWS.get(what, "")
+    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}. {more}".strip()
 
 
 def _numbers(baseline: Night, tonight: Night, limits: Limits) -> list[str]:

@@ -52,7 +52,8 @@ class Night:
     Parameters
     ----------
     run : dict
-        `id`, `profile`, `started` (ISO, UTC), `duration_s`, `command`, and `simtest.provenance.environment()`.
+        `id`, `profile`, `started` (ISO, UTC), `duration_s`, `command`, and `simtest.provenance.environment()`; where
+        they are known `definitions` (a hash by experiment: what was run), `variant` and `llvm`.
     rows : polars.DataFrame
         Results of all experiments, the columns of `simtest.validation.metrics.SCHEMA`.
     figures : polars.DataFrame

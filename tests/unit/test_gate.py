@@ -194,6 +194,36 @@ def test_a_new_version_of_simtest_itself_leaves_pairs_pairs():
     assert set(verdict.comparisons["method"]) == {"paired"}
 
 
+def test_another_definition_of_an_experiment_unpairs_its_places():
+    table = pl.concat([rows(), rows(seed=3, experiment="f")])
+    known, other = {"e": "1", "f": "1"}, {"e": "2", "f": "1", "g": "9"}
+    tonight = changed(raised(table, 1 + 1e-9), (pl.col("experiment") == "e") & FIRST_12, error_deg=0.1)
+    verdict = compare(night(tonight, definitions=other), night(table, definitions=known))
+    methods = dict(
+        verdict.comparisons.filter(quantity="mean_deg", label="l").select("experiment", "method").iter_rows()
+    )
+    assert methods == {"e": "unpaired", "f": "paired"}
+    assert verdict.notes[0] == "The definition changed of e: their places were compared unpaired."
+    # The same bytes all the same: it is said.
+    same = compare(night(table, definitions=other), night(table, definitions=known))
+    assert (same.bit_equal, len(same.notes)) == (True, 1)
+    # What is not known is no change.
+    assert compare(night(table, definitions=other), night(table)).notes == ()
+    assert compare(night(table), night(table, definitions=known)).notes == ()
+    # Fewer highlights by another definition are told, and not judged.
+    fewer = night(table.filter(pl.col("realisation") > 2), definitions=other)
+    lost = compare(fewer, night(table, definitions=known)).comparisons.filter(quantity="n")
+    assert dict(lost.select("experiment", "outcome").iter_rows()) == {"e": "undecided", "f": "worse"}
+
+
+@pytest.mark.parametrize("key", ["profile", "variant", "llvm", "python"])
+def test_what_else_ran_otherwise_is_said(key):
+    table = rows()
+    verdict = compare(night(table, **{key: "new"}), night(table, **{key: "old"}))
+    assert verdict.notes == (f"The {key} changed from old to new.",)
+    assert compare(night(table, **{key: "new"}), night(table)).notes == ()
+
+
 def test_false_detections_are_counted_by_frames():
     table = rows()
     false = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)
