@@ -10,7 +10,7 @@ from simtest.gate import known, missing
 from simtest.gate.contrasts import Outcomes, paired, unpaired
 from simtest.gate.holm import holm
 from simtest.gate.limits import Limits
-from simtest.gate.notes import notes_on, redefined
+from simtest.gate.notes import large_and_undecided, notes_on, redefined
 from simtest.gate.pairing import Numbered, alone, pairing, pairs
 from simtest.gate.pooling import pooled
 from simtest.gate.quantities import WHERE_MIXED, Quantity, quantities
@@ -60,6 +60,7 @@ def compare(tonight: Night, baseline: Night | None, limits: Limits = DEFAULTS) -
     state = "fine" if baseline is not None else "no baseline"
     if (comparisons["outcome"] == "worse").any():
         state = "regression"
+    notes += large_and_undecided(comparisons)
     return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.run)
 
 

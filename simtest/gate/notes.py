@@ -8,7 +8,10 @@ import polars as pl
 from simtest.gate.limits import Limits
 from simtest.gate.pairing import changes
 from simtest.gate.quantities import ANSWERED
-from simtest.gate.records import PLACE, Night
+from simtest.gate.records import PLACE, POOLED, Night
+
+_FAR, _FAR_DEG = 10, 1.0
+"""A rise of so many margins, and of so many degrees, is told even where nothing can be decided."""
 
 _FOLLOWS = {"Versions": "All places were compared unpaired.", "The processor": "Costs were not judged."}
 
@@ -23,6 +26,26 @@ def redefined(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """
     first, second = (dict(run.get("definitions") or {}) for run in (before, after))
     return sorted(name for name in first.keys() & second.keys() if first[name] != second[name])
+
+
+def large_and_undecided(comparisons: pl.DataFrame) -> tuple[str, ...]:
+    """Say where a single realisation rose so much that a reader must look, though one number decides nothing.
+
+    Parameters
+    ----------
+    comparisons : polars.DataFrame
+        Columns `COMPARISONS`.
+    """
+    errors = pl.col("quantity").is_in(["mean_deg", "mean_penalised_deg"]) & (pl.col("setting") != POOLED)
+    far = (pl.col("difference") > _FAR * pl.col("margin")) & (pl.col("difference") > _FAR_DEG)
+    found = comparisons.filter(errors & far, pl.col("n") == 1, pl.col("outcome") == "undecided")
+    count = found.select(PLACE).n_unique()
+    if not count:
+        return ()
+    return (
+        f"At {count} places of one realisation the error rose by more than {_FAR} margins and {_FAR_DEG:g} deg, by "
+        f"{float(found['difference'].to_numpy().max()):.2g} deg at most: too few to decide, look at them.",
+    )
 
 
 def notes_on(

@@ -105,6 +105,16 @@ def test_one_realisation_decides_nothing_but_that_nothing_changed():
     assert one(compare(night(raised(table, 1.01)), night(table)), "mean_deg")["outcome"] == "equivalent"
 
 
+def test_large_rises_of_single_realisations_are_told():
+    table = rows(count=1, level=0.01, settings=tuple("abcdefghi"))
+    verdict = compare(night(raised(table, 4000.0)), night(table))
+    assert (verdict.state, set(verdict.comparisons.filter(quantity="mean_deg")["outcome"])) == ("fine", {"undecided"})
+    assert verdict.notes[-1].startswith("At 9 places of one realisation the error rose by more than 10 margins")
+    for quiet in (raised(table, 50.0), raised(table, 0.001)):
+        assert "of one realisation" not in compare(night(quiet), night(table)).notes[-1]
+    assert "of one realisation" not in compare(night(raised(rows(), 40.0)), night(rows())).notes[-1]
+
+
 def test_many_settings_decide_where_one_cannot():
     settings = tuple("abcdefghijklmnopqrst")
     table = rows(count=1, settings=settings, estimators=("cone_axis", "curved"))
