@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.gate import known
+from simtest.gate import known, missing
 from simtest.gate.contrasts import Outcomes, paired, unpaired
 from simtest.gate.holm import holm
 from simtest.gate.limits import Limits
-from simtest.gate.notes import notes_on
-from simtest.gate.pairing import Numbered, alone, paired_places, pairs
+from simtest.gate.notes import large_and_undecided, notes_on, redefined
+from simtest.gate.pairing import Numbered, alone, pairing, pairs
 from simtest.gate.pooling import pooled
-from simtest.gate.quantities import Quantity, quantities
+from simtest.gate.quantities import WHERE_MIXED, Quantity, quantities
 from simtest.gate.records import COMPARISONS, PLACE, POOLED, Night, Verdict
 from simtest.gate.units import paired_sums, sums
 
@@ -39,7 +39,8 @@ def compare(tonight: Night, baseline: Night | None, limits: Limits = DEFAULTS) -
     Returns
     -------
     Verdict
-        "regression" where a comparison is worse, else "no baseline" or "fine".
+        "regression" where a comparison is worse, else "no baseline" or "fine". What tonight lacks (a place, true
+        highlights of a place whose seeds are the same, a canary) is worse.
     """
     before = None if baseline is None else baseline.figures
     same_machine = baseline is None or baseline.run.get("processor") == tonight.run.get("processor")
@@ -47,33 +48,20 @@ def compare(tonight: Night, baseline: Night | None, limits: Limits = DEFAULTS) -
     bit_equal: bool | None = None
     notes: tuple[str, ...] = ("There is no baseline: nothing but the canaries was judged.",)
     if baseline is not None:
-        first, second = _digests(baseline.figures), _digests(tonight.figures)
-        bit_equal = first.equals(second)
+        first, second = missing.digests(baseline.figures), missing.digests(tonight.figures)
+        bit_equal = first.select(*PLACE, "digest").equals(second.select(*PLACE, "digest"))
         shared = first.join(second, on=PLACE, suffix="_2", maintain_order="left")
         differing = shared.filter(pl.col("digest") != pl.col("digest_2")).select(*PLACE)
-        made += _unshared(first, second) + _same(shared, tonight.figures, limits)
-        tested, unmatched = _tested(baseline, tonight, differing, limits)
+        made += missing.places(first, second) + _same(shared, tonight.figures, limits)
+        tested, unmatched, short = _tested(baseline, tonight, differing, limits)
         made += tested
-        notes = notes_on(baseline, tonight, bit_equal, unmatched, limits)
+        notes = notes_on(baseline, tonight, bit_equal, unmatched, short, limits)
     comparisons = pl.DataFrame(made, schema=COMPARISONS)
     state = "fine" if baseline is not None else "no baseline"
     if (comparisons["outcome"] == "worse").any():
         state = "regression"
+    notes += large_and_undecided(comparisons)
     return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.run)
-
-
-def _digests(figures: pl.DataFrame) -> pl.DataFrame:
-    """Give each place's hash, in the order of the places' names."""
-    return figures.filter(pl.col("kind") == "setting").select(*PLACE, "digest").unique(PLACE).sort(PLACE)
-
-
-def _unshared(first: pl.DataFrame, second: pl.DataFrame) -> list[dict[str, Any]]:
-    """Give the comparisons of places that one of the nights lacks."""
-    made = []
-    for here, there, outcome in ((first, second, "gone"), (second, first, "new")):
-        for row in here.join(there, on=PLACE, how="anti", maintain_order="left").select(*PLACE).to_dicts():
-            made.append({**row, "quantity": "n", "unit": "", "method": "none", "outcome": outcome})
-    return made
 
 
 def _same(shared: pl.DataFrame, figures: pl.DataFrame, limits: Limits) -> list[dict[str, Any]]:
@@ -93,20 +81,24 @@ def _same(shared: pl.DataFrame, figures: pl.DataFrame, limits: Limits) -> list[d
 
 def _tested(
     baseline: Night, tonight: Night, differing: pl.DataFrame, limits: Limits
-) -> tuple[list[dict[str, Any]], int]:
-    """Give the comparisons of places whose results differ, and how many of them are no exact pairs."""
+) -> tuple[list[dict[str, Any]], int, int]:
+    """Give the comparisons of places whose results differ; how many are no pairs, and how many lost highlights."""
     if differing.is_empty():
-        return [], 0
+        return [], 0, 0
     names = differing.with_row_index("place").with_columns(pl.col("place").cast(pl.Int64))
     before, after = (Numbered.of(night.rows, names) for night in (baseline, tonight))
-    found = paired_places(before, after)
-    unmatched = names.height - len(found)
+    matched = pairing(before, after)
+    moved = redefined(baseline.run, tonight.run)
+    comparable = frozenset(names.filter(~pl.col("experiment").is_in(moved))["place"].to_list())
     if known_versions(baseline.run) != known_versions(tonight.run):
-        found = frozenset()
+        comparable = frozenset()
+    found = matched.places & comparable
     every, named = quantities(limits), names.select(PLACE).to_dicts()
-    made: list[dict[str, Any]] = []
+    made = missing.highlights(matched.lost, named, comparable)
     # Where all answered, the penalised mean is the mean: it would be tested twice.
     once = (pl.col("quantity") != PENALISED) | pl.col("place").is_in(_with_unanswered(before, after))
+    for name in WHERE_MIXED:
+        once &= (pl.col("quantity") != name) | pl.col("place").is_in(_mixed(name, before, after))
     sums_of_pairs = paired_sums(pairs(before, after, found).filter(once))
     singles = [sums(alone(night, found).filter(once)) for night in (before, after)]
     for name, quantity in every.items():
@@ -118,14 +110,21 @@ def _tested(
             rows = [named[place] for place in places]
             made += _as_rows(rows, name, quantity, outcomes, method)
             made += _pooled_rows(rows, name, quantity, outcomes, method)
-        if name != PENALISED:
+        if name != PENALISED and name not in WHERE_MIXED:
             made += _unanswerable(named, name, quantity, (before, after), {*own["place"], *shared})
-    return _judged(made, limits), unmatched
+    return _judged(made, limits), names.height - len(matched.places), matched.lost.height
 
 
 def _with_unanswered(*nights: Numbered) -> list[int]:
     """Give the places where a highlight went unanswered in one of the nights."""
     return sorted({place for night in nights for place in night.rows.filter(pl.col("unanswered") > 0)["place"]})
+
+
+def _mixed(name: str, *nights: Numbered) -> list[int]:
+    """Give the places where what a quantity counts is so of some answers and not of others, of both nights together."""
+    both = pl.concat([night.rows.select("place", name) for night in nights]).drop_nulls()
+    found = both.group_by("place").agg(pl.col(name).n_unique().alias("kinds")).filter(pl.col("kinds") > 1)
+    return sorted(found["place"].to_list())
 
 
 def known_versions(run: Mapping[str, Any]) -> dict[str, str]:

@@ -11,7 +11,7 @@ _KEY = (*PLACE, "quantity")
 
 
 def canaries(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> list[dict[str, Any]]:
-    """Give the comparisons of canaries: worse where one is outside of what it may be, whatever the baseline was.
+    """Give the comparisons of canaries: worse where one is outside of what it may be, or missing tonight.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def canaries(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> list[dict[
     made = []
     for row in _both(tonight, baseline, "canary"):
         if row["value"] is None and row["passed"] is None:
-            made.append({**_named(row), "baseline": row["value_before"], "outcome": "gone"})
+            made.append({**_named(row), "baseline": row["value_before"], "outcome": "worse"})
             continue
         same = row["value_before"] is not None and row["value"] == row["value_before"]
         fine = "same" if same else "equivalent" if row["value_before"] is not None else "new"

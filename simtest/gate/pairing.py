@@ -31,19 +31,50 @@ class Numbered:
         )
 
 
-def paired_places(before: Numbered, after: Numbered) -> frozenset[int]:
-    """Give the places all of whose true highlights are in both nights, once, and whose frames have the same seeds."""
+@dataclass(frozen=True)
+class Pairing:
+    """Which places of two nights are pairs.
+
+    Parameters
+    ----------
+    places : frozenset of int
+        Places whose frames have the same seeds, and all of whose true highlights tonight are in the baseline, once:
+        what both nights have is compared pair by pair.
+    lost : polars.DataFrame
+        `place`, `before` (true highlights of the baseline), `kept` (those that tonight has too): places whose frames
+        have the same seeds, and of whose true highlights some are missing tonight.
+    """
+
+    places: frozenset[int]
+    lost: pl.DataFrame
+
+
+def pairing(before: Numbered, after: Numbered) -> Pairing:
+    """Find the places that are pairs, and those that have lost highlights."""
     key = ("place", "realisation", "true_id", "seed")
     counted = [
         night.rows.group_by(key).agg(pl.len().alias(name)) for night, name in ((before, "once"), (after, "again"))
     ]
-    rows = counted[0].join(counted[1], on=key, how="full", coalesce=True)
-    unlike = rows.filter(~((pl.col("once") == 1) & (pl.col("again") == 1)).fill_null(False))
+    once, again = pl.col("once"), pl.col("again")
+    counts = (
+        counted[0]
+        .join(counted[1], on=key, how="full", coalesce=True, nulls_equal=True)
+        .with_columns(once.fill_null(0), again.fill_null(0))
+        .group_by("place")
+        .agg(
+            before=(once > 0).sum(), kept=((once > 0) & (again > 0)).sum(), gained=(once == 0).sum(),
+            repeated=((once > 1) | (again > 1)).any(),
+        )
+    )  # fmt: skip
     # A frame without a highlight has rows only where something was found in it.
     frames = before.frames.join(after.frames, on=("place", "realisation"), suffix="_2")
-    moved = frames.filter(pl.col("seed").ne_missing(pl.col("seed_2")))
+    moved = set(frames.filter(pl.col("seed").ne_missing(pl.col("seed_2")))["place"].to_list())
+    # Realisations of other numbers are other realisations: nothing of them is lost.
+    same = (pl.col("kept") < pl.col("before")) & pl.col("place").is_in(list(set(frames["place"].to_list()) - moved))
+    lost = counts.filter(same).select("place", "before", "kept")
+    other = counts.filter((pl.col("gained") > 0) | pl.col("repeated") | ((pl.col("kept") < pl.col("before")) & ~same))
     every = set(before.frames["place"].to_list()) & set(after.frames["place"].to_list())
-    return frozenset(every - set(unlike["place"].to_list()) - set(moved["place"].to_list()))
+    return Pairing(frozenset(every - set(other["place"].to_list()) - moved), lost)
 
 
 def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataFrame:
@@ -52,8 +83,10 @@ def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataF
     rows = _long(before.rows.filter(kept), "baseline").join(
         _long(after.rows.filter(kept), "tonight"), on=(*UNIT, "true_id")
     )
+    # A frame that had highlights and has no row at all tonight is lost: it is not one without false detections.
+    unseen = before.rows.join(after.frames, on=("place", "realisation"), how="anti").select("place", "realisation")
     frames = (
-        _frames(before.frames.filter(kept), "baseline")
+        _frames(before.frames.filter(kept).join(unseen, on=("place", "realisation"), how="anti"), "baseline")
         .join(_frames(after.frames.filter(kept), "tonight"), on=UNIT, how="full", coalesce=True)
         .with_columns(pl.col("baseline", "tonight").fill_null(0.0))
     )

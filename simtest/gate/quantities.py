@@ -62,6 +62,8 @@ def quantities(limits: Limits) -> dict[str, Quantity]:
         "unanswered": Quantity("", 0.0, limits.rate, span=1.0),
         "false": Quantity("a frame", 0.0, limits.rate, span=1.0),
         "coverage95": Quantity("", 0.0, limits.coverage, span=1.0, falls=True),
+        "no_region": Quantity("", 0.0, limits.rate, span=1.0),
+        "no_axis_ratio": Quantity("", 0.0, limits.rate, span=1.0),
     }
 
 
@@ -86,11 +88,17 @@ HARMS: dict[str, pl.Expr] = {
     "mean_penalised_deg": pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
     "axis_ratio": RATIO_OFF,
     "unanswered": pl.when(IS_TRUE).then((~ANSWERED).cast(pl.Float64)),
-    "coverage95": pl.when(ANSWERED & pl.col("mahalanobis2").is_finite()).then(
-        (pl.col("mahalanobis2") > COVERED).cast(pl.Float64)
+    # A distance that is no number, or infinite, lies in no region, as in `simtest.validation.statistics.figures`.
+    "coverage95": pl.when(ANSWERED & pl.col("mahalanobis2").is_not_null()).then(
+        (~(pl.col("mahalanobis2").is_finite() & (pl.col("mahalanobis2") <= COVERED))).cast(pl.Float64)
     ),
+    "no_region": pl.when(ANSWERED).then(pl.col("mahalanobis2").is_null().cast(pl.Float64)),
+    "no_axis_ratio": pl.when(ANSWERED).then(RATIO_OFF.is_null().cast(pl.Float64)),
 }
 """Harm of a row by quantity; null where the row says nothing of it. False detections are counted by frames instead."""
+
+WHERE_MIXED = ("no_region", "no_axis_ratio")
+"""Quantities of what an answer may leave unstated: compared where some answers state it, and some do not."""
 
 KEY = (*PLACE, "realisation", "true_id")
 """What names the row of a true highlight in two nights."""

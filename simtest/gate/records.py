@@ -41,8 +41,8 @@ Canaries (`experiment` the canary's name, `low`, `high` what it may be) and cost
 
 OUTCOMES = ("same", "equivalent", "undecided", "better", "worse", "new", "gone")
 """same: equal bytes; equivalent: the interval, or every single pair, lies within the margin; worse: beyond the margin
-at the corrected level (a regression); better: its mirror image; undecided: neither shown; new, gone: one of the two
-nights lacks the place."""
+at the corrected level, or a place, highlights or a canary that tonight lacks (a regression); better: its mirror image;
+undecided: neither shown; new: the baseline lacks it; gone: tonight has nothing to say of the quantity."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Night:
     Parameters
     ----------
     run : dict
-        `id`, `profile`, `started` (ISO, UTC), `duration_s`, `command`, and `simtest.provenance.environment()`.
+        `id`, `profile`, `started` (ISO, UTC), `duration_s`, `command`, and `simtest.provenance.environment()`; where
+        they are known `definitions` (a hash by experiment: what was run), `variant` and `llvm`.
     rows : polars.DataFrame
         Results of all experiments, the columns of `simtest.validation.metrics.SCHEMA`.
     figures : polars.DataFrame

@@ -10,6 +10,7 @@ from benchmarks.gate.faults import FAULTS, HARMLESS, Mutation, planted
 from simtest.gate.records import FIGURES
 from simtest.geometry import Camera
 from simtest.nightly.canaries import geometry, noise, run_canaries
+from simtest.spec import Experiment
 
 DETECTORS = {
     "sign flip of an axis": ("circle_pose", "normal_off"),
@@ -86,5 +87,35 @@ def test_repeated_noise_shows_in_the_rows():
     assert [canary.quantity for canary in noise.noises_of(again) if not canary.passed] == ["repeated_answers"]
     seeds = table.with_columns(seed=pl.lit(5, pl.Int64))
     assert [canary.value for canary in noise.noises_of(seeds)] == [5, 0]
-    # Without noise, realisations are the same by right.
-    assert all(canary.passed for canary in noise.noises_of(again.with_columns(noise_sigma=0.0)))
+
+
+def experiment(sigma, **group):
+    small = {"camera.width": 64, "camera.height": 64, "sensor.noise_sigma": sigma}
+    return Experiment(name="e", groups=[{"scene": "plane", "set": small, **group}])
+
+
+def test_noise_that_is_lost_does_not_pass():
+    table = rows(count=6).with_columns(noise_sigma=0.05, normal_x=pl.col("error_deg"), normal_y=0.0, normal_z=-1.0)
+    clean = table.with_columns(noise_sigma=0.0)
+    published = Experiment(name="e", groups=[{"scene": "published"}])
+    drawn = experiment(0.0, random={"sensor.noise_sigma": {"low": 0.0, "high": 0.1}})
+    for defined in (experiment(0.05), published, drawn):
+        assert all(canary.passed for canary in noise.noises_of(table, [defined]))
+        unknown = [table.with_columns(noise_sigma=pl.lit(value, pl.Float64)) for value in (None, float("nan"))]
+        for lost in (clean, *unknown, table.clear()):
+            dead = noise.noises_of(lost, [defined])
+            assert not any(canary.passed for canary in dead)
+            assert all("no noise in e" in canary.about for canary in dead)
+    # One noisy experiment does not stand for another.
+    other = experiment(0.05).model_copy(update={"name": "f"})
+    assert not any(canary.passed for canary in noise.noises_of(table, [experiment(0.05), other]))
+    # Where the definition has none, realisations are the same by right.
+    assert all(canary.passed for canary in noise.noises_of(clean.with_columns(normal_x=0.1), [experiment(0.0)]))
+    # Without a definition 0 is taken at its word, and nothing is not.
+    assert all(canary.passed for canary in noise.noises_of(clean))
+    assert not any(canary.passed for canary in noise.noises_of(table.with_columns(noise_sigma=float("nan"))))
+
+
+def test_noisy_settings_without_an_answer_do_not_pass():
+    table = rows(count=6, status="no_peak").with_columns(noise_sigma=0.05)
+    assert [canary.quantity for canary in noise.noises_of(table) if not canary.passed] == ["repeated_answers"]

@@ -105,6 +105,16 @@ def test_one_realisation_decides_nothing_but_that_nothing_changed():
     assert one(compare(night(raised(table, 1.01)), night(table)), "mean_deg")["outcome"] == "equivalent"
 
 
+def test_large_rises_of_single_realisations_are_told():
+    table = rows(count=1, level=0.01, settings=tuple("abcdefghi"))
+    verdict = compare(night(raised(table, 4000.0)), night(table))
+    assert (verdict.state, set(verdict.comparisons.filter(quantity="mean_deg")["outcome"])) == ("fine", {"undecided"})
+    assert verdict.notes[-1].startswith("At 9 places of one realisation the error rose by more than 10 margins")
+    for quiet in (raised(table, 50.0), raised(table, 0.001)):
+        assert "of one realisation" not in compare(night(quiet), night(table)).notes[-1]
+    assert "of one realisation" not in compare(night(raised(rows(), 40.0)), night(rows())).notes[-1]
+
+
 def test_many_settings_decide_where_one_cannot():
     settings = tuple("abcdefghijklmnopqrst")
     table = rows(count=1, settings=settings, estimators=("cone_axis", "curved"))
@@ -119,14 +129,62 @@ def test_places_that_one_night_lacks():
     table = rows(settings=("a", "b"))
     verdict = compare(night(table.filter(setting="b")), night(table.filter(setting="a")))
     outcomes = dict(verdict.comparisons.select("setting", "outcome").iter_rows())
-    assert outcomes == {"a": "gone", "b": "new"}
-    assert not verdict.bit_equal
+    assert outcomes == {"a": "worse", "b": "new"}
+    assert (verdict.bit_equal, verdict.state) == (False, "regression")
+    row = one(verdict, "n")
+    assert (row["baseline"], row["tonight"], row["difference"], row["method"]) == (20, 0, -20, "none")
+    # More than before does no harm; nothing at all, or other names alone, does.
+    assert compare(night(table), night(table.filter(setting="a"))).state == "fine"
+    assert compare(night(rows(count=0)), night(table)).state == "regression"
+    renamed = compare(night(changed(table, True, experiment="f")), night(table))
+    assert (renamed.state, renamed.regressions.height) == ("regression", 2)
 
 
-@pytest.mark.parametrize("cause", ["seeds", "versions", "fewer"])
+def test_highlights_that_are_lost_make_nothing_better():
+    table = rows()
+    easy = table.filter(pl.col("error_deg") < pl.col("error_deg").median())
+    verdict = compare(night(easy), night(table))
+    assert verdict.state == "regression"
+    assert set(verdict.regressions["quantity"]) == {"n"}
+    row = one(verdict, "n")
+    assert (row["baseline"], row["tonight"], row["difference"]) == (20, 10, -10)
+    # What both nights have is compared pair by pair, and is the same.
+    assert (one(verdict, "mean_deg")["method"], one(verdict, "mean_deg")["outcome"]) == ("paired", "equivalent")
+    assert one(verdict, "mean_deg")["n"] == 10
+    assert "better" not in set(verdict.comparisons["outcome"])
+    assert verdict.notes[0].startswith("At 1 places highlights of the baseline are missing")
+    worse = compare(night(raised(easy, 1.1)), night(table))
+    assert set(worse.regressions["quantity"]) == {"n", "mean_deg"}
+
+
+def test_lost_frames_are_no_frames_without_false_detections():
+    table = rows()
+    find = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)
+    verdict = compare(night(pl.concat([table, find]).filter(~FIRST_12)), night(pl.concat([table, find])))
+    row = one(verdict, "false")
+    assert (row["n"], row["baseline"], row["tonight"], row["outcome"]) == (8, 1.0, 1.0, "equivalent")
+
+
+def test_highlights_that_are_lost_beside_new_ones_are_told():
+    table = rows()
+    moved = changed(table, FIRST_12, true_id=7)
+    verdict = compare(night(moved), night(table))
+    assert (one(verdict, "n")["outcome"], one(verdict, "n")["tonight"]) == ("worse", 8)
+    # New ones alone are judged with all others, unpaired.
+    more = compare(night(pl.concat([table, changed(table, True, true_id=7)])), night(table))
+    assert (more.state, set(more.comparisons["method"])) == ("fine", {"unpaired"})
+
+
+def test_with_other_versions_a_loss_is_told_and_not_judged():
+    table = rows()
+    verdict = compare(night(table.head(15), versions={"numpy": "2.5", "simtest": "0.1"}), night(table))
+    assert (verdict.state, one(verdict, "n")["outcome"]) == ("fine", "undecided")
+
+
+@pytest.mark.parametrize("cause", ["seeds", "versions", "more"])
 def test_without_exact_pairs_the_test_is_unpaired(cause):
     table, run = rows(), {}
-    other = rows(seed=1) if cause == "seeds" else table.head(15) if cause == "fewer" else raised(table, 1 + 1e-9)
+    other = rows(seed=1) if cause == "seeds" else rows(count=25) if cause == "more" else raised(table, 1 + 1e-9)
     if cause == "versions":
         run = {"versions": {"numpy": "2.5", "simtest": "0.1"}}
     verdict = compare(night(other, **run), night(table))
@@ -146,6 +204,36 @@ def test_a_new_version_of_simtest_itself_leaves_pairs_pairs():
     assert set(verdict.comparisons["method"]) == {"paired"}
 
 
+def test_another_definition_of_an_experiment_unpairs_its_places():
+    table = pl.concat([rows(), rows(seed=3, experiment="f")])
+    known, other = {"e": "1", "f": "1"}, {"e": "2", "f": "1", "g": "9"}
+    tonight = changed(raised(table, 1 + 1e-9), (pl.col("experiment") == "e") & FIRST_12, error_deg=0.1)
+    verdict = compare(night(tonight, definitions=other), night(table, definitions=known))
+    methods = dict(
+        verdict.comparisons.filter(quantity="mean_deg", label="l").select("experiment", "method").iter_rows()
+    )
+    assert methods == {"e": "unpaired", "f": "paired"}
+    assert verdict.notes[0] == "The definition changed of e: their places were compared unpaired."
+    # The same bytes all the same: it is said.
+    same = compare(night(table, definitions=other), night(table, definitions=known))
+    assert (same.bit_equal, len(same.notes)) == (True, 1)
+    # What is not known is no change.
+    assert compare(night(table, definitions=other), night(table)).notes == ()
+    assert compare(night(table), night(table, definitions=known)).notes == ()
+    # Fewer highlights by another definition are told, and not judged.
+    fewer = night(table.filter(pl.col("realisation") > 2), definitions=other)
+    lost = compare(fewer, night(table, definitions=known)).comparisons.filter(quantity="n")
+    assert dict(lost.select("experiment", "outcome").iter_rows()) == {"e": "undecided", "f": "worse"}
+
+
+@pytest.mark.parametrize("key", ["profile", "variant", "llvm", "python"])
+def test_what_else_ran_otherwise_is_said(key):
+    table = rows()
+    verdict = compare(night(table, **{key: "new"}), night(table, **{key: "old"}))
+    assert verdict.notes == (f"The {key} changed from old to new.",)
+    assert compare(night(table, **{key: "new"}), night(table)).notes == ()
+
+
 def test_false_detections_are_counted_by_frames():
     table = rows()
     false = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)
@@ -163,6 +251,26 @@ def test_coverage_is_worse_where_it_falls():
     assert (row["outcome"], row["baseline"]) == ("worse", 1.0)
     assert row["tonight"] == pytest.approx(0.4)
     assert row["low"] < row["difference"] < row["high"] < 0
+
+
+def test_an_uncertainty_that_is_no_longer_stated_is_seen():
+    table = changed(rows(), True, mahalanobis2=1.0)
+    for value in (float("nan"), float("inf")):
+        verdict = compare(night(changed(table, FIRST_12, mahalanobis2=value)), night(table))
+        assert set(verdict.regressions["quantity"]) == {"coverage95"}
+        assert one(verdict, "coverage95")["tonight"] == pytest.approx(0.4)
+    for lost, quantity in (("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")):
+        for condition, share in ((FIRST_12, 0.6), (True, 1.0)):
+            verdict = compare(night(changed(table, condition, **{lost: None})), night(table))
+            assert set(verdict.regressions["quantity"]) == {quantity}
+            row = one(verdict, quantity)
+            assert (row["baseline"], row["tonight"]) == (0, pytest.approx(share))
+            # Where none ever states it there is nothing to lose.
+            never = changed(table, True, **{lost: None})
+            quiet = compare(night(raised(never, 1 + 1e-9)), night(never))
+            assert quantity not in set(quiet.comparisons["quantity"])
+    fresh = compare(night(changed(rows(seed=1), True, mahalanobis2=None)), night(table))
+    assert (one(fresh, "no_region")["outcome"], one(fresh, "no_region")["method"]) == ("worse", "unpaired")
 
 
 def test_the_axis_ratio_is_held_to_its_law():
@@ -185,7 +293,8 @@ def test_canaries_are_judged_without_a_baseline():
         assert dead.regressions["experiment"].to_list() == ["bird"]
     assert compare(night(table, canaries=[("bird", 2.0, 1.0)]), night(table)).state == "regression"
     gone = compare(night(table), night(table, canaries=[("bird", 0.5, 1.0)]))
-    assert gone.comparisons.filter(experiment="bird")["outcome"].to_list() == ["gone"]
+    assert gone.comparisons.filter(experiment="bird")["outcome"].to_list() == ["worse"]
+    assert gone.state == "regression"
 
 
 @pytest.mark.parametrize(

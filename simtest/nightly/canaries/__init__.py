@@ -1,6 +1,6 @@
 """Canaries: figures whose value is known, which see faults that the errors of a night do not show."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import polars as pl
@@ -9,11 +9,15 @@ from simtest.errors import BackendError
 from simtest.nightly.canaries import geometry, noise, rendered
 from simtest.nightly.canaries.record import Canary, as_figures
 from simtest.rendering import Session
+from simtest.spec import Experiment
 
 __all__ = ["Canary", "run_canaries"]
 
 
-def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None, seed: int = 0) -> pl.DataFrame:
+def run_canaries(
+    rows: pl.DataFrame | None = None, variant: str | None = None, seed: int = 0,
+    experiments: Sequence[Experiment] | None = None,
+) -> pl.DataFrame:  # fmt: skip
     """Measure all canaries.
 
     Parameters
@@ -24,6 +28,8 @@ def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None, s
         Mitsuba variant.
     seed : int
         Of the noise.
+    experiments : sequence of Experiment, optional
+        What the rows are of: tells whether they must be noisy.
 
     Returns
     -------
@@ -49,7 +55,7 @@ def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None, s
     measured += [partial(_in, session, measure) for measure in in_session]
     measured.append(partial(noise.noises, variant, seed))
     if rows is not None:
-        measured.append(partial(noise.noises_of, rows))
+        measured.append(partial(noise.noises_of, rows, experiments))
     names = [*(measure.__name__ for measure in (*alone, *in_session)), "noises", "noises_of"]
     return as_figures(
         [canary for name, measure in zip(names, measured, strict=False) for canary in _any(name, measure)]

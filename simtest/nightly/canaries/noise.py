@@ -1,5 +1,6 @@
 """Canaries of randomness: as many different noises as realisations, of the right size."""
 
+from collections.abc import Sequence
 from hashlib import sha256
 
 import numpy as np
@@ -10,13 +11,15 @@ from simtest.rendering import Session
 from simtest.seeds import from_integer
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.paper import PaperSetting
-from simtest.validation.cases import expand
+from simtest.validation.cases import Case, expand
 from simtest.validation.paper.pipeline import Pipeline
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.realise import view
 
 SLANT_OFF_DEG = 0.05
 """What interpolation may leave of the error of circle_pose without noise and smoothing; 0.0085 deg."""
+
+_SIGMA_PATH = "sensor.noise_sigma"
 
 REALISATIONS = 8
 SIGMA = 0.05
@@ -78,14 +81,18 @@ def _distinct(name: str, frames: list[np.ndarray]) -> Canary:
     return Canary("noise", f"distinct_{name}", "", float(found), count, count, count, about)
 
 
-def noises_of(rows: pl.DataFrame) -> list[Canary]:
+def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = None) -> list[Canary]:
     """Count the realisations of a night's noisy settings that repeat another's seed, or its answers to the last bit.
 
     Parameters
     ----------
     rows : polars.DataFrame
         Results of all experiments.
+    experiments : sequence of Experiment, optional
+        What was run. Where one is defined with noise and its rows have none, the noise is lost and there is nothing to
+        count: no value, which does not pass. Without them, rows that all state a noise of 0 are taken at their word.
     """
+    lost = _without_noise(rows, experiments)
     setting = ("experiment", "setting")
     noisy = rows.filter(pl.col("noise_sigma") > 0)
     frames = noisy.select(*setting, "realisation", "seed").unique()
@@ -94,10 +101,37 @@ def noises_of(rows: pl.DataFrame) -> list[Canary]:
     answers = noisy.filter(pl.col("status") == "ok", pl.col("true_id").is_not_null(), pl.col("specularity") == 0)
     place = (*setting, "estimator")
     same = answers.group_by(place).agg(repeated=pl.len() - pl.struct("normal_x", "normal_y", "normal_z").n_unique())
+    # No repetition among no answers is no proof of different ones.
+    silent = frames.height > 0 and answers.is_empty()
+    told = f"; no noise in {', '.join(lost)}" if lost else ""
     return [
-        Canary("noise", "repeated_seeds", "", float(seeds), 0, n=frames.height, about="of the night's noisy settings"),
         Canary(
-            "noise", "repeated_answers", "", float(same["repeated"].sum()), 0, n=answers.height,
-            about="normals of the brightest highlight of the night's noisy settings that are the same bits",
+            "noise", "repeated_seeds", "", float("nan") if lost else float(seeds), 0, n=frames.height,
+            about="of the night's noisy settings" + told,
+        ),
+        Canary(
+            "noise", "repeated_answers", "", float("nan") if lost or silent else float(same["repeated"].sum()), 0,
+            n=answers.height,
+            about="normals of the brightest highlight of the night's noisy settings that are the same bits" + told,
         ),
     ]  # fmt: skip
+
+
+def _without_noise(rows: pl.DataFrame, experiments: Sequence[Experiment] | None) -> list[str]:
+    """Name the experiments whose noise is not in their rows."""
+    found = rows.group_by("experiment", maintain_order=True).agg(
+        noisy=(pl.col("noise_sigma").is_finite() & (pl.col("noise_sigma") > 0)).any(),
+        told=pl.col("noise_sigma").is_finite().any(),
+    )
+    if experiments is None:
+        return found.filter(~pl.col("told"))["experiment"].to_list()
+    noisy = set(found.filter("noisy")["experiment"].to_list())
+    return [own.name for own in experiments if own.name not in noisy and any(_sigma(case) > 0 for case in expand(own))]
+
+
+def _sigma(case: Case) -> float:
+    """Give the standard deviation of a case's noise; where it is drawn, the largest."""
+    if case.is_paper:
+        return case.paper_setting().sigma
+    drawn = case.random.get(_SIGMA_PATH)
+    return float(drawn.high) if drawn is not None else scene_from_dict(case.data, case.where).sensor.noise_sigma
