@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from simtest.nightly.baseline import accept, load_baseline
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
 from simtest.nightly.run import run_nightly
+from simtest.nightly.storage import BASELINE_ROWS, save_night
 from simtest.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
@@ -261,6 +263,29 @@ def test_a_damaged_baseline_stops_a_night_before_it_works(measured, reports):
     assert len(measured) == left
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda night: replace(night, rows=night.rows.drop("seed")), "quick/night.parquet: damaged .no column seed"),
+        (lambda night: replace(night, rows=night.rows.cast({"error_deg": pl.String})),
+         "quick/night.parquet: damaged .column error_deg is of type String, not Float64"),
+        (lambda night: replace(night, figures=night.figures.cast({"value": pl.String})),
+         "quick/figures.parquet: damaged .column value is of type String, not Float64"),
+        (lambda night: replace(night, run={**night.run, "profile": "full"}), "quick/run.json: profile = full; the "
+         "baseline of this night must be of the profile quick"),
+    ],
+)  # fmt: skip
+def test_a_baseline_that_cannot_be_compared_stops_a_night_before_it_works(measured, reports, change, said):
+    """Its hashes are right: it was written so."""
+    accept_first(reports)
+    save_night(reports.baseline("quick"), change(load_baseline(reports, "quick")), BASELINE_ROWS)
+    before, left = contents(reports.root), len(measured)
+    with pytest.raises(InputError, match=said):
+        run_nightly(quick(), reports)
+    assert contents(reports.root) == before
+    assert len(measured) == left
+
+
 @pytest.mark.parametrize("at", range(8))
 def test_a_full_disk_is_told_and_nothing_is_lost(measured, reports, monkeypatch, at):
     """The disk is full from the n-th flush on: while the history, the tables, the outputs are written."""
@@ -289,6 +314,62 @@ def test_the_next_night_works_after_a_full_disk(measured, reports, monkeypatch):
         with pytest.raises(SimtestError):
             run_nightly(quick(), reports)
     assert run_nightly(quick(), reports).exit_code == 0
+
+
+def fails_with(error):
+    def fails(*_, **__):
+        raise error
+
+    return fails
+
+
+def test_a_night_without_its_pictures_is_kept_and_says_so(measured, reports, monkeypatch):
+    monkeypatch.setattr(run_module, "save_worst", fails_with(RuntimeError("no such\nframe")))
+    outcome = run_nightly(quick(), reports)
+    said = "The worst cases could not be made again (RuntimeError: no such frame)."
+    assert said in outcome.verdict.notes
+    assert said in json.loads((outcome.folder / "verdict.json").read_text())["notes"]
+    assert outcome.history_file.is_file()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a page's fault"), KeyboardInterrupt()])
+@pytest.mark.parametrize("step", ["make_page", "write_nightly_page", "append"])
+def test_nothing_is_kept_of_a_night_that_stops_before_it_is_whole(measured, reports, monkeypatch, step, error):
+    accept_first(reports)
+    before = contents(reports.root)
+    monkeypatch.setattr(run_module, step, fails_with(error))
+    with pytest.raises(type(error)) as stop:
+        run_nightly(quick(), reports)
+    assert contents(reports.root) == before
+    assert stop.value.args == error.args
+
+
+def test_a_ctrl_c_after_the_history_says_what_is_kept(measured, here, monkeypatch, tmp_path):
+    monkeypatch.setattr(run_module, "replace_folder", fails_with(KeyboardInterrupt()))
+    code, output, errors = here()
+    assert (code, output) == (130, "")
+    assert errors[-1] == "simtest: stopped; this night is in the history; its page may not have been published"
+    assert read_history(tmp_path / "reports" / "history")[0].height
+
+
+def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
+    for error in (pl.exceptions.ColumnNotFoundError("seed"), OSError(errno.ENOMEM, "Cannot allocate memory")):
+        monkeypatch.setattr(run_module, "measure_night", fails_with(error))
+        with pytest.raises(type(error)):
+            run_nightly(quick(), reports)
+    monkeypatch.setattr(run_module, "measure_night", fails_with(
+        pl.exceptions.ComputeError("No space left on device (os error 28)")))  # fmt: skip
+    with pytest.raises(SimtestError, match=r"the night could not be written .No space left"):
+        run_nightly(quick(), reports)
+
+
+def test_an_acceptance_on_a_full_disk_is_told_in_one_line(measured, reports, monkeypatch):
+    accept_first(reports)
+    before = contents(reports.root)
+    monkeypatch.setattr("simtest.files.os.fsync", fails_with(OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(SimtestError, match=r"the baseline could not be written .No space left on device.; the last"):
+        accept(reports, "quick", "second")
+    assert contents(reports.root) == before
 
 
 # The command -----------------------------------------------------------------------------------------------------
