@@ -117,9 +117,7 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
         low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))
         about = f"{1e3 * np.median(times[name]):.3g} ms over {1e3 * np.median(reference):.3g} ms of processor time"
         made.append(_figure(name, setting, "run_time", "x", middle, low, high, rounds, about))
-    about = (
-        "; ".join(f"{name}: {why}" for name, why in idle.items()) or "each piece that is timed has an answer"
-    )
+    about = "; ".join(f"{name}: {why}" for name, why in idle.items()) or "each piece that is timed has an answer"
     canary = Canary("costs", "unanswered", "", len(idle), 0.0, n=len(pieces), about=about)
     return pl.concat([pl.DataFrame(made, schema=FIGURES), as_figures([canary])])
 
