@@ -37,10 +37,9 @@ def run(
     """
     try:
         outcome = _run(profile, reports, variant, engine, workers, address)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            "nothing of this night is kept; history, baseline and the last page are as they were"
-        ) from None
+    except KeyboardInterrupt as stop:
+        nothing = "nothing of this night is kept; history, baseline and the last page are as they were"
+        raise KeyboardInterrupt(str(stop) or nothing) from None
     _print(outcome)
     return outcome.exit_code
 

@@ -6,18 +6,25 @@ from datetime import UTC, datetime
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.gate.quantities import RESULT_COLUMNS
 from simtest.gate.records import PLACE, Night
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
-from simtest.nightly.storage import BASELINE_ROWS, RUN_FILE, TONIGHT_ROWS, load_night, save_night
+from simtest.nightly.storage import (
+    BASELINE_ROWS,
+    RUN_FILE,
+    TONIGHT_ROWS,
+    check_columns,
+    load_night,
+    save_night,
+    told_in_one_line,
+)
 from simtest.resources import shown
+from simtest.validation.metrics import SCHEMA
 
 LOG = "log.jsonl"
 MAX_REASON = 1000
 
-COLUMNS = (
-    *PLACE, "realisation", "specularity", "true_id", "seed", "status", "error_deg", "mahalanobis2", "axis_ratio",
-    "axis_ratio_law",
-)  # fmt: skip
+COLUMNS = (*PLACE, "realisation", *RESULT_COLUMNS)
 """Columns of the rows that a baseline keeps: what names a row, and what `simtest.gate.compare` reads."""
 
 
@@ -27,11 +34,21 @@ def load_baseline(reports: Reports, profile: str) -> Night | None:
     Raises
     ------
     InputError
-        If a file of it is missing or damaged; the message names it.
+        If a file of it is missing or damaged, lacks what `simtest.gate.compare` reads, or is another profile's; the
+        message names it.
     """
     folder = reports.baseline(profile)
     with turn(folder):
-        return load_night(folder, BASELINE_ROWS) if folder.is_dir() else None
+        if not folder.is_dir():
+            return None
+        night = load_night(folder, BASELINE_ROWS)
+    if night.run["profile"] != profile:
+        raise InputError(
+            f"{shown(folder / RUN_FILE)}: profile = {shown(night.run['profile'])}; the baseline of this night must be "
+            f"of the profile {profile}"
+        )
+    check_columns(folder / BASELINE_ROWS, night.rows, {name: SCHEMA[name] for name in COLUMNS})
+    return night
 
 
 def accept(reports: Reports, profile: str, reason: str) -> dict[str, Any]:
@@ -55,10 +72,17 @@ def accept(reports: Reports, profile: str, reason: str) -> dict[str, Any]:
     ------
     InputError
         If there is no last night, it is damaged, or no reason is given.
+    SimtestError
+        If the disk is full, or may not be written.
     """
     reason = " ".join(reason.split())
     if not reason or len(reason) > MAX_REASON:
         raise InputError(f"--reason: {len(reason)} characters; must be 1 to {MAX_REASON} that say why")
+    with told_in_one_line(reports.root, "the baseline could not be written; the last one is as it was"):
+        return _accept(reports, profile, reason)
+
+
+def _accept(reports: Reports, profile: str, reason: str) -> dict[str, Any]:
     source, target = reports.tonight(profile), reports.baseline(profile)
     reports.make()
     with turn(source):

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from simtest.calibration import Known
+from simtest.errors import Failure
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
@@ -16,6 +17,7 @@ from simtest.estimators.photometric import photometric
 from simtest.gate.records import FIGURES
 from simtest.geometry import Camera, Patch, smooth
 from simtest.measuring import times_in_turns
+from simtest.nightly.canaries.record import Canary, as_figures
 from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_scene
@@ -92,13 +94,15 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
     -------
     polars.DataFrame
         Columns `FIGURES`, kind "cost", `estimator` the piece's name, quantity "run_time": the median of the rounds'
-        ratios to the reference kernel's time; `low`, `high` are their quartiles.
+        ratios to the reference kernel's time; `low`, `high` are their quartiles. A piece that gives no answer has no
+        value, for it stops early and would look fast; a row of kind "canary" counts these.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         of_highlight = estimator_pieces()
         pieces = {**of_highlight, **_frame_pieces(variant)}
+        idle = {name: why for name, piece in pieces.items() if (why := _no_answer(piece()))}
         # The processor's time, of all threads: what else runs on the machine tells less on it than on the clock's.
         times = times_in_turns({"reference": reference_kernel(), **pieces}, rounds, time.process_time)
     finally:
@@ -106,11 +110,27 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
     reference = np.array(times["reference"])
     made = []
     for name in pieces:
+        setting = HIGHLIGHT if name in of_highlight else FRAME
+        if name in idle:
+            made.append(_figure(name, setting, "run_time", "x", None, None, None, 0, f"no answer: {idle[name]}"))
+            continue
         low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))
         about = f"{1e3 * np.median(times[name]):.3g} ms over {1e3 * np.median(reference):.3g} ms of processor time"
-        setting = HIGHLIGHT if name in of_highlight else FRAME
         made.append(_figure(name, setting, "run_time", "x", middle, low, high, rounds, about))
-    return pl.DataFrame(made, schema=FIGURES)
+    about = "; ".join(f"{name}: {why}" for name, why in idle.items()) or "each piece that is timed has an answer"
+    canary = Canary("costs", "unanswered", "", len(idle), 0.0, n=len(pieces), about=about)
+    return pl.concat([pl.DataFrame(made, schema=FIGURES), as_figures([canary])])
+
+
+def _no_answer(result: object) -> str:
+    """Say why a piece of work has no answer; nothing where it has one."""
+    if isinstance(result, Failure):
+        return str(result)
+    if isinstance(result, list):
+        # Of a frame: one specularity that all estimators answer is enough, as noise may add others.
+        whole = [spot for spot in result if not any(isinstance(own, Failure) for own in spot.estimates.values())]
+        return "" if whole else f"none of {len(result)} specularities"
+    return ""
 
 
 def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
@@ -124,8 +144,8 @@ def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
 
 
 def _figure(
-    name: str, setting: str, quantity: str, unit: str, value: float, low: float | None, high: float | None, n: int,
-    about: str,
+    name: str, setting: str, quantity: str, unit: str, value: float | None, low: float | None, high: float | None,
+    n: int, about: str,
 ) -> dict[str, Any]:  # fmt: skip
     return {
         "kind": "cost", "experiment": "cost", "label": "", "surface": "", "setting": setting, "estimator": name,

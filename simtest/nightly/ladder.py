@@ -3,6 +3,7 @@
 import polars as pl
 
 from simtest.gate.records import FIGURES
+from simtest.nightly.canaries.record import Canary, as_figures
 from simtest.validation.ladder import RUNGS, error_ladder
 
 
@@ -29,3 +30,22 @@ def ladder_figures(seed: int = 0) -> pl.DataFrame:
              "high": high, "n": len(rung.errors_deg), "about": RUNGS[rung.name]}
         )  # fmt: skip
     return pl.DataFrame(rows, schema=FIGURES)
+
+
+def ladder_canary(figures: pl.DataFrame) -> pl.DataFrame:
+    """Give the canary that sees a rung that nothing answers: of a closed form, every one does.
+
+    Parameters
+    ----------
+    figures : polars.DataFrame
+        As `ladder_figures` gives them.
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns `FIGURES`, kind "canary".
+    """
+    without = figures.filter(pl.col("value").is_null() | pl.col("value").is_nan())
+    named = "; ".join(f"{row['setting']}, {row['estimator']}, {row['quantity']}" for row in without.to_dicts())
+    about = f"rungs without an answer: {named}" if named else "each rung of a closed form has an answer"
+    return as_figures([Canary("error ladder", "unanswered", "", without.height, 0.0, n=figures.height, about=about)])

@@ -11,16 +11,18 @@ import polars as pl
 from simtest import provenance
 from simtest.engines import make_engine
 from simtest.engines.base import Engine
+from simtest.estimators import load_estimators
 from simtest.gate.figures import setting_figures
 from simtest.gate.records import FIGURES, Night
 from simtest.measuring import PeakMemory
 from simtest.nightly import cost
-from simtest.nightly.canaries import run_canaries
-from simtest.nightly.ladder import ladder_figures
+from simtest.nightly.canaries import Canary, noise, run_canaries
+from simtest.nightly.canaries.record import as_figures
+from simtest.nightly.ladder import ladder_canary, ladder_figures
 from simtest.rendering import backend
 from simtest.spec import Profile, experiments_of
 from simtest.validation.cases import expand
-from simtest.validation.runner import Progress, run_experiments
+from simtest.validation.runner import Progress, definition, run_experiments
 
 _LOOK_S = 0.5
 """Time between two looks at the memory: each takes some milliseconds of a big process."""
@@ -69,21 +71,31 @@ def measure_night(
     # Told at the start: the checkout may have moved on before the night ends.
     origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
     experiments = experiments_of(profile)
-    steps = _Steps(progress, sum(case.realisations for experiment in experiments for case in expand(experiment)))
+    cases = [expand(experiment) for experiment in experiments]
+    for experiment in experiments:
+        # Refused before the canaries, not after them.
+        load_estimators(experiment.estimators)
+    definitions = {own.name: definition(own, of_own) for own, of_own in zip(experiments, cases, strict=True)}
+    steps = _Steps(progress, sum(case.realisations for of_own in cases for case in of_own))
+    figures: list[pl.DataFrame] = []
     with PeakMemory(os.getpid(), _LOOK_S) as peak:
+        if profile.canaries:
+            steps.tell("canaries")
+            figures += [run_canaries(None, variant), *_guarded("error ladder", _ladder)]
+        before = time.monotonic()
         runs = run_experiments(
             [(experiment, folder / experiment.name) for experiment in experiments], command, variant,
             steps.of("experiments"), engine or make_engine(workers=workers),
         )  # fmt: skip
-        took_s = time.monotonic() - clock
+        took_s = time.monotonic() - before
         rows = pl.concat([run.results for run in runs], how="diagonal_relaxed")
-        figures = [setting_figures(rows)]
+        figures.insert(0, setting_figures(rows))
         if profile.canaries:
-            steps.tell("canaries")
-            figures += [run_canaries(rows, variant), ladder_figures()]
+            figures += _guarded("noises_of", lambda: [as_figures(noise.noises_of(rows))])
     if profile.costs:
         steps.tell("costs")
-        figures += [cost.run_times(variant), cost.memory(peak.peak_mib, workers)]
+        figures += _guarded("costs", lambda: [cost.run_times(variant)])
+        figures.append(cost.memory(peak.peak_mib, workers))
     steps.end()
     run = {
         "id": run_id,
@@ -93,12 +105,27 @@ def measure_night(
         "duration_s": round(time.monotonic() - clock, 1),
         "experiments_s": round(took_s, 1),
         "workers": workers,
+        "definitions": definitions,
         "command": command,
         **origin,
         "variant": backend.requested_variant(variant),
         "llvm": backend.library_in_use(),
     }
     return Night(run, rows, pl.concat([table.select(*FIGURES) for table in figures]))
+
+
+def _ladder() -> list[pl.DataFrame]:
+    figures = ladder_figures()
+    return [figures, ladder_canary(figures)]
+
+
+def _guarded(name: str, measure: Callable[[], list[pl.DataFrame]]) -> list[pl.DataFrame]:
+    """Give figures, or in their place a canary that failed: a fault of one part must not lose a night."""
+    try:
+        return measure()
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        return [as_figures([Canary(name, "error", "", float("nan"), 0.0, n=0, about=why)])]
 
 
 class _Steps:

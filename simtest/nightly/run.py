@@ -1,8 +1,6 @@
 """A night from start to end: measured, judged, kept in the history, published."""
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +8,6 @@ from pathlib import Path
 import polars as pl
 
 from simtest.engines.base import Engine
-from simtest.errors import SimtestError
 from simtest.gate.compare import compare
 from simtest.gate.records import Night, Verdict
 from simtest.nightly.baseline import load_baseline
@@ -27,15 +24,14 @@ from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_fol
 from simtest.nightly.measure import measure_night
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.overview import ordered, without_canaries
-from simtest.nightly.storage import TONIGHT_ROWS, save_night
+from simtest.nightly.storage import TONIGHT_ROWS, save_night, told_in_one_line
 from simtest.report.nightly import Extras, write_nightly_page
-from simtest.resources import shown
 from simtest.spec import Profile, experiments_of
 from simtest.validation.runner import Progress
 from simtest.validation.worst import save_worst, worst_cases
 
-FINE, REGRESSION, COULD_NOT_RUN = 0, 1, 2
-"""Exit codes of a night."""
+FINE, REGRESSION = 0, 1
+"""Exit codes of a night that was run."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +104,7 @@ def run_nightly(
         If the night could not be run: bad input, a damaged baseline, no rendering backend, no space on the disk. What
         was written by earlier nights is as it was.
     """
-    with _told_in_one_line(reports):
+    with told_in_one_line(reports.root, "the night could not be written; what earlier nights wrote is as it was"):
         reports.make()
         # A damaged baseline is told before the work, not after it.
         baseline = load_baseline(reports, profile.name)
@@ -119,14 +115,41 @@ def run_nightly(
             verdict = judge(night, baseline)
             history, notes = read_history(reports.history, profile.name, TREND_COLUMNS, TRENDS)
             late = clock_note(history, datetime.fromisoformat(night.run["started"]))
-            verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *([late] if late else []), *notes))
+            worst, lacking = _gallery(profile, night, verdict, folder / "worst", variant)
+            notes = [*verdict.notes, *([late] if late else []), *notes, *lacking]
+            verdict = dataclasses.replace(verdict, notes=tuple(notes))
             rows = history_rows(night, verdict)
-            file = append(reports.history, rows)
             history = pl.concat([history, trend_columns(rows, quantities=TRENDS)])
-            worse = ordered(without_canaries(night, verdict), "worse")
-            worst = save_worst(worst_cases(night.rows, worse), experiments_of(profile), folder / "worst", variant)
-            target = publish(reports, folder, night, verdict, history, worst)
-    return Outcome(night, verdict, target, file)
+            page = make_page(folder / "tonight", night, verdict, history, worst)
+            file = _keep(reports, night, rows, page)
+    return Outcome(night, verdict, reports.tonight(profile.name), file)
+
+
+def _gallery(
+    profile: Profile, night: Night, verdict: Verdict, folder: Path, variant: str | None
+) -> tuple[tuple[Path, ...], list[str]]:
+    """Make the worst cases again; a failure is a note, for the night is measured and must not be lost over pictures."""
+    try:
+        worse = ordered(without_canaries(night, verdict), "worse")
+        return save_worst(worst_cases(night.rows, worse), experiments_of(profile), folder, variant), []
+    except Exception as error:
+        return (), [
+            f"The worst cases could not be made again ({type(error).__name__}: {' '.join(str(error).split())})."
+        ]
+
+
+def _keep(reports: Reports, night: Night, rows: pl.DataFrame, page: Path) -> Path:
+    """Put a night that is whole into the history, and its page in the place of the last; gives the history's file."""
+    target, run_id = reports.tonight(night.run["profile"]), night.run["id"]
+    try:
+        file = append(reports.history, rows)
+        with turn(target):
+            replace_folder(page, target)
+    except KeyboardInterrupt:
+        if any(reports.history.glob(f"date=*/commit=*/{run_id}.parquet")):
+            raise KeyboardInterrupt("this night is in the history; its page may not have been published") from None
+        raise
+    return file
 
 
 def judge(night: Night, baseline: Night | None) -> Verdict:
@@ -142,18 +165,15 @@ def judge(night: Night, baseline: Night | None) -> Verdict:
     return dataclasses.replace(verdict, notes=(*verdict.notes, note))
 
 
-def publish(
-    reports: Reports, scratch_folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame,
-    worst: tuple[Path, ...] = (),
-) -> Path:  # fmt: skip
-    """Write the page and all that lies beside it, and put it in the place of the last night's.
+def make_page(
+    folder: Path, night: Night, verdict: Verdict, history: pl.DataFrame, worst: tuple[Path, ...] = ()
+) -> Path:
+    """Write the page and all that lies beside it.
 
     Parameters
     ----------
-    reports : Reports
-        Where it goes.
-    scratch_folder : Path
-        Where it is made.
+    folder : Path
+        Where; made.
     night : Night
         The night.
     verdict : Verdict
@@ -166,28 +186,10 @@ def publish(
     Returns
     -------
     Path
-        The page's folder.
+        The folder.
     """
-    new, target = scratch_folder / "tonight", reports.tonight(night.run["profile"])
-    new.mkdir()
-    save_night(new, night, TONIGHT_ROWS)
-    write_outputs(new, night, verdict)
-    write_nightly_page(new, night, verdict, history, Extras(gallery=worst, files=FILES))
-    with turn(target):
-        replace_folder(new, target)
-    return target
-
-
-@contextlib.contextmanager
-def _told_in_one_line(reports: Reports) -> Iterator[None]:
-    """Turn what the disk refuses into an error that says so."""
-    try:
-        yield
-    except SimtestError:
-        raise
-    except (OSError, pl.exceptions.PolarsError) as error:
-        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise SimtestError(
-            f"--reports {shown(reports.root)}: the night could not be written ({' '.join(said.split())[:200]}); "
-            "what earlier nights wrote is as it was"
-        ) from error
+    folder.mkdir()
+    save_night(folder, night, TONIGHT_ROWS)
+    write_outputs(folder, night, verdict)
+    write_nightly_page(folder, night, verdict, history, Extras(gallery=worst, files=FILES))
+    return folder

@@ -1,13 +1,15 @@
 """A night as files: the rows, the figures, and the run's record with their hashes."""
 
+import contextlib
+import errno
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.files import sync_folder, write_atomically, write_json
 from simtest.gate.records import FIGURES, Night
 from simtest.provenance import file_hash
@@ -15,6 +17,45 @@ from simtest.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
 TONIGHT_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
+
+_OF_THE_DISK = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
+    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG,
+}  # fmt: skip
+
+
+@contextlib.contextmanager
+def told_in_one_line(root: Path, said: str) -> Iterator[None]:
+    """Turn what the disk refuses into an error that says so; any other error is a fault, and stays what it is.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the reports.
+    said : str
+        What could not be done; what is left as it was, after a semicolon.
+
+    Raises
+    ------
+    SimtestError
+        In place of an error of the file system, also of one that polars hands on.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _OF_THE_DISK and "(os error " not in str(error):
+            raise
+        raise _refused(root, said, error.strerror or str(error)) from error
+    except pl.exceptions.PolarsError as error:
+        # Its own errors, of a missing column say, have nothing to do with the disk.
+        if "(os error " not in str(error):
+            raise
+        raise _refused(root, said, str(error)) from error
+
+
+def _refused(root: Path, said: str, why: str) -> SimtestError:
+    what, _, left = said.partition("; ")
+    return SimtestError(f"--reports {shown(root)}: {what} ({' '.join(why.split())[:200]}); {left}")
 
 
 def save_night(folder: Path, night: Night, rows_file: str, columns: Sequence[str] | None = None) -> None:
@@ -53,9 +94,23 @@ def load_night(folder: Path, rows_file: str) -> Night:
     """
     run = _record(folder / RUN_FILE)
     rows, figures = (_table(folder / name, run) for name in (rows_file, FIGURES_FILE))
-    if missing := next((name for name in FIGURES if name not in figures.columns), None):
-        raise InputError(f"{shown(folder / FIGURES_FILE)}: damaged (no column {missing})")
+    check_columns(folder / FIGURES_FILE, figures, FIGURES)
     return Night({key: value for key, value in run.items() if key != "files"}, rows, figures.select(*FIGURES))
+
+
+def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataType]) -> None:
+    """Refuse a table that lacks a column, or holds one of another type.
+
+    Raises
+    ------
+    InputError
+        The message names file and column.
+    """
+    for name, dtype in schema.items():
+        if name not in table.columns:
+            raise InputError(f"{shown(path)}: damaged (no column {name})")
+        if table.schema[name] != dtype:
+            raise InputError(f"{shown(path)}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
 
 
 def _record(path: Path) -> dict[str, Any]:

@@ -238,14 +238,39 @@ def _in_gallery(cases: list[Case]) -> set[int]:
 
 def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
     """Give a hash of all that determines a run's results."""
-    fingerprint = {
-        "experiment": experiment.model_dump(mode="json"),
-        "scenes": [case.data for case in cases],
-        "inputs": _inputs(cases),
-        "versions": provenance.versions() | distributions(experiment.estimators),
-        "source": provenance.source_hash(),
-        "variant": variant,
-    }
+    return _hash(
+        {
+            "experiment": experiment.model_dump(mode="json"),
+            "scenes": [case.data for case in cases],
+            "inputs": _inputs(cases),
+            "versions": provenance.versions() | distributions(experiment.estimators),
+            "source": provenance.source_hash(),
+            "variant": variant,
+        }
+    )
+
+
+def definition(experiment: Experiment, cases: list[Case]) -> str:
+    """Give a hash of what an experiment is: itself, its scenes, its input files; not of what runs it, nor from where.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    cases : list of Case
+        As `expand` gives them.
+
+    Returns
+    -------
+    str
+        SHA-256, hex.
+    """
+    files = sorted((Path(name).name, digest) for name, digest in _inputs(cases).items())
+    scenes = [case.data for case in cases]
+    return _hash({"experiment": experiment.model_dump(mode="json"), "scenes": scenes, "inputs": files})
+
+
+def _hash(fingerprint: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
 
 

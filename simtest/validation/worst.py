@@ -64,6 +64,8 @@ def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: 
     -------
     list of WorstCase
     """
+    # A law that is no number says nothing; it would be sorted before all numbers.
+    results = results.with_columns(error_law_deg=pl.when(pl.col("error_law_deg").is_finite()).then("error_law_deg"))
     expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_PLACE))
     answered = (pl.col("status") == "ok") & pl.col("true_id").is_not_null() & pl.col("error_oracle_deg").is_finite()
     rows = results.filter(answered).with_columns(
@@ -72,7 +74,9 @@ def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: 
     rows = rows.sort("excess", "row", descending=[True, False])
     queues: list[pl.DataFrame] = []
     if worse is not None:
-        places = worse.select(_PLACE).unique(maintain_order=True).head(most // 2)
+        places = worse.select(_PLACE).unique(maintain_order=True)
+        # Pooled comparisons and costs are of no frame: they must not take the room of those that are.
+        places = places.join(rows, on=_PLACE, how="semi", nulls_equal=True, maintain_order="left").head(most // 2)
         queues += [rows.join(place, on=_PLACE, nulls_equal=True).head(1) for place in places.iter_slices(1)]
     chosen: dict[tuple[str, str, int], WorstCase] = {}
     _take(chosen, [queue for queue in queues if queue.height], most // 2)

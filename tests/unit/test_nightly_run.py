@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -14,15 +15,19 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
+from simtest.gate.records import FIGURES
 from simtest.nightly import measure
 from simtest.nightly import run as run_module
 from simtest.nightly.baseline import accept, load_baseline
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
+from simtest.nightly.overview import failed_canaries
 from simtest.nightly.run import run_nightly
+from simtest.nightly.storage import BASELINE_ROWS, save_night
 from simtest.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
+from simtest.validation.runner import definition
 from tests.unit.nightly_samples import STARTED, canary, make_night, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -261,6 +266,29 @@ def test_a_damaged_baseline_stops_a_night_before_it_works(measured, reports):
     assert len(measured) == left
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda night: replace(night, rows=night.rows.drop("seed")), "quick/night.parquet: damaged .no column seed"),
+        (lambda night: replace(night, rows=night.rows.cast({"error_deg": pl.String})),
+         "quick/night.parquet: damaged .column error_deg is of type String, not Float64"),
+        (lambda night: replace(night, figures=night.figures.cast({"value": pl.String})),
+         "quick/figures.parquet: damaged .column value is of type String, not Float64"),
+        (lambda night: replace(night, run={**night.run, "profile": "full"}), "quick/run.json: profile = full; the "
+         "baseline of this night must be of the profile quick"),
+    ],
+)  # fmt: skip
+def test_a_baseline_that_cannot_be_compared_stops_a_night_before_it_works(measured, reports, change, said):
+    """Its hashes are right: it was written so."""
+    accept_first(reports)
+    save_night(reports.baseline("quick"), change(load_baseline(reports, "quick")), BASELINE_ROWS)
+    before, left = contents(reports.root), len(measured)
+    with pytest.raises(InputError, match=said):
+        run_nightly(quick(), reports)
+    assert contents(reports.root) == before
+    assert len(measured) == left
+
+
 @pytest.mark.parametrize("at", range(8))
 def test_a_full_disk_is_told_and_nothing_is_lost(measured, reports, monkeypatch, at):
     """The disk is full from the n-th flush on: while the history, the tables, the outputs are written."""
@@ -289,6 +317,142 @@ def test_the_next_night_works_after_a_full_disk(measured, reports, monkeypatch):
         with pytest.raises(SimtestError):
             run_nightly(quick(), reports)
     assert run_nightly(quick(), reports).exit_code == 0
+
+
+def fails_with(error):
+    def fails(*_, **__):
+        raise error
+
+    return fails
+
+
+def test_a_night_without_its_pictures_is_kept_and_says_so(measured, reports, monkeypatch):
+    monkeypatch.setattr(run_module, "save_worst", fails_with(RuntimeError("no such\nframe")))
+    outcome = run_nightly(quick(), reports)
+    said = "The worst cases could not be made again (RuntimeError: no such frame)."
+    assert said in outcome.verdict.notes
+    assert said in json.loads((outcome.folder / "verdict.json").read_text())["notes"]
+    assert outcome.history_file.is_file()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a page's fault"), KeyboardInterrupt()])
+@pytest.mark.parametrize("step", ["make_page", "write_nightly_page", "append"])
+def test_nothing_is_kept_of_a_night_that_stops_before_it_is_whole(measured, reports, monkeypatch, step, error):
+    accept_first(reports)
+    before = contents(reports.root)
+    monkeypatch.setattr(run_module, step, fails_with(error))
+    with pytest.raises(type(error)) as stop:
+        run_nightly(quick(), reports)
+    assert contents(reports.root) == before
+    assert stop.value.args == error.args
+
+
+def test_a_ctrl_c_after_the_history_says_what_is_kept(measured, here, monkeypatch, tmp_path):
+    monkeypatch.setattr(run_module, "replace_folder", fails_with(KeyboardInterrupt()))
+    code, output, errors = here()
+    assert (code, output) == (130, "")
+    assert errors[-1] == "simtest: stopped; this night is in the history; its page may not have been published"
+    assert read_history(tmp_path / "reports" / "history")[0].height
+
+
+def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
+    for error in (pl.exceptions.ColumnNotFoundError("seed"), OSError(errno.ENOMEM, "Cannot allocate memory")):
+        monkeypatch.setattr(run_module, "measure_night", fails_with(error))
+        with pytest.raises(type(error)):
+            run_nightly(quick(), reports)
+    monkeypatch.setattr(run_module, "measure_night", fails_with(
+        pl.exceptions.ComputeError("No space left on device (os error 28)")))  # fmt: skip
+    with pytest.raises(SimtestError, match=r"the night could not be written .No space left"):
+        run_nightly(quick(), reports)
+
+
+def test_an_acceptance_on_a_full_disk_is_told_in_one_line(measured, reports, monkeypatch):
+    accept_first(reports)
+    before = contents(reports.root)
+    monkeypatch.setattr("simtest.files.os.fsync", fails_with(OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(SimtestError, match=r"the baseline could not be written .No space left on device.; the last"):
+        accept(reports, "quick", "second")
+    assert contents(reports.root) == before
+
+
+# Measuring -------------------------------------------------------------------------------------------------------
+
+
+def figure_of(kind, name):
+    return pl.DataFrame([{"kind": kind, "experiment": name, "value": 1.0, "passed": True}], schema=FIGURES)
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """Have a night whose parts but the experiments do nothing; gives the order in which they are asked."""
+    told, experiments = [], measure.run_experiments
+
+    def tells(name, result):
+        return lambda *_, **__: (told.append(name), result)[1]
+
+    def work(*arguments):
+        told.append("experiments")
+        return experiments(*arguments)
+
+    monkeypatch.setattr(measure, "run_canaries", tells("canaries", figure_of("canary", "pose")))
+    monkeypatch.setattr(measure, "ladder_figures", tells("ladder", figure_of("ladder", "error ladder")))
+    monkeypatch.setattr(measure, "run_experiments", work)
+    monkeypatch.setattr(measure.noise, "noises_of", tells("noises_of", []))
+    monkeypatch.setattr(measure.cost, "run_times", tells("costs", figure_of("cost", "cost")))
+    return told
+
+
+PAPER = '[[experiments]]\nexperiment = "paper"\nlabels = ["noise"]\nrealisations = 1\n'
+
+
+def night_of(tmp_path, text=PAPER):
+    folder = tmp_path / f"night-{len(list(tmp_path.glob('night-*')))}"
+    folder.mkdir()
+    return measure.measure_night(profile_of(tmp_path, text), folder, "id")
+
+
+def test_canaries_come_first(parts, tmp_path):
+    night = night_of(tmp_path)
+    assert parts == ["canaries", "ladder", "experiments", "noises_of", "costs"]
+    assert failed_canaries(night).height == 0
+    assert set(night.figures["kind"]) == {"setting", "canary", "ladder", "cost"}
+
+
+@pytest.mark.parametrize("part", ["ladder_figures", "noises_of", "run_times"])
+@pytest.mark.parametrize("error", [AssertionError("odd"), BackendError("odd")])
+def test_a_part_that_breaks_is_a_failed_canary_of_a_night_that_is_kept(parts, tmp_path, monkeypatch, part, error):
+    monkeypatch.setattr({"noises_of": measure.noise, "run_times": measure.cost}.get(part, measure), part,
+                        fails_with(error))  # fmt: skip
+    night = night_of(tmp_path)
+    assert night.rows.height
+    (failed,) = failed_canaries(night).to_dicts()
+    names = {"ladder_figures": "error ladder", "noises_of": "noises_of", "run_times": "costs"}
+    assert (failed["experiment"], failed["about"]) == (names[part], f"{type(error).__name__}: odd")
+
+
+def test_the_record_says_what_ran(parts, tmp_path):
+    first, again, more = (night_of(tmp_path, text) for text in (PAPER, PAPER, PAPER + "seed = 3\n"))
+    assert set(first.run["definitions"]) == {"paper"}
+    assert re.fullmatch("[0-9a-f]{64}", first.run["definitions"]["paper"])
+    assert first.run["definitions"] == again.run["definitions"]
+    assert first.run["definitions"] != more.run["definitions"]
+
+
+def test_a_definition_is_that_of_scene_and_files_and_not_of_place_or_source(small, tmp_path, monkeypatch):
+    def hashes(profile):
+        return {own.name: definition(own, expand(own)) for own in experiments_of(load_profile(profile))}
+
+    scene = tmp_path / "plane.toml"
+    scene.write_text((data_root("scenes") / "plane.toml").read_text())
+    planes = tmp_path / "planes.toml"
+    planes.write_text(PLANES.replace('"plane"\nlabel', f'"{scene}"\nlabel'))
+    first = hashes(small)
+    monkeypatch.setattr("simtest.provenance.source_hash", lambda: "another")
+    assert hashes(small) == first
+    text = scene.read_text()
+    scene.write_text(text + "\n# Another file.\n")
+    assert hashes(small)["planes"] != first["planes"]
+    assert hashes(small)["paper"] == first["paper"]
 
 
 # The command -----------------------------------------------------------------------------------------------------

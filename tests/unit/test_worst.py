@@ -49,6 +49,25 @@ def test_what_got_worse_comes_first_but_leaves_room():
     assert len({(c.setting, c.realisation) for c in chosen}) == 4
 
 
+def test_what_is_of_no_frame_takes_no_room_from_what_got_worse():
+    rows = table(*(row(name, f"setting {i}", i, 0.1 * i, law=0.0) for i in range(8) for name in ("a", "b")))
+    own = rows.filter((pl.col("estimator") == "b") & pl.col("setting").is_in(["setting 0", "setting 1"]))
+    pooled = own.with_columns(label=pl.lit("all"), surface=pl.lit("all"), setting=pl.lit("all"))
+    cost = pooled.with_columns(experiment=pl.lit("cost"))
+    chosen = worst_cases(rows, pl.concat([pooled, cost, own]), most=4)
+    assert [(c.estimator, c.setting) for c in chosen[:2]] == [("b", "setting 0"), ("b", "setting 1")]
+
+
+@pytest.mark.parametrize("law", [np.nan, np.inf])
+def test_a_law_that_is_no_number_is_none(law):
+    rows = table(
+        *(row("a", "x", i, error, law=law) for i, error in enumerate([0.1, 0.2, 0.3])), row("a", "y", 3, 9.0, law=0.0)
+    )
+    chosen = worst_cases(rows)
+    assert [c.setting for c in chosen] == ["y", "x"]
+    assert chosen[1].why == "a missed by 0.3°; the setting's median is 0.2°."
+
+
 def test_frames_are_chosen_once_and_rows_without_an_answer_never():
     rows = table(
         row("a", "x", 0, 5.0, law=0.0), row("b", "x", 0, 6.0, law=0.0), row("a", "y", 1, np.nan, law=0.0),
