@@ -91,12 +91,13 @@ def measure_night(
         rows = pl.concat([run.results for run in runs], how="diagonal_relaxed")
         figures.insert(0, setting_figures(rows))
         if profile.canaries:
-            figures += _guarded("noises_of", lambda: [as_figures(noise.noises_of(rows))])
+            figures += _guarded("noises_of", lambda: [as_figures(noise.noises_of(rows, experiments))])
     if profile.costs:
         steps.tell("costs")
         figures += _guarded("costs", lambda: [cost.run_times(variant)])
         figures.append(cost.memory(peak.peak_mib, workers))
     steps.end()
+    library = backend.library_in_use()
     run = {
         "id": run_id,
         "profile": profile.name,
@@ -109,7 +110,8 @@ def measure_night(
         "command": command,
         **origin,
         "variant": backend.requested_variant(variant),
-        "llvm": backend.library_in_use(),
+        # Its name: where it lies says nothing of the numbers, and nights of two machines are compared.
+        "llvm": None if library is None else Path(library).name,
     }
     return Night(run, rows, pl.concat([table.select(*FIGURES) for table in figures]))
 

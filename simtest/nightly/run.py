@@ -159,8 +159,8 @@ def judge(night: Night, baseline: Night | None) -> Verdict:
         return verdict
     profile = night.run["profile"]
     note = (
-        f"No baseline for the profile {profile}: look at the figures, then run "
-        f'simtest nightly accept --profile {profile} --reason "...".'
+        f"No baseline for the profile {profile}: look at the figures, then run simtest nightly accept "
+        '--reason "..." with the --profile and --reports of this night.'
     )
     return dataclasses.replace(verdict, notes=(*verdict.notes, note))
 
