@@ -210,7 +210,8 @@ def test_a_night_is_measured_kept_and_published(small, reports):
 
     accept(reports, "small", "first")
     second = run_nightly(profile.model_copy(update={"costs": False}), reports)
-    assert second.exit_code == 0
+    # Costs that are no longer measured are missed, and nothing else.
+    assert set(second.verdict.regressions["experiment"]) == {"costs"}
     assert second.night.rows.equals(first.night.rows)
     settings = [night.figures.filter(pl.col("kind") == "setting") for night in (first.night, second.night)]
     assert settings[0].equals(settings[1])
