@@ -3,22 +3,14 @@
 import importlib
 import sys
 
-from rich.console import Console
-from rich.table import Table
-
-from benchmarks.measuring import Figure
+from benchmarks.measuring import Figure, print_figures
 
 NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (
     "history",
-    "detection",
-    "dataset_png",
     "dataset_memory",
-    "dataset_kills",
-    "coverage",
-    "gate",
     "nightly_page",
 )
 """The same, run where they are named: they measure no speed, and take minutes."""
@@ -33,13 +25,7 @@ def main(names: list[str]) -> int:
     figures: list[Figure] = []
     for name in names or NAMES:
         figures += importlib.import_module(f"benchmarks.{name}").figures()
-    table = Table("figure", "measured", "limit", "", "times")
-    for figure in figures:
-        limit = "" if figure.limit is None else f"{'>=' if figure.at_least else '<='} {figure.limit:g} {figure.unit}"
-        verdict = "" if figure.limit is None else "met" if figure.met else "MISSED"
-        table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}", limit, verdict, figure.about)
-    Console(width=150).print(table)
-    return 0 if all(figure.met for figure in figures) else 1
+    return print_figures(figures)
 
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ import numpy.typing as npt
 
 from benchmarks.measuring import Figure
 from simtest.calibration import Calibration, srgb_encode
-from simtest.colour import detect_in_picture, reconstruct_colour
 from simtest.geometry import Camera
-from simtest.imaging.single import default_estimators
-from simtest.measuring import in_turns
+from simtest.reconstruction.colour_pipeline import detect_in_picture, reconstruct_colour
+from simtest.reconstruction.single import default_estimators
+from simtest.runtime.measuring import in_turns
 
 WIDTH, HEIGHT, HIGHLIGHTS = 1280, 720, 30
 ROUNDS = 9

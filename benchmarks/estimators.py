@@ -3,8 +3,8 @@
 import cv2
 
 from benchmarks.measuring import Figure
-from simtest.measuring import in_turns
 from simtest.nightly.cost import SIDE, estimator_pieces, reference_kernel
+from simtest.runtime.measuring import in_turns
 
 ROUNDS = 25
 LIMITS_MS = {"cone_axis": 1.5, "curved": 2.5, "photometric": 25.0}

@@ -14,8 +14,8 @@ import numpy as np
 import polars as pl
 
 from benchmarks.measuring import Figure
-from simtest.gate.records import PLACE, Night, Verdict
 from simtest.nightly.baseline import accept
+from simtest.nightly.gate.records import PLACE, Night, Verdict
 from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
 from simtest.nightly.layout import Reports
 from simtest.nightly.run import judge, publish, run_nightly

@@ -1,6 +1,10 @@
 """What the benchmarks share: a measured figure with its limit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from rich.console import Console
+from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -36,3 +40,14 @@ class Figure:
         if self.limit is None:
             return True
         return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+def print_figures(figures: Sequence[Figure]) -> int:
+    """Print figures beside their limits; return 1 where one misses its limit, else 0."""
+    table = Table("figure", "measured", "limit", "", "times")
+    for figure in figures:
+        limit = "" if figure.limit is None else f"{'>=' if figure.at_least else '<='} {figure.limit:g} {figure.unit}"
+        verdict = "" if figure.limit is None else "met" if figure.met else "MISSED"
+        table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}", limit, verdict, figure.about)
+    Console(width=150).print(table)
+    return 0 if all(figure.met for figure in figures) else 1

@@ -11,9 +11,9 @@ import polars as pl
 
 from benchmarks.measuring import Figure
 from benchmarks.nights import history_of, night_of, verdict_of
-from simtest.gate.records import Night, Verdict
+from simtest.nightly.gate.records import Night, Verdict
 from simtest.nightly.ladder import ladder_figures
-from simtest.report.nightly import Extras, write_nightly_page
+from simtest.nightly.page import Extras, write_nightly_page
 from simtest.spec import load_experiment
 from simtest.validation.runner import run_experiment
 from simtest.validation.worst import save_worst, worst_cases

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest import provenance
-from simtest.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.nightly.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.runtime import provenance
 from simtest.validation.statistics import figures
 
 FIRST = datetime(2024, 2, 1, 2, 30, tzinfo=UTC)

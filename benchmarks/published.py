@@ -14,16 +14,16 @@ import numpy as np
 
 from benchmarks.measuring import Figure
 from simtest.geometry import Camera, backproject_conic, circle_poses, fit_ellipses
-from simtest.measuring import PeakMemory, in_turns
-from simtest.resources import find
-from simtest.seeds import from_integer
+from simtest.runtime.measuring import PeakMemory, in_turns
+from simtest.runtime.resources import find
+from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment
 from simtest.spec.paper import PaperSetting
 from simtest.validation.cases import Case, expand
+from simtest.validation.execution import PAPER_CHUNK
 from simtest.validation.paper.pipeline import kernel_radius
 from simtest.validation.paper.protocol import draw_light, picture
 from simtest.validation.paper.rows import paper_rows, pipeline_with
-from simtest.validation.work import PAPER_CHUNK
 
 WORKERS = 2
 CONICS, POINTS = 1000, 100

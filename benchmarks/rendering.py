@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import Figure
-from simtest.measuring import in_turns
 from simtest.rendering import Session
+from simtest.runtime.measuring import in_turns
 from simtest.spec import Scene, scene_from_dict
 
 ROUNDS = 7

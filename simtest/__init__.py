@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
     from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask
-    from simtest.reconstruction import Specularity, reconstruct
+    from simtest.reconstruction.pipeline import Specularity, reconstruct
     from simtest.spec import (
         Experiment,
         Scene,
@@ -29,7 +29,7 @@ _HOMES = {
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
     "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "ViewMask"),
-    "simtest.reconstruction": ("Specularity", "reconstruct"),
+    "simtest.reconstruction.pipeline": ("Specularity", "reconstruct"),
     "simtest.spec": (
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
     ),
@@ -67,7 +67,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from simtest.provenance import version
+        from simtest.runtime.provenance import version
 
         return version()
     if name not in _HOME:

@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration.known import Known
-from simtest.calibration.noise import NoiseModel
+from simtest.calibration.noise_model import NoiseModel
+from simtest.calibration.priors import Known
 from simtest.calibration.response import Response
 from simtest.errors import InputError
+from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number
-from simtest.geometry.profile import AngularProfile
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -38,7 +38,7 @@ def make(
     """
     from simtest.cli.progress import progress_bar
     from simtest.dataset.writer import SHARDS_PER_PROCESS, write_dataset
-    from simtest.engines import make_engine
+    from simtest.runtime.engines import make_engine
     from simtest.spec import load_dataset, parse_settings
 
     values = parse_settings(settings or []) | {
@@ -69,7 +69,7 @@ def verify(
     from simtest.dataset.verify import mend
     from simtest.dataset.verify import verify as check
     from simtest.dataset.writer import SHARDS_PER_PROCESS
-    from simtest.engines import make_engine
+    from simtest.runtime.engines import make_engine
 
     with progress_bar("done") as progress:
         faults = check(folder, progress)
@@ -100,7 +100,7 @@ def sample(
     index : int
         Of the sample, from 0.
     """
-    from simtest.dataset.again import compare, sample_again
+    from simtest.dataset.reproduce import compare, sample_again
 
     target = out or Path(f"sample-{index}")
     files = sample_again(folder, index, target, variant)

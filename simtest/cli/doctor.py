@@ -18,7 +18,7 @@ def doctor(*, as_json: Annotated[bool, Parameter(name="--json", negative="")] = 
     variant : str, optional
         Mitsuba variant to check.
     """
-    from simtest.rendering.doctor import examine
+    from simtest.rendering.backend_check import examine
 
     report = examine(variant)
     if as_json:

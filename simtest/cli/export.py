@@ -12,7 +12,7 @@ def export(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
         A scene file, or the name of a shipped scene.
     """
     from simtest import api
-    from simtest.files import refuse_file
+    from simtest.runtime.files import refuse_file
     from simtest.spec import parse_settings
 
     refuse_file(out)

@@ -41,7 +41,7 @@ BAD_USE = 2
 
 
 def _version() -> str:
-    from simtest.provenance import version
+    from simtest.runtime.provenance import version
 
     return version()
 

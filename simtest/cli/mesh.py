@@ -50,9 +50,9 @@ def check(
     as_json : bool
         Print JSON.
     """
-    from simtest.anatomy.fineness import concentration
-    from simtest.anatomy.mesh_check import check_mesh
     from simtest.errors import InputError
+    from simtest.surfaces.fineness import concentration
+    from simtest.surfaces.mesh_check import check_mesh
 
     if not 0.1 <= distance <= 1e4:
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")
@@ -101,10 +101,10 @@ def _make(
     settings: list[str] | None,
     curvature: bool,
 ) -> None:
-    from simtest.anatomy.generate import load_anatomy, make_mesh
-    from simtest.anatomy.mesh_writing import check_target, write_mesh
     from simtest.errors import InputError
     from simtest.spec import parse_settings
+    from simtest.surfaces.generate import load_anatomy, make_mesh
+    from simtest.surfaces.mesh_writing import check_target, write_mesh
 
     check_target(out)
     if curvature and out.suffix.lower() != ".ply":

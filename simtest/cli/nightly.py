@@ -51,10 +51,10 @@ def _run(
     import sys
 
     from simtest.cli.progress import progress_bar
-    from simtest.engines import make_engine
     from simtest.nightly.layout import Reports
     from simtest.nightly.run import run_nightly
     from simtest.rendering.backend import requested_variant
+    from simtest.runtime.engines import make_engine
     from simtest.spec import load_profile
 
     described = load_profile(profile)
@@ -92,7 +92,7 @@ def _print(outcome: "Outcome") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from simtest.gate.records import OUTCOMES
+    from simtest.nightly.gate.records import OUTCOMES
     from simtest.nightly.overview import (
         by_experiment,
         failed_canaries,

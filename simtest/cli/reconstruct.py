@@ -61,9 +61,10 @@ def reconstruct(
     image : Path
         PNG, JPEG, BMP or TIFF; a folder of these; or a video that OpenCV reads.
     """
+    from simtest.api import Extras, reconstruct_picture
     from simtest.errors import InputError
-    from simtest.imaging.sources import is_sequence
-    from simtest.picture import Extras, parse_roi, reconstruct_picture
+    from simtest.reconstruction.image_sources import is_sequence
+    from simtest.reconstruction.picture import parse_roi
 
     if not is_sequence(image):
         extras = Extras(reference, camera_from_model, depth, depth_scale)
@@ -78,8 +79,8 @@ def reconstruct(
     if reference or camera_from_model or depth:
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     from simtest.cli.progress import progress_bar
-    from simtest.imaging.single import Options
-    from simtest.sequence import reconstruct_sequence
+    from simtest.reconstruction.sequence import reconstruct_sequence
+    from simtest.reconstruction.single import Options
 
     box = None if roi is None else parse_roi(roi)
     options = Options(None if estimators is None else tuple(estimators), box, encoding, every, detector, smoothing)

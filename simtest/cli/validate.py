@@ -37,8 +37,8 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
-    from simtest.engines import make_engine
     from simtest.rendering.backend import requested_variant
+    from simtest.runtime.engines import make_engine
     from simtest.spec import load_experiment, parse_settings
 
     values = parse_settings(settings or [])

@@ -25,8 +25,8 @@ def view(
     scene : str
         A scene file, or the name of a shipped scene.
     """
+    from simtest.report.viewer import check_target, make_content, save_screenshot, show
     from simtest.spec import load_scene, parse_settings
-    from simtest.viewer import check_target, make_content, save_screenshot, show
 
     described = load_scene(scene, parse_settings(settings or []))
     check_target(screenshot)

@@ -6,7 +6,7 @@ from cyclopts import Parameter
 
 from simtest.cli.options import Out, Settings, Variant, whole_number
 from simtest.errors import InputError
-from simtest.resources import shown
+from simtest.runtime.resources import shown
 
 
 def views(
@@ -32,7 +32,7 @@ def views(
     """
     from simtest import api
     from simtest.cli.progress import progress_bar
-    from simtest.files import refuse_file
+    from simtest.runtime.files import refuse_file
     from simtest.spec import parse_settings
 
     refuse_file(out)

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from simtest.dataset.fields import FIELDS
-    from simtest.dataset.frame import LabelledFrame, make_frame, write_frame
     from simtest.dataset.reader import read
-    from simtest.dataset.views import ViewWriter
+    from simtest.simulation.labelled_frame import LabelledFrame, make_frame, write_frame
+    from simtest.simulation.view_files import ViewWriter
 
 _HOMES = {
     "FIELDS": "fields", "LabelledFrame": "frame", "ViewWriter": "views", "make_frame": "frame", "read": "reader",

@@ -10,7 +10,7 @@ from simtest.dataset.fields import FIELDS
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
-from simtest.files import write_atomically
+from simtest.runtime.files import write_atomically
 from simtest.spec.dataset import Distribution
 
 CARD = "README.md"

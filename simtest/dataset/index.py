@@ -9,7 +9,7 @@ import polars as pl
 
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import samples
-from simtest.files import write_atomically
+from simtest.runtime.files import write_atomically
 from simtest.validation.metrics import SCHEMA
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from simtest import provenance
 from simtest.dataset.plan import Plan, spec_files
 from simtest.errors import InputError
-from simtest.files import write_json
-from simtest.resources import shown
+from simtest.runtime import provenance
+from simtest.runtime.files import write_json
+from simtest.runtime.resources import shown
 from simtest.spec.dataset import Dataset
 
 NAME = "manifest.json"

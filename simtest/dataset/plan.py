@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from simtest.anatomy.recipe import load_recipe
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.resources import find
-from simtest.seeds import Stage, generator, integer
+from simtest.runtime.resources import find
+from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.dataset import Dataset, Distribution, Family
+from simtest.surfaces.recipe import load_recipe
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """What tells one anatomy from the next."""

@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from simtest.dataset.index import HIGHLIGHTS, SAMPLES
 from simtest.dataset.reader import Record, open_manifest, read, shard_names
 from simtest.errors import InputError
-from simtest.files import write_atomically
+from simtest.runtime.files import write_atomically
 
 Array = npt.NDArray[Any]
 

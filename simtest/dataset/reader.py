@@ -8,7 +8,7 @@ from simtest.dataset.fields import BY_NAME, BY_SUFFIX
 from simtest.dataset.manifest import Manifest, ManifestError, read_manifest
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
-from simtest.resources import shown
+from simtest.runtime.resources import shown
 
 Record = dict[str, Any]
 

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from simtest.anatomy import forget_meshes
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import FIELDS, depth_scale_mm
-from simtest.dataset.frame import describe_highlight
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
-from simtest.reconstruction import Specularity, reconstruct
+from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
-from simtest.sensor import to_uint8
+from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.labelled_frame import describe_highlight
+from simtest.simulation.rendered_view import View, view
+from simtest.simulation.true_highlights import JudgedHighlight, region_of
 from simtest.spec import describe_camera
+from simtest.surfaces import forget_meshes
 from simtest.validation.matching import match
 from simtest.validation.metrics import RowContext, rows
-from simtest.validation.realise import View, view
-from simtest.validation.truth import JudgedHighlight, region_of
 
 Array = npt.NDArray[Any]
 

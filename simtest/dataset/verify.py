@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest import provenance
 from simtest.dataset.card import CARD, make_card
 from simtest.dataset.fields import BY_SUFFIX, FIELDS
 from simtest.dataset.index import TABLES, make_tables
@@ -27,10 +26,11 @@ from simtest.dataset.reader import decode
 from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.dataset.writer import PART, repair
-from simtest.engines import Engine
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.spec.camera import CameraSpec
+from simtest.runtime import provenance
+from simtest.runtime.engines import Engine
+from simtest.spec.camera_spec import CameraSpec
 from simtest.validation.runner import Progress
 
 Array = np.ndarray[Any, Any]

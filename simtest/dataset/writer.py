@@ -24,10 +24,10 @@ from simtest.dataset.manifest import (
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import DEFAULT_VARIANT, Maker, Sample
 from simtest.dataset.shard import finish, locked, whole_samples, write_sample
-from simtest.engines import Engine, Tell
 from simtest.errors import InputError
-from simtest.files import make_folder
-from simtest.resources import shown
+from simtest.runtime.engines import Engine, Tell
+from simtest.runtime.files import make_folder
+from simtest.runtime.resources import shown
 from simtest.spec.dataset import Dataset
 from simtest.validation.runner import Progress
 

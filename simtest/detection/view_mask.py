@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import ViewMask
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -8,10 +8,10 @@ import numpy.typing as npt
 from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.base import Estimate
 from simtest.estimators.flags import spot_flags
-from simtest.estimators.lights import light_of_highlight
-from simtest.estimators.spot import Spot, fit_spot
+from simtest.estimators.isophote_family import Spot, fit_spot
+from simtest.estimators.light_assignment import light_of_highlight
+from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import tangent_basis
 

@@ -3,10 +3,10 @@
 from simtest.calibration import Known
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
-from simtest.estimators.aside import with_known_lights
-from simtest.estimators.base import Estimate
 from simtest.estimators.flags import spot_flags
-from simtest.estimators.spot import fit_spot
+from simtest.estimators.isophote_family import fit_spot
+from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 
 NOTHING_KNOWN = Known()
@@ -22,7 +22,7 @@ def brightest_point(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) 
     camera : Camera
         Calibration.
     known : Known
-        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
 
     Returns
     -------

@@ -8,8 +8,8 @@ import numpy.typing as npt
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
-from simtest.estimators.base import Estimate, FittedIsophote, answers_each, fit_isophote_of_each
-from simtest.estimators.pose_region import pose_region
+from simtest.estimators.pose_uncertainty import pose_region
+from simtest.estimators.protocol import Estimate, FittedIsophote, answers_each, fit_isophote_of_each
 from simtest.geometry import Camera, CirclePoses, Patch
 from simtest.geometry import circle_poses as poses_of_cones
 

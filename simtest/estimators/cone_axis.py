@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.aside import with_known_lights
-from simtest.estimators.base import Estimate
 from simtest.estimators.flags import spot_flags
-from simtest.estimators.spot import fit_spot
+from simtest.estimators.isophote_family import fit_spot
+from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 
 NOTHING_KNOWN = Known()
@@ -29,7 +29,7 @@ def cone_axis(
     camera : Camera
         Calibration.
     known : Known
-        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
     isovalues : sequence of float
         Each t in (0, 1).
 

@@ -9,10 +9,10 @@ import numpy.typing as npt
 from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.aside import with_known_lights
-from simtest.estimators.base import Estimate, EstimatedCurvature
 from simtest.estimators.flags import STREAK_RATIO, spot_flags
-from simtest.estimators.spot import Spot, fit_spot
+from simtest.estimators.isophote_family import Spot, fit_spot
+from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Camera, Patch
 
 Array = npt.NDArray[np.float64]

@@ -1,7 +1,7 @@
 """Warnings that hang on the isophotes of a highlight."""
 
 from simtest.errors import Reason
-from simtest.estimators.spot import Spot
+from simtest.estimators.isophote_family import Spot
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""

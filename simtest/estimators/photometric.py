@@ -8,14 +8,14 @@ import numpy.typing as npt
 from simtest.calibration import Known
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.aside import with_known_lights
-from simtest.estimators.base import Estimate, FittedIsophote
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.flags import spot_flags
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
+from simtest.estimators.isophote_family import Spot, fit_spot
+from simtest.estimators.light_offset import with_known_lights
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
-from simtest.estimators.spot import Spot, fit_spot
+from simtest.estimators.protocol import Estimate, FittedIsophote
 from simtest.geometry import Camera, Patch, cone_rays
 from simtest.geometry.vectors import tangent_basis
 
@@ -41,7 +41,7 @@ COARSE = 4
 
 MISFIT_SHARE = 0.9
 """Variance of a misfitting lobe's normal over the squared shift that its misfit shows, or the squared drift of the
-isophotes' axis: what 614 highlights of the generated colon showed (`simtest.estimators.spot`)."""
+isophotes' axis: what 614 highlights of the generated colon showed (`simtest.estimators.isophote_family`)."""
 
 SAME_RAD = 1e-3
 """Two fits closer than this are one."""
@@ -84,7 +84,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     camera : Camera
         Calibration.
     known : Known
-        Its lights are used, to say where they are beside the camera (`simtest.estimators.aside`).
+        Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
 
     Returns
     -------

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 
 from simtest.errors import InputError
-from simtest.estimators.base import Estimator
+from simtest.estimators.protocol import Estimator
 
 GROUP = "simtest.estimators"
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from simtest.calibration import Known
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.base import Estimate
+from simtest.estimators.protocol import Estimate
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 
 Array = npt.NDArray[np.float64]

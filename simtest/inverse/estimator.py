@@ -7,16 +7,16 @@ import numpy.typing as npt
 
 from simtest.calibration import Known
 from simtest.errors import Failure, Reason
-from simtest.estimators.base import Estimate, EstimatedCurvature
 from simtest.estimators.bisector import bisect
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
+from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import tangent_basis
 from simtest.inverse.patch import RenderedQuadric
-from simtest.inverse.render import PatchRenderer
+from simtest.inverse.patch_renderer import PatchRenderer
 
 Array = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.estimators.bisector import bisect
-from simtest.inverse.render import PatchRenderer
+from simtest.inverse.patch_renderer import PatchRenderer
 
 Array = npt.NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from xml.sax.saxutils import escape
 
-from simtest.gate.records import Night, Verdict
+from simtest.nightly.gate.records import Night, Verdict
 from simtest.nightly.overview import headline
 
 # White on these has a contrast of 4.5 or more (WCAG AA).

@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.gate.quantities import RESULT_COLUMNS
-from simtest.gate.records import PLACE, Night
+from simtest.nightly.gate.quantities import RESULT_COLUMNS
+from simtest.nightly.gate.records import PLACE, Night
 from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
 from simtest.nightly.storage import (
     BASELINE_ROWS,
@@ -18,14 +18,14 @@ from simtest.nightly.storage import (
     save_night,
     told_in_one_line,
 )
-from simtest.resources import shown
+from simtest.runtime.resources import shown
 from simtest.validation.metrics import SCHEMA
 
 LOG = "log.jsonl"
 MAX_REASON = 1000
 
 COLUMNS = (*PLACE, "realisation", *RESULT_COLUMNS)
-"""Columns of the rows that a baseline keeps: what names a row, and what `simtest.gate.compare` reads."""
+"""Columns of the rows that a baseline keeps: what names a row, and what `simtest.nightly.gate.compare` reads."""
 
 
 def load_baseline(reports: Reports, profile: str) -> Night | None:
@@ -34,8 +34,8 @@ def load_baseline(reports: Reports, profile: str) -> Night | None:
     Raises
     ------
     InputError
-        If a file of it is missing or damaged, lacks what `simtest.gate.compare` reads, or is another profile's; the
-        message names it.
+        If a file of it is missing or damaged, lacks what `simtest.nightly.gate.compare` reads, or is another profile's;
+        the message names it.
     """
     folder = reports.baseline(profile)
     with turn(folder):

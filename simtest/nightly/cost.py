@@ -14,12 +14,12 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
-from simtest.gate.records import FIGURES
 from simtest.geometry import Camera, Patch, smooth
-from simtest.measuring import times_in_turns
 from simtest.nightly.canaries.record import Canary, as_figures
-from simtest.reconstruction import reconstruct
+from simtest.nightly.gate.records import FIGURES
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.runtime.measuring import times_in_turns
 from simtest.spec import load_scene
 
 SIDE, WIDTH_PX, SIGMA, SMOOTHING_PX = 100, 28.0, 0.05, 2.0

@@ -12,9 +12,9 @@ from typing import Any
 
 import polars as pl
 
-from simtest.files import sync_folder, write_atomically
-from simtest.gate.records import FIGURES, PLACE, Night, Verdict
-from simtest.resources import shown
+from simtest.nightly.gate.records import FIGURES, PLACE, Night, Verdict
+from simtest.runtime.files import sync_folder, write_atomically
+from simtest.runtime.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
     **FIGURES, "run_id": pl.String(), "started": pl.Datetime("us", "UTC"), "commit": pl.String(),

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import polars as pl
 
-from simtest.gate.records import PLACE, Night, Verdict
+from simtest.nightly.gate.records import PLACE, Night, Verdict
 from simtest.nightly.overview import number, place_name, without_canaries
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

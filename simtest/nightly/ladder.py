@@ -2,13 +2,13 @@
 
 import polars as pl
 
-from simtest.gate.records import FIGURES
 from simtest.nightly.canaries.record import Canary, as_figures
-from simtest.validation.ladder import RUNGS, error_ladder
+from simtest.nightly.gate.records import FIGURES
+from simtest.validation.error_ladder import RUNGS, error_ladder
 
 
 def ladder_figures(seed: int = 0) -> pl.DataFrame:
-    """Compute the error ladder (`simtest.validation.ladder`): seconds.
+    """Compute the error ladder (`simtest.validation.error_ladder`): seconds.
 
     Parameters
     ----------

@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.files import sync_folder
-from simtest.resources import shown
+from simtest.runtime.files import sync_folder
+from simtest.runtime.resources import shown
 
 LOCK = "lock"
 _ENTRY, _OLD = ".lock", ".old"

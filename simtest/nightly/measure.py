@@ -8,18 +8,19 @@ from pathlib import Path
 
 import polars as pl
 
-from simtest import provenance
-from simtest.engines import make_engine
-from simtest.engines.base import Engine
 from simtest.estimators import load_estimators
-from simtest.gate.figures import setting_figures
-from simtest.gate.records import FIGURES, Night
-from simtest.measuring import PeakMemory
 from simtest.nightly import cost
-from simtest.nightly.canaries import Canary, noise, run_canaries
+from simtest.nightly.canaries import Canary, run_canaries
+from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries.record import as_figures
+from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.records import FIGURES, Night
 from simtest.nightly.ladder import ladder_canary, ladder_figures
 from simtest.rendering import backend
+from simtest.runtime import provenance
+from simtest.runtime.engines import make_engine
+from simtest.runtime.engines.engine import Engine
+from simtest.runtime.measuring import PeakMemory
 from simtest.spec import Profile, experiments_of
 from simtest.validation.cases import expand
 from simtest.validation.runner import Progress, definition, run_experiments

@@ -6,12 +6,12 @@ from typing import Any
 
 import polars as pl
 
-from simtest.files import write_atomically, write_json
-from simtest.gate.records import OUTCOMES, Night, Verdict
 from simtest.nightly.badge import badge
+from simtest.nightly.gate.records import OUTCOMES, Night, Verdict
 from simtest.nightly.junit import junit
 from simtest.nightly.overview import failed_canaries, headline
 from simtest.nightly.summary import summary
+from simtest.runtime.files import write_atomically, write_json
 
 SCHEMA_VERSION = 1
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import polars as pl
 
-from simtest.gate.records import OUTCOMES, PLACE, Night, Verdict
+from simtest.nightly.gate.records import OUTCOMES, PLACE, Night, Verdict
 
 MISSED = "missed"
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import polars as pl
 
-from simtest.engines.base import Engine
-from simtest.gate.compare import compare
-from simtest.gate.records import Night, Verdict
 from simtest.nightly.baseline import load_baseline
+from simtest.nightly.gate.compare import compare
+from simtest.nightly.gate.records import Night, Verdict
 from simtest.nightly.history import (
     TREND_COLUMNS,
     TRENDS,
@@ -24,8 +23,9 @@ from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_fol
 from simtest.nightly.measure import measure_night
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.overview import ordered, without_canaries
+from simtest.nightly.page import Extras, write_nightly_page
 from simtest.nightly.storage import TONIGHT_ROWS, save_night, told_in_one_line
-from simtest.report.nightly import Extras, write_nightly_page
+from simtest.runtime.engines.engine import Engine
 from simtest.spec import Profile, experiments_of
 from simtest.validation.runner import Progress
 from simtest.validation.worst import save_worst, worst_cases

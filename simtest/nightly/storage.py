@@ -10,10 +10,10 @@ from typing import Any
 import polars as pl
 
 from simtest.errors import InputError, SimtestError
-from simtest.files import sync_folder, write_atomically, write_json
-from simtest.gate.records import FIGURES, Night
-from simtest.provenance import file_hash
-from simtest.resources import shown
+from simtest.nightly.gate.records import FIGURES, Night
+from simtest.runtime.files import sync_folder, write_atomically, write_json
+from simtest.runtime.provenance import file_hash
+from simtest.runtime.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
 TONIGHT_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"

@@ -5,7 +5,7 @@ from typing import Any
 
 import polars as pl
 
-from simtest.gate.records import OUTCOMES, Night, Verdict
+from simtest.nightly.gate.records import OUTCOMES, Night, Verdict
 from simtest.nightly.history import short_commit
 from simtest.nightly.overview import (
     by_experiment,

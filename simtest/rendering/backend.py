@@ -21,7 +21,7 @@ from typing import Any
 import platformdirs
 
 from simtest.errors import BackendError
-from simtest.files import write_json
+from simtest.runtime.files import write_json
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"

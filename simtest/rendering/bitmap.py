@@ -7,7 +7,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.rendering.frames import FloatImage
-from simtest.resources import shown
+from simtest.runtime.resources import shown
 
 
 def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None:

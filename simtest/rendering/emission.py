@@ -12,7 +12,7 @@ import numpy as np
 
 from simtest.rendering import lobes
 from simtest.rendering.spectrum import spectrum
-from simtest.spec.profile import CosineProfile, TableProfile
+from simtest.spec.falloff import CosineProfile, TableProfile
 from simtest.spec.rig import LightSpec
 
 PLUGIN = "simtest_light"

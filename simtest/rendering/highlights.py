@@ -10,11 +10,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from simtest.anatomy.base import SurfacePoints
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
 from simtest.rendering.frames import Array, Radiance, TrueHighlight
 from simtest.spec.scene import Scene
+from simtest.surfaces.model import SurfacePoints
 
 MIN_GAIN = 0.05
 """Where abs(1 + d k) is smaller the point is no point but a streak; seeds there are not followed."""

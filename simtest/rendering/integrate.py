@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import FloatImage, Radiance
+from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.labels import ShapeLabels
 from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
-from simtest.rendering.refine import Refinement
 from simtest.rendering.spectrum import channels
 
 Progress = Callable[[int, int, str], None]

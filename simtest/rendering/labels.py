@@ -1,17 +1,17 @@
 """Labels of the rendered shape at each pixel's centre, from the same hits as the radiance.
 
 They are single precision and those of the triangles where the shape is a mesh, with normals and shape operators
-interpolated between its corners. The exact truth of the smooth surface is `simtest.rendering.exact`.
+interpolated between its corners. The exact truth of the smooth surface is `simtest.rendering.exact_points`.
 """
 
 from typing import Any
 
 import numpy as np
 
-from simtest.anatomy import RayHits
-from simtest.rendering.exact import pack_hits
+from simtest.rendering.exact_points import pack_hits
 from simtest.rendering.frames import Array, FloatImage, Labels
 from simtest.rendering.rays import Rays
+from simtest.surfaces import RayHits
 
 CHANNELS = (
     "depth", "x", "y", "z", "normal_x", "normal_y", "normal_z", "geometric_x", "geometric_y", "geometric_z",

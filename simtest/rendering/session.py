@@ -5,21 +5,22 @@ from typing import Any
 
 import numpy as np
 
-from simtest.anatomy import RayHits, SurfaceModel, SurfacePoints, make_surface
-from simtest.rendering import backend, emission, exact, highlights, phong
+from simtest.rendering import backend, emission, highlights, phong
+from simtest.rendering import exact_points as exact
 from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
+from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
-from simtest.rendering.places import check_camera, check_lights
+from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
-from simtest.rendering.refine import Refinement
 from simtest.rendering.shapes import make_shape
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
+from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
 
 FINE_STRIDE_PX = 2
 """Seeds' grid for anatomies, whose highlights are small and many."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from simtest.anatomy import Shape, TriangleMesh
+from simtest.surfaces import Shape, TriangleMesh
 
 
 def make_shape(mi: Any, shape: Shape, bsdf: dict[str, Any]) -> Any:

@@ -5,9 +5,9 @@ from typing import Any
 
 import polars as pl
 
-from simtest.report.run import Run
+from simtest.pages.style import estimator_order
+from simtest.report.run_folder import Run
 from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
-from simtest.report.style import estimator_order
 
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"

@@ -9,8 +9,8 @@ import polars as pl
 from scipy.special import stdtrit
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
-from simtest.report.run import Run
-from simtest.report.style import Array, Axis, estimator_order
+from simtest.pages.style import Array, Axis, estimator_order
+from simtest.report.run_folder import Run
 from simtest.validation import laws
 
 _BINS = 12

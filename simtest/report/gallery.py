@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from simtest.report.run import GalleryItem
-from simtest.report.style import NEUTRAL, TRUTH, Array
+from simtest.pages.style import NEUTRAL, TRUTH, Array
+from simtest.report.run_folder import GalleryItem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from simtest.report import style
+from simtest.pages import style
+from simtest.pages.html import script_text
+from simtest.pages.style import LIGHT, NEUTRAL, Array
 from simtest.report.curves import Curve
-from simtest.report.html import script_text
 from simtest.report.series import LineFigure
 from simtest.report.static import has_law, heat_range, log_range, segment_colour, visible
-from simtest.report.style import LIGHT, NEUTRAL, Array
 from simtest.report.surface3d import Segments, Surface3D
 from simtest.report.tables import HeatMap, SurfaceFigure
 

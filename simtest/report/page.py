@@ -4,18 +4,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from simtest.files import write_atomically
-from simtest.report import fineness, static, style, words
+from simtest.pages import style
+from simtest.pages.html import environment, packed_plotly, picture
+from simtest.report import labels as words
+from simtest.report import static
+from simtest.report import triangle_cost as fineness
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.gallery import isophote_colour, isovalues
-from simtest.report.html import environment, packed_plotly, picture
 from simtest.report.laws.section import laws_section
 from simtest.report.pairs import pairs
 from simtest.report.paper.section import paper_section
-from simtest.report.run import Run, read_run
+from simtest.report.run_folder import Run, read_run
 from simtest.report.series import LineFigure, line_figures
 from simtest.report.surface3d import surface_3d
 from simtest.report.tables import SUMMARY_COLUMNS, heat_maps, summary_rows, surface_figure
+from simtest.runtime.files import write_atomically
 
 _IMAGE_BUDGET = 1_350_000
 _FIRST = 9

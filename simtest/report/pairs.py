@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from simtest.report.run import Run
-from simtest.report.style import estimator_order, number
+from simtest.pages.style import estimator_order, number
+from simtest.report.run_folder import Run
 from simtest.validation.statistics import student_interval
 
 ALL = "all settings"

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from simtest.pages.style import Axis, curvature_axis, estimator_order
 from simtest.report.curves import Ask, Curve, gather, prepared, varies
-from simtest.report.run import Run
-from simtest.report.style import Axis, curvature_axis, estimator_order
+from simtest.report.run_folder import Run
 from simtest.spec.describe import describe_key, name_key
 
 TOLERANCE_DEG = 0.3

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from simtest.report import style
+from simtest.pages import style
+from simtest.pages.style import LIGHT, NEUTRAL, Array, Axis
 from simtest.report.curves import Curve, finite
 from simtest.report.gallery import draw_item
-from simtest.report.run import GalleryItem
+from simtest.report.run_folder import GalleryItem
 from simtest.report.series import LineFigure
-from simtest.report.style import LIGHT, NEUTRAL, Array, Axis
 from simtest.report.surface3d import Surface3D
 from simtest.report.tables import HeatMap, SurfaceFigure
 

@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
+from simtest.pages.style import Array
 from simtest.report.gallery import anchor, estimated_normals, grey
-from simtest.report.run import GalleryItem, Run
-from simtest.report.style import Array
+from simtest.report.run_folder import GalleryItem, Run
 
 _GRID = 72
 _NORMALS = 9

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.pages.style import Array, estimator_order, number
 from simtest.report.coverage import is_anatomical
 from simtest.report.curves import prepared, scattered, varies
-from simtest.report.run import Run
-from simtest.report.style import Array, estimator_order, number
+from simtest.report.run_folder import Run
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still have a place on a logarithmic axis
 

@@ -1,11 +1,10 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema."""
 
-from simtest.spec.calibration import CalibrationSpec, load_calibration
-from simtest.spec.camera import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
+from simtest.spec.calibration_file import CalibrationSpec, load_calibration
+from simtest.spec.camera_spec import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
 from simtest.spec.dataset import Dataset, load_dataset
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
-from simtest.spec.nightly import Profile, ProfileEntry, experiments_of, load_profile
-from simtest.spec.reading import apply_settings, parse_settings, read_toml
+from simtest.spec.profile import Profile, ProfileEntry, experiments_of, load_profile
 from simtest.spec.rig import Emission, LightSpec, Rig
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
 from simtest.spec.surface import (
@@ -16,6 +15,7 @@ from simtest.spec.surface import (
     SphereSurface,
     Surface,
 )
+from simtest.spec.toml_input import apply_settings, parse_settings, read_toml
 
 __all__ = [
     "AnatomySurface",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from simtest.resources import find
-from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
+from simtest.runtime.resources import find
+from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
 
 MAX_SAMPLES = 100_000_000
 

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.resources import find
-from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
+from simtest.runtime.resources import find
+from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
 
 LawName = Literal[
     "circle_pose", "branch_point", "axis_ratio", "axis_ratio_seen", "offset", "bisector", "falloff", "look"

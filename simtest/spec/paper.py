@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.geometry.camera import Camera
-from simtest.spec.reading import Spec, validate
+from simtest.spec.toml_input import Spec, validate
 
 
 class PaperSetting(Spec):

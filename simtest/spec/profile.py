@@ -1,49 +1,120 @@
-"""A factor over the angle from an axis, as scene and calibration files give it."""
+"""The nightly's profile: a fixed list of experiments, and how much of each is run."""
 
-from typing import Annotated, Literal
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from simtest.geometry.profile import AngularProfile
-from simtest.spec.reading import Spec
+from simtest.errors import InputError
+from simtest.runtime.resources import find, shown
+from simtest.spec.experiment import Experiment, Group, load_experiment
+from simtest.spec.toml_input import Spec, place, read_toml, validate
 
 
-class CosineProfile(Spec):
-    """cos^power of the angle from the axis; 0 at 90 deg and beyond."""
+class ProfileEntry(Spec):
+    """One experiment of a night."""
 
-    type: Literal["cosine"] = "cosine"
-    power: float = Field(0.0, ge=0, le=1000, description="k of cos^k; 0 is uniform in all directions")
-
-    def model(self) -> AngularProfile:
-        """Give the profile as the geometry package uses it."""
-        return AngularProfile(self.power)
-
-
-class TableProfile(Spec):
-    """A table, linear between its angles; its last value holds beyond the last angle."""
-
-    type: Literal["table"] = "table"
-    angle_deg: tuple[Annotated[float, Field(ge=0, le=180)], ...] = Field(
-        min_length=2, max_length=4096, description="angles from the axis, deg, rising from 0"
+    experiment: str = Field(min_length=1, description="a shipped name, or a path; relative ones start at the profile")
+    name: str | None = Field(
+        None, min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$",
+        description="name in the results, where one experiment is run twice; seeds hang on it",
+    )  # fmt: skip
+    realisations: int | None = Field(None, ge=1, le=10**6, description="of each setting, in place of the experiment's")
+    pool: int | None = Field(
+        None, ge=1, description="how many pooled values (an anatomy's viewpoints) of each setting are kept, at most"
     )
-    value: tuple[Annotated[float, Field(ge=0, le=1e6)], ...] = Field(
-        min_length=2, max_length=4096, description="factor at each angle; positive on the axis"
+    seed: int | None = Field(None, ge=0, lt=2**63, description="in place of the experiment's")
+    estimators: tuple[str, ...] | None = Field(None, min_length=1, description="in place of the experiment's")
+    labels: tuple[str, ...] | None = Field(None, min_length=1, description="groups that are run, by label; default all")
+    set: dict[str, Any] = Field(default_factory=dict, description="values that replace the scenes', by key path")
+
+
+class Profile(Spec):
+    """What a night runs."""
+
+    name: str = Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")
+    title: str = ""
+    description: str = ""
+    experiments: tuple[ProfileEntry, ...] = Field(min_length=1, max_length=100)
+    canaries: bool = Field(
+        True, description="run the canaries, which see faults that error figures do not show, and the error ladder"
     )
+    costs: bool = Field(True, description="measure run time and memory too")
 
     @model_validator(mode="after")
-    def _table(self) -> "TableProfile":
-        if len(self.value) != len(self.angle_deg):
-            raise ValueError(f"value has {len(self.value)} entries, angle_deg {len(self.angle_deg)}; must be as many")
-        if self.angle_deg[0] != 0 or not (np.diff(self.angle_deg) > 0).all():
-            raise ValueError(f"angle_deg = {list(self.angle_deg)}: must rise from 0")
-        if self.value[0] <= 0:
-            raise ValueError(f"value = {list(self.value)}: must be positive on the axis")
+    def _told_apart(self) -> "Profile":
+        names = [entry.name or Path(entry.experiment).stem for entry in self.experiments]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"experiment {twice}: listed twice; give one of them another name")
         return self
 
-    def model(self) -> AngularProfile:
-        """Give the profile as the geometry package uses it."""
-        return AngularProfile(angles=tuple(np.radians(self.angle_deg).tolist()), values=self.value)
+
+def load_profile(name: str | Path) -> Profile:
+    """Read a profile.
+
+    Parameters
+    ----------
+    name : str or Path
+        A path, or the name of a shipped profile.
+
+    Returns
+    -------
+    Profile
+        With the paths of its experiments made absolute.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed.
+    """
+    path = find(name, "scenes", "profiles")
+    data = read_toml(path)
+    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
+    profile = validate(Profile, data, place(path, {}))
+    entries = (
+        entry.model_copy(update={"experiment": _beside(path, entry.experiment)}) for entry in profile.experiments
+    )
+    return profile.model_copy(update={"experiments": tuple(entries)})
 
 
-Profile = Annotated[CosineProfile | TableProfile, Field(discriminator="type")]
+def _beside(profile: Path, experiment: str) -> str:
+    """Give the path of an experiment that lies beside its profile; any other name as it is."""
+    path = profile.resolve().parent / experiment
+    return str(path) if path.is_file() else experiment
+
+
+def experiments_of(profile: Profile) -> list[Experiment]:
+    """Read a profile's experiments, cut down as it says.
+
+    Raises
+    ------
+    InputError
+        If an experiment is missing or malformed, or has no group of a label that is asked for.
+    """
+    return [_experiment(profile, entry) for entry in profile.experiments]
+
+
+def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
+    own = {"realisations": entry.realisations, "seed": entry.seed, "estimators": entry.estimators}
+    values: Mapping[str, Any] = {key: value for key, value in own.items() if value is not None}
+    experiment = load_experiment(entry.experiment, {**values, **entry.set})
+    groups = experiment.groups
+    if entry.labels is not None:
+        labels = [group.label for group in groups]
+        if missing := next((label for label in entry.labels if label not in labels), None):
+            allowed = ", ".join(shown(label) for label in labels if label)
+            raise InputError(
+                f"profile {profile.name}: {experiment.name} has no group {shown(missing)!r}; allowed: {allowed}"
+            )
+        groups = tuple(group for group in groups if group.label in entry.labels)
+    if entry.pool is not None:
+        groups = tuple(_thinned(group, entry.pool) for group in groups)
+    return experiment.model_copy(update={"groups": groups, "name": entry.name or experiment.name})
+
+
+def _thinned(group: Group, count: int) -> Group:
+    """Keep the first pooled values of a group: seeds hang on their places."""
+    pool = tuple({key: values[:count] for key, values in table.items()} for table in group.pool)
+    return group.model_copy(update={"pool": pool})

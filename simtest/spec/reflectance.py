@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from simtest.spec.quantities import Share
-from simtest.spec.reading import Spec
+from simtest.spec.ranges import Share
+from simtest.spec.toml_input import Spec
 
 ROUNDING = 1e-9
 """What a sum of shares written in decimals may exceed 1 by."""

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from simtest.seeds import from_integer
-from simtest.spec.profile import CosineProfile, Profile, TableProfile
-from simtest.spec.quantities import Coordinate
-from simtest.spec.reading import Spec
+from simtest.runtime.seeds import from_integer
+from simtest.spec.falloff import CosineProfile, Profile, TableProfile
+from simtest.spec.ranges import Coordinate
+from simtest.spec.toml_input import Spec
 
 Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
 Gain = Annotated[float, Field(ge=0, le=1e6)]

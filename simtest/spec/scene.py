@@ -7,15 +7,15 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from simtest.calibration import Calibration, Known, NoiseModel, Response
-from simtest.geometry.profile import AngularProfile
-from simtest.resources import find
-from simtest.spec.camera import CameraSpec
-from simtest.spec.quantities import Millimetres
-from simtest.spec.reading import Spec, apply_settings, place, read_toml, validate
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.runtime.resources import find
+from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.ranges import Millimetres
 from simtest.spec.reflectance import PhongReflectance, Reflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.surface import Surface
+from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
 
 
 class Effort(Spec):

@@ -7,9 +7,9 @@ from pydantic import Field, model_validator
 from simtest.calibration import NoiseModel, Response
 from simtest.calibration.response import check_table
 from simtest.errors import InputError
-from simtest.spec.profile import CosineProfile, Profile
-from simtest.spec.quantities import Share
-from simtest.spec.reading import Spec
+from simtest.spec.falloff import CosineProfile, Profile
+from simtest.spec.ranges import Share
+from simtest.spec.toml_input import Spec
 
 FullWell = Annotated[float, Field(ge=1, le=1e9)]
 ReadNoise = Annotated[float, Field(ge=0, le=1e6)]

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from simtest.resources import find
-from simtest.spec.quantities import Curvature, Millimetres
-from simtest.spec.reading import Spec
+from simtest.runtime.resources import find
+from simtest.spec.ranges import Curvature, Millimetres
+from simtest.spec.toml_input import Spec
 
 EdgeLength = Annotated[float, Field(ge=0.01, le=100)]
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from simtest.anatomy.recipe import load_recipe
 from simtest.errors import InputError
-from simtest.resources import find, shown
-from simtest.seeds import Stage, generator, integer
+from simtest.runtime.resources import find, shown
+from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
-from simtest.spec.writing import toml_value
+from simtest.spec.toml_output import toml_value
+from simtest.surfaces.recipe import load_recipe
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.geometry.isophotes import encloses
-from simtest.reconstruction import Specularity
-from simtest.validation.truth import JudgedHighlight
+from simtest.reconstruction.pipeline import Specularity
+from simtest.simulation.true_highlights import JudgedHighlight
 
 
 def match(specularities: list[Specularity], truths: list[JudgedHighlight]) -> dict[int, int]:

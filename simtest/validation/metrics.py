@@ -10,13 +10,13 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
-from simtest.reconstruction import Specularity
+from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import Session, TrueHighlight
 from simtest.rendering.frames import Array
+from simtest.simulation.true_highlights import JudgedHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, law_deg, look_law_deg
-from simtest.validation.truth import JudgedHighlight
 
 SCHEMA: dict[str, pl.DataType] = {
     "experiment": pl.String(), "label": pl.String(), "surface": pl.String(), "reflectance": pl.String(),

@@ -7,12 +7,12 @@ from simtest.estimators import Estimate
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import TrueHighlight
 from simtest.rendering.frames import Array
-from simtest.spec.profile import CosineProfile
+from simtest.simulation.true_highlights import JudgedHighlight
+from simtest.spec.falloff import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.validation import laws
-from simtest.validation.truth import JudgedHighlight
 
 SAME_DEG = 1e-4
 """Directions that differ by less are the same but for rounding."""

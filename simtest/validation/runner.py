@@ -16,20 +16,20 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest import provenance
-from simtest.engines import Engine, make_engine
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.registry import distributions
-from simtest.files import write_atomically, write_json
 from simtest.rendering import backend
-from simtest.resources import shown
+from simtest.runtime import provenance
+from simtest.runtime.engines import Engine, make_engine
+from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
 from simtest.validation.cases import Case, expand, swept_example
+from simtest.validation.execution import Part, forget, make_rows, parts_of
 from simtest.validation.statistics import summarise
-from simtest.validation.work import Part, forget, make_rows, parts_of
 
 GALLERY_ITEMS = 18
 PARTS = "parts"

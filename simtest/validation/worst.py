@@ -9,11 +9,12 @@ import polars as pl
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.rendering import Session
+from simtest.simulation.rendered_view import view
 from simtest.spec import Experiment
-from simtest.validation import gallery
+from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case, expand
 from simtest.validation.paper.item import save_realisation
-from simtest.validation.realise import realise, view
+from simtest.validation.realisation import realise
 
 MOST = 8
 """Cases that are chosen."""

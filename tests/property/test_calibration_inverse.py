@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.geometry import Camera
-from simtest.geometry.profile import AngularProfile
-from simtest.sensor import capture, collect
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.simulation.camera_chain import capture, collect
 from simtest.spec.sensor import Sensor
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 14.0, 13.0)

@@ -7,10 +7,10 @@ from simtest.calibration import Known
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisector
 from simtest.estimators.brightest_point import brightest_point
-from simtest.estimators.checked import run
 from simtest.estimators.circle_pose import circle_pose as circle_pose_estimator
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.estimators.execution_guard import run
 from simtest.estimators.photometric import photometric, photometric_plane
 from simtest.geometry import Camera, FittedArc, FittedConic, KannalaBrandt, Patch, circle_pose, fit_arc, fit_ellipse
 

@@ -9,15 +9,15 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from simtest.gate.compare import compare
-from simtest.gate.contrasts import Outcomes, paired, unpaired
-from simtest.gate.figures import setting_figures
-from simtest.gate.holm import holm
-from simtest.gate.limits import Limits
-from simtest.gate.pooling import pooled
-from simtest.gate.quantities import quantities
-from simtest.gate.records import OUTCOMES, Night
-from simtest.gate.units import paired_sums, sums
+from simtest.nightly.gate.compare import compare
+from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
+from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.holm import holm
+from simtest.nightly.gate.limits import Limits
+from simtest.nightly.gate.pairing_units import paired_sums, sums
+from simtest.nightly.gate.pooling import pooled
+from simtest.nightly.gate.quantities import quantities
+from simtest.nightly.gate.records import OUTCOMES, Night
 from simtest.validation.metrics import SCHEMA
 
 ERROR = quantities(Limits())["mean_deg"]

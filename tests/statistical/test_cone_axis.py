@@ -9,10 +9,10 @@ from scipy import ndimage, stats
 from simtest.detection import estimate_noise
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import Stage, generator
-from simtest.sensor import expose
+from simtest.runtime.seeds import Stage, generator
+from simtest.simulation.camera_chain import expose
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
 

@@ -16,9 +16,9 @@ from simtest.estimators.lobe_models import ColocatedQuadric
 from simtest.estimators.photometric import photometric
 from simtest.geometry import smooth
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import Stage, from_integer, generator
+from simtest.runtime.seeds import Stage, from_integer, generator
 from simtest.spec import scene_from_dict
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import curvature_errors, mahalanobis2

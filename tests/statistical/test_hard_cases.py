@@ -15,12 +15,12 @@ from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, ViewMask
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.simulation.rendered_view import view
 from simtest.spec import load_scene, scene_from_dict
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2
-from simtest.validation.realise import view
 
 D = 10.0
 AXES = {"cone_axis": cone_axis, "curved": curved}

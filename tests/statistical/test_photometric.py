@@ -11,15 +11,15 @@ from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.photometric import photometric, photometric_plane
 from simtest.geometry import Patch, smooth
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.rendered_view import view
 from simtest.spec import scene_from_dict
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.pipeline import Pipeline
-from simtest.validation.realise import view
 
 ALPHA = 1e-3
 

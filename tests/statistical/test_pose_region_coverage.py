@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.pose_region import pose_region
-from simtest.seeds import from_integer
+from simtest.estimators.pose_uncertainty import pose_region
+from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.pipeline import Pipeline
 

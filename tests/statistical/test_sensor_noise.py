@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from simtest.calibration import NoiseModel
-from simtest.seeds import Stage, generator
-from simtest.sensor import capture
+from simtest.runtime.seeds import Stage, generator
+from simtest.simulation.camera_chain import capture
 from simtest.spec.sensor import Sensor
 
 ALPHA = 0.01

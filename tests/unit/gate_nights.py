@@ -3,8 +3,8 @@
 import numpy as np
 import polars as pl
 
-from simtest.gate.figures import setting_figures
-from simtest.gate.records import FIGURES, Night
+from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.records import FIGURES, Night
 from simtest.validation.metrics import SCHEMA
 
 RUN = {"id": "x", "versions": {"numpy": "2.4", "simtest": "0.1"}, "processor": "one"}

@@ -4,8 +4,8 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from simtest.gate.figures import setting_figures
-from simtest.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
 from simtest.validation.metrics import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)

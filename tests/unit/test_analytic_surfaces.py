@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from simtest.anatomy import RayHits, make_surface
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.spec import scene_from_dict
+from simtest.surfaces import RayHits, make_surface
 
 CAMERA = Camera(64, 48, 60.0, 55.0, 33.0, 22.5, 3.0)
 D = 10.0

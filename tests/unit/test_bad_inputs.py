@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtest.anatomy import make_surface
-from simtest.anatomy.recipe import load_recipe
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.spec import load_camera, load_experiment, load_scene, parse_settings, scene_from_dict
 from simtest.spec.surface import AnatomySurface
-from simtest.validation import runner, work
+from simtest.surfaces import make_surface
+from simtest.surfaces.recipe import load_recipe
+from simtest.validation import execution as work
+from simtest.validation import runner
 from simtest.validation.cases import expand
 
 

@@ -11,9 +11,9 @@ from simtest.calibration.calibration import MIN_FALLOFF
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
-from simtest.geometry.profile import AngularProfile
-from simtest.reconstruction import reconstruct
-from simtest.sensor import capture, collect
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import load_calibration, load_camera
 from simtest.spec.sensor import Sensor
 

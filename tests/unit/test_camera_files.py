@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, ViewMask, load_camera, save_camera
 from simtest.spec import scene_from_dict
-from simtest.spec.plain_yaml import parse_yaml
+from simtest.spec.camera_formats.plain_yaml import parse_yaml
 
 PINHOLE = Camera(640, 480, 500.1, 430.3, 331.2, 225.7)
 PLUMB_BOB = Camera(640, 480, 500.1, 430.3, 331.2, 225.7, 0.0, BrownConrady(-0.3, 0.1, 0.001, -0.002, 0.01))

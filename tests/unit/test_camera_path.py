@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from simtest.anatomy import make_surface
-from simtest.anatomy.base import RayHits, Shape, SurfaceModel, TriangleMesh
-from simtest.anatomy.centreline import camera_path
-from simtest.anatomy.viewpoints import MIN_CLEARANCE_MM
 from simtest.errors import InputError
 from simtest.spec.surface import AnatomySurface
+from simtest.surfaces import make_surface
+from simtest.surfaces.centreline import camera_path
+from simtest.surfaces.model import RayHits, Shape, SurfaceModel, TriangleMesh
+from simtest.surfaces.poses import MIN_CLEARANCE_MM
 
 
 class Bent(SurfaceModel):

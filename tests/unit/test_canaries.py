@@ -6,11 +6,12 @@ import polars as pl
 import pytest
 from gate_nights import rows
 
-from benchmarks.gate.faults import FAULTS, HARMLESS, Mutation, planted
-from simtest.gate.records import FIGURES
 from simtest.geometry import Camera
-from simtest.nightly.canaries import geometry, noise, run_canaries
+from simtest.nightly.canaries import geometry, run_canaries
+from simtest.nightly.canaries import randomness as noise
+from simtest.nightly.gate.records import FIGURES
 from simtest.spec import Experiment
+from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 
 DETECTORS = {
     "sign flip of an axis": ("circle_pose", "normal_off"),

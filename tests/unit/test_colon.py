@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtest.anatomy.base import RayHits
-from simtest.anatomy.colon import Colon, build
-from simtest.anatomy.jets import Jet
-from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
-from simtest.anatomy.stalk import Stalk
 from simtest.errors import InputError
+from simtest.surfaces.colon import Colon, build
+from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import RayHits
+from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
+from simtest.surfaces.stalk import Stalk
 
 ROOT = Path(__file__).resolve().parents[2]
 LOBE = "[[lobes]]\ncentre_mm = [0, 0, 0]\nsemi_axes_mm = [50, 40, %d]"

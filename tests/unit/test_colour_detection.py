@@ -3,14 +3,14 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, srgb_encode
-from simtest.colour import detect_in_picture, reconstruct_colour
 from simtest.detection.blobs import Kind
 from simtest.detection.light_split import fill, split_light
 from simtest.detection.view_mask import find_view
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.validation.detection.scores import Scores, score
-from simtest.validation.detection.truth import SpecularTruth, specular_truth
+from simtest.reconstruction.colour_pipeline import detect_in_picture, reconstruct_colour
+from studies.detection.scores import Scores, score
+from studies.detection.truth import SpecularTruth, specular_truth
 
 WIDTH, HEIGHT = 320, 240
 TISSUE = np.array([0.55, 0.28, 0.22])

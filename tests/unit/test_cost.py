@@ -5,7 +5,7 @@ import pytest
 
 from simtest.errors import Failure, Reason
 from simtest.nightly import cost
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 
 
 @pytest.fixture

@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 
 from simtest.cli.main import main
 from simtest.dataset import fields, read
-from simtest.dataset.again import compare, sample_again
 from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES
 from simtest.dataset.manifest import NAME, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
+from simtest.dataset.reproduce import compare, sample_again
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.verify import mend, verify
 from simtest.dataset.writer import write_dataset
-from simtest.engines import make_engine
-from simtest.engines.cluster import cores_each
 from simtest.errors import InputError, SimtestError
+from simtest.runtime.engines import make_engine
+from simtest.runtime.engines.cluster import cores_each
 from simtest.spec import load_dataset, scene_from_dict
 from simtest.spec.dataset import Dataset, Distribution, Splits
-from simtest.spec.reading import validate
+from simtest.spec.toml_input import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}

@@ -15,8 +15,8 @@ from PIL import Image
 
 from simtest.dataset import fields, read
 from simtest.dataset.writer import write_dataset
-from simtest.engines import make_engine
 from simtest.errors import InputError
+from simtest.runtime.engines import make_engine
 from simtest.spec import load_dataset
 
 # Others warn as they like.

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, srgb_encode
-from simtest.colour import reconstruct_colour
 from simtest.detection.blobs import Kind
+from simtest.reconstruction.colour_pipeline import reconstruct_colour
 from simtest.rendering import Session
 from simtest.spec import load_scene
-from simtest.validation.detection.frames import SPLITS, study_frames
-from simtest.validation.detection.truth import specular_truth
+from studies.detection.frames import SPLITS, study_frames
+from studies.detection.truth import specular_truth
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.render
 def test_detection_keeps_its_promise_and_is_ahead_of_the_others(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.detection import figures
+    from studies.detection.__main__ import figures
 
     shown = {figure.name: figure for figure in figures(frames=18, tuning=6)}
     assert all(figure.met for figure in shown.values()), shown

@@ -10,9 +10,9 @@ import pytest
 import simtest
 from simtest.errors import InputError
 from simtest.rendering import Session, plugins
-from simtest.rendering.export import SAMPLES
+from simtest.rendering.mitsuba_export import SAMPLES
 from simtest.spec import scene_from_dict
-from simtest.spec.camera import CameraSpec
+from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.rig import LightSpec
 
 pytestmark = pytest.mark.render

@@ -5,9 +5,9 @@ import polars as pl
 import pytest
 from gate_nights import changed, night, raised, rows
 
-from simtest.gate.compare import compare
-from simtest.gate.figures import digest, setting_figures
-from simtest.gate.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
+from simtest.nightly.gate.compare import compare
+from simtest.nightly.gate.figures import digest, setting_figures
+from simtest.nightly.gate.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
 
 FIRST_12 = pl.col("realisation") < 12
 

@@ -4,7 +4,7 @@ import polars as pl
 from gate_nights import night, rows
 from scipy import stats
 
-from simtest.gate.compare import compare
+from simtest.nightly.gate.compare import compare
 
 
 def alarms(nights, factor, seed):

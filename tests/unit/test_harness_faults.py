@@ -8,23 +8,24 @@ import polars as pl
 import pytest
 
 import simtest
+from simtest.api import reconstruct_picture
 from simtest.calibration import NoiseModel
 from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
-from simtest.estimators.checked import run
+from simtest.estimators.execution_guard import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
-from simtest.picture import reconstruct_picture
 from simtest.rendering import Session
 from simtest.rendering.frames import TrueHighlight
 from simtest.report import write_report
+from simtest.simulation.rendered_view import view
+from simtest.simulation.true_highlights import judge
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.metrics import mahalanobis2
-from simtest.validation.realise import realise, view
+from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
-from simtest.validation.truth import judge
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
 GOOD = {"normal": np.array([0, 0, -1.0]), "candidates": np.array([[0, 0, -1.0]]), "look_px": np.array([40.0, 30.0])}

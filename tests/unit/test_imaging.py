@@ -9,17 +9,17 @@ import trimesh
 from PIL import Image as PillowImage
 from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
+from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.imaging.constraints import arrays
-from simtest.imaging.depth import depth_normals, depth_points, depths_at, judge_depth, read_depth
-from simtest.imaging.reading import is_coloured, read_picture
-from simtest.imaging.reference import load_reference, read_pose
-from simtest.imaging.single import Options
-from simtest.imaging.sources import open_source
-from simtest.imaging.tracking import Tracker
-from simtest.picture import Extras, reconstruct_picture
-from simtest.sequence import reconstruct_sequence
+from simtest.reconstruction.constraints import arrays
+from simtest.reconstruction.image_io import is_coloured, read_picture
+from simtest.reconstruction.image_sources import open_source
+from simtest.reconstruction.sequence import reconstruct_sequence
+from simtest.reconstruction.single import Options
+from simtest.reconstruction.tracking import Tracker
+from simtest.validation.depth_maps import depth_normals, depth_points, depths_at, judge_depth, read_depth
+from simtest.validation.reference_surface import load_reference, read_pose
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
 FOV = 60.0

@@ -8,17 +8,17 @@ import pytest
 
 from simtest.calibration import Calibration, Known
 from simtest.errors import Failure, Reason
-from simtest.estimators.checked import run
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.estimators.execution_guard import run
 from simtest.estimators.photometric import photometric
 from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.inverse import inverse_rendering
 from simtest.inverse.patch import RenderedQuadric
-from simtest.inverse.render import PatchRenderer
-from simtest.reconstruction import reconstruct
+from simtest.inverse.patch_renderer import PatchRenderer
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
 from simtest.spec import scene_from_dict
 from simtest.validation.metrics import curvature_errors, mahalanobis2
 

@@ -10,15 +10,15 @@ from simtest.calibration import Calibration, Known
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisect, bisector
-from simtest.estimators.checked import run
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
-from simtest.estimators.spot import fit_spot
-from simtest.estimators.top import fit_top
+from simtest.estimators.execution_guard import run
+from simtest.estimators.isophote_family import fit_spot
+from simtest.estimators.peak_value import fit_top
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
 from simtest.validation import laws

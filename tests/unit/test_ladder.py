@@ -6,12 +6,13 @@ import pytest
 
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators import base
+from simtest.estimators import protocol as base
 from simtest.geometry import Patch
 from simtest.nightly import ladder as nightly_ladder
 from simtest.nightly.ladder import ladder_figures
-from simtest.validation import ladder, laws
-from simtest.validation.ladder import CAMERA, DISTANCE_MM, EXPONENT, RUNGS, SCENES, ClosedScene, error_ladder
+from simtest.validation import error_ladder as ladder
+from simtest.validation import laws
+from simtest.validation.error_ladder import CAMERA, DISTANCE_MM, EXPONENT, RUNGS, SCENES, ClosedScene, error_ladder
 
 PLANE, TURNED, CYLINDER = SCENES
 NAMES = list(RUNGS)

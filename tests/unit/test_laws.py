@@ -5,7 +5,7 @@ import pytest
 
 from simtest.geometry import circle_pose
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws

@@ -5,12 +5,12 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from simtest.dataset.learn import Samples, read_crops  # noqa: E402
+from simtest.dataset.learn.network import propose, train  # noqa: E402
 from simtest.dataset.writer import write_dataset  # noqa: E402
-from simtest.engines import make_engine  # noqa: E402
 from simtest.errors import InputError  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
-from simtest.learn import Samples, read_crops  # noqa: E402
-from simtest.learn.network import propose, train  # noqa: E402
+from simtest.runtime.engines import make_engine  # noqa: E402
 from simtest.spec import load_dataset  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")

@@ -8,16 +8,16 @@ import pytest
 
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, Reason
-from simtest.estimators.base import fit_isophote, fit_isophote_of_each
 from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.protocol import fit_isophote, fit_isophote_of_each
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import from_integer
-from simtest.sensor import expose
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.camera_chain import expose
+from simtest.simulation.rendered_view import view
 from simtest.spec import scene_from_dict
-from simtest.validation.realise import view
 
 # A 140 degree fisheye: 70 deg from the axis lie 320 px away.
 FOCAL = 320 / np.radians(70)

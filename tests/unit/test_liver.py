@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtest.anatomy.base import RayHits
-from simtest.anatomy.liver import Liver, _project, build
-from simtest.anatomy.recipe import LiverRecipe, load_recipe
 from simtest.errors import InputError
+from simtest.surfaces.liver import Liver, _project, build
+from simtest.surfaces.model import RayHits
+from simtest.surfaces.recipe import LiverRecipe, load_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP = 0.02

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.anatomy.fineness import (
+from simtest.errors import InputError
+from simtest.surfaces.fineness import (
     EDGES_PER_HALF_WIDTH,
     concentration,
     ggx_concentration,
     half_width,
     phong_concentration,
 )
-from simtest.anatomy.mesh import prepare
-from simtest.anatomy.mesh_check import check_mesh
-from simtest.anatomy.mesh_file import read_mesh
-from simtest.anatomy.repair import examine, repair
-from simtest.errors import InputError
+from simtest.surfaces.mesh_check import check_mesh
+from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.mesh_surface import prepare
+from simtest.surfaces.repair import examine, repair
 
 C = phong_concentration(10.0)
 
@@ -136,15 +136,15 @@ def test_another_unit_than_mm_is_guessed(tmp_path, scale, unit):
 
 def test_huge_meshes_are_refused_by_their_size_alone(tmp_path, monkeypatch):
     path = save(tmp_path / "ball.obj", *ball())
-    monkeypatch.setitem(__import__("simtest.anatomy.mesh_file", fromlist=["x"]).MAX_BYTES, ".obj", 1000)
+    monkeypatch.setitem(__import__("simtest.surfaces.mesh_file", fromlist=["x"]).MAX_BYTES, ".obj", 1000)
     with pytest.raises(InputError, match="bytes; at most 1000 are allowed: decimate"):
         read_mesh(path)
 
 
 def test_large_meshes_are_not_searched_and_it_is_said(tmp_path, monkeypatch):
     path = save(tmp_path / "ball.ply", *ball())
-    monkeypatch.setattr("simtest.anatomy.repair.MAX_CROSSING_FACES", 100)
-    monkeypatch.setattr("simtest.anatomy.mesh_check.MAX_CURVATURE_FACES", 100)
+    monkeypatch.setattr("simtest.surfaces.repair.MAX_CROSSING_FACES", 100)
+    monkeypatch.setattr("simtest.surfaces.mesh_check.MAX_CURVATURE_FACES", 100)
     verdict = check_mesh(path, 30.0, C)
     assert verdict.condition.crossing_faces is None
     assert not verdict.usable
@@ -217,7 +217,7 @@ def test_five_million_faces_are_checked_in_bounded_memory(tmp_path):
     )
     path.write_bytes(header.encode() + points.astype("<f4").tobytes() + faces.tobytes())
     code = (
-        "import json, resource, sys\nfrom simtest.anatomy.mesh_check import check_mesh\n"
+        "import json, resource, sys\nfrom simtest.surfaces.mesh_check import check_mesh\n"
         "verdict = check_mesh(sys.argv[1], 30.0, 800.0)\n"
         "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
         "print(json.dumps({'lines': list(verdict.lines()), 'peak': peak}))"

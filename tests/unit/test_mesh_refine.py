@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.anatomy.base import principal_curvatures
-from simtest.anatomy.mesh import Refinement, prepare
-from simtest.anatomy.mesh_file import read_mesh
-from simtest.anatomy.refine import edge_lengths, fair, halvings, refine, shape_operators, vertex_normals
-from simtest.anatomy.repair import edge_uses
 from simtest.spec.surface import AnatomySurface
+from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.mesh_surface import Refinement, prepare
+from simtest.surfaces.model import principal_curvatures
+from simtest.surfaces.repair import edge_uses
+from simtest.surfaces.subdivision import edge_lengths, fair, halvings, refine, shape_operators, vertex_normals
 
 
 def plane_lattice(side, reach):
@@ -110,7 +110,7 @@ def test_a_scene_may_ask_for_an_edge_length(tmp_path, monkeypatch):
     assert prepared.subdivisions == 1
     radius = np.linalg.norm(prepared.mesh.vertices, axis=1)
     assert radius.mean() == pytest.approx(15, rel=0.01)  # fair smoothing hardly shrinks
-    monkeypatch.setattr("simtest.anatomy.mesh.AUTO_CONCENTRATION", 40.0)  # a wide lobe: fewer faces
+    monkeypatch.setattr("simtest.surfaces.mesh_surface.AUTO_CONCENTRATION", 40.0)  # a wide lobe: fewer faces
     automatic = prepare(path, Refinement(edge_mm="auto"))
     assert automatic.subdivisions == 2  # 40 mm sqrt(2 ln 2 / 40) / (1 + 40/15) / 2 = 1.0 mm
     assert automatic.key != prepared.key
@@ -123,7 +123,7 @@ def test_a_scene_may_ask_for_an_edge_length(tmp_path, monkeypatch):
 def test_smoothing_is_left_out_with_a_warning_where_it_cannot_be(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(3, radius=15.0).export(path)
-    monkeypatch.setattr("simtest.anatomy.refine.MAX_SMOOTHED_FACES", 1000)
+    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SMOOTHED_FACES", 1000)
     with pytest.warns(UserWarning, match="1280 faces, at most 1000 can be smoothed; using smoothing_mm = 0"):
         prepare(path, Refinement(0, smoothing_mm=3.0))
 

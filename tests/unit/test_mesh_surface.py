@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.anatomy.base import RayHits
-from simtest.anatomy.mesh import (
+from simtest.errors import InputError
+from simtest.spec.surface import AnatomySurface
+from simtest.surfaces.mesh_surface import (
     LUMEN_QUOTIENT,
     MeshSurface,
     isoperimetric_quotient,
     prepare,
     read_mesh,
 )
-from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.surfaces.model import RayHits
 
 MESHES = Path(__file__).resolve().parents[2].parent / "shared/data/meshes"
 COLON, LIVER = MESHES / "colon_edingca_00090.ply", MESHES / "liver_sksurgery.ply"
@@ -187,7 +187,7 @@ def test_orientation_is_mended(tmp_path):
 def test_subdivision_is_reduced_with_a_warning(tmp_path, monkeypatch):
     path = save(sphere(level=3), tmp_path / "ball.ply")
     assert len(prepare(path, 1).mesh.faces) == 4 * 1280
-    monkeypatch.setattr("simtest.anatomy.refine.MAX_SUBDIVIDED_FACES", 10_000)
+    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SUBDIVIDED_FACES", 10_000)
     with pytest.warns(UserWarning, match="3 subdivisions of 1280 faces would exceed 10000; using 1"):
         prepared = prepare(path, 3)
     assert prepared.subdivisions == 1

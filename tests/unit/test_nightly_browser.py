@@ -8,7 +8,7 @@ from test_nightly_page import rows_of
 from test_report import make_item
 
 from benchmarks.nights import history_of, night_of, verdict_of
-from simtest.report.nightly import Extras, write_nightly_page
+from simtest.nightly.page import Extras, write_nightly_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
 CHROMIUM = next(

@@ -189,7 +189,7 @@ def test_a_full_disk_leaves_no_half_of_a_night(tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("simtest.files.os.fsync", full)
+    monkeypatch.setattr("simtest.runtime.files.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         keep(tmp_path, 1)
     assert contents(tmp_path) == before

@@ -7,8 +7,8 @@ from xml.etree import ElementTree as ET
 import polars as pl
 import pytest
 
-from simtest.gate.records import COMPARISONS, OUTCOMES, PLACE, Verdict
 from simtest.nightly.badge import COLOURS, badge
+from simtest.nightly.gate.records import COMPARISONS, OUTCOMES, PLACE, Verdict
 from simtest.nightly.junit import junit
 from simtest.nightly.outputs import write_outputs
 from simtest.nightly.summary import MAX_CHARACTERS, summary

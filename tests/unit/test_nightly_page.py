@@ -16,13 +16,13 @@ from plotly.offline import get_plotlyjs
 from test_report import EVIL, make_item, make_rows
 
 from benchmarks.nights import history_of, night_of, verdict_of
-from simtest.gate.records import COMPARISONS, FIGURES, Night, Verdict
-from simtest.report.nightly import Extras, write_nightly_page
-from simtest.report.nightly.comparisons import comparisons
-from simtest.report.nightly.ladder import FLOOR_DEG, ladder
-from simtest.report.nightly.trends import COSTS, MEDIAN, NEWEST, trends
-from simtest.report.nightly.words import bounds, headline, measure, short_commit, signed
-from simtest.report.style import colours
+from simtest.nightly.gate.records import COMPARISONS, FIGURES, Night, Verdict
+from simtest.nightly.page import Extras, write_nightly_page
+from simtest.nightly.page.comparisons import comparisons
+from simtest.nightly.page.ladder_figures import FLOOR_DEG, ladder
+from simtest.nightly.page.phrases import bounds, headline, measure, short_commit, signed
+from simtest.nightly.page.trends import COSTS, MEDIAN, NEWEST, trends
+from simtest.pages.style import colours
 from simtest.validation.metrics import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)

@@ -15,16 +15,16 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
-from simtest.gate.records import FIGURES
 from simtest.nightly import measure
 from simtest.nightly import run as run_module
 from simtest.nightly.baseline import accept, load_baseline
+from simtest.nightly.gate.records import FIGURES
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
 from simtest.nightly.overview import failed_canaries
 from simtest.nightly.run import run_nightly
 from simtest.nightly.storage import BASELINE_ROWS, save_night
-from simtest.resources import data_root
+from simtest.runtime.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.runner import definition
@@ -303,7 +303,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost(measured, reports, monkeypatch,
             raise OSError(errno.ENOSPC, "No space left on device")
         fsync(descriptor)
 
-    monkeypatch.setattr("simtest.files.os.fsync", full)
+    monkeypatch.setattr("simtest.runtime.files.os.fsync", full)
     with pytest.raises(SimtestError, match=r"the night could not be written .No space left on device.; what earlier"):
         run_nightly(quick(), reports)
     monkeypatch.undo()
@@ -370,7 +370,7 @@ def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
 def test_an_acceptance_on_a_full_disk_is_told_in_one_line(measured, reports, monkeypatch):
     accept_first(reports)
     before = contents(reports.root)
-    monkeypatch.setattr("simtest.files.os.fsync", fails_with(OSError(errno.ENOSPC, "No space left on device")))
+    monkeypatch.setattr("simtest.runtime.files.os.fsync", fails_with(OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(SimtestError, match=r"the baseline could not be written .No space left on device.; the last"):
         accept(reports, "quick", "second")
     assert contents(reports.root) == before
@@ -448,7 +448,7 @@ def test_a_definition_is_that_of_scene_and_files_and_not_of_place_or_source(smal
     planes = tmp_path / "planes.toml"
     planes.write_text(PLANES.replace('"plane"\nlabel', f'"{scene}"\nlabel'))
     first = hashes(small)
-    monkeypatch.setattr("simtest.provenance.source_hash", lambda: "another")
+    monkeypatch.setattr("simtest.runtime.provenance.source_hash", lambda: "another")
     assert hashes(small) == first
     text = scene.read_text()
     scene.write_text(text + "\n# Another file.\n")

@@ -13,7 +13,7 @@ from benchmarks.__main__ import NAMES
 ROOT = Path(__file__).resolve().parents[2]
 
 FIND = """
-from simtest.resources import find
+from simtest.runtime.resources import find
 from simtest.spec import load_experiment, load_scene
 import simtest
 assert "site" in simtest.__file__, simtest.__file__

@@ -4,8 +4,8 @@ import polars as pl
 import pytest
 
 from simtest import validate
-from simtest.engines import make_engine
 from simtest.errors import InputError
+from simtest.runtime.engines import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.paper import PaperSetting
 from simtest.validation.cases import expand

@@ -8,9 +8,10 @@ import polars as pl
 import pytest
 
 from simtest.geometry.isocurves import cosine_beta
+from simtest.pages import style
 from simtest.report import interactive as plotly_base
 from simtest.report import static as base
-from simtest.report import style, write_report
+from simtest.report import write_report
 from simtest.report.paper import interactive, static
 from simtest.report.paper.fits import line, offset_inside_window
 from simtest.report.paper.isocurves import KAPPA, OFFSET_LIGHT, isocurve_figure
@@ -18,7 +19,7 @@ from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.paper.stages import stages
 from simtest.report.paper.statements import ABSENT, AGREES, DIFFERS, FEW, PART, statements
 from simtest.report.paper.sweeps import sweep_figures
-from simtest.report.run import read_run
+from simtest.report.run_folder import read_run
 from simtest.report.series import line_figures
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment

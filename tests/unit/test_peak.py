@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.peak import weights_at_zero, weights_of_axes
-from simtest.estimators.spot import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_spot
+from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
+from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_spot
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
 

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from simtest.api import reconstruct_picture
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCESS
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
-from simtest.picture import reconstruct_picture
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 
 SIZE = 160
 CAMERA = Camera(SIZE, SIZE, 160.0, 160.0, 80.0, 80.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.pose_region import _conic, _ellipse
+from simtest.estimators.pose_uncertainty import _conic, _ellipse
 from simtest.geometry import circle_pose
 from simtest.geometry.pose_region import PoseRegion
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.geometry.profile import AngularProfile
-from simtest.spec.profile import CosineProfile, TableProfile
-from simtest.spec.reading import validate
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.spec.falloff import CosineProfile, TableProfile
+from simtest.spec.toml_input import validate
 
 
 def test_cosine_profile_is_the_cosines_power():

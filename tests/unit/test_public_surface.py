@@ -17,26 +17,26 @@ PUBLIC = {
     "BrownConrady": "simtest.geometry.distortion",
     "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
-    "Estimate": "simtest.estimators.base",
+    "Estimate": "simtest.estimators.protocol",
     "Experiment": "simtest.spec.experiment",
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.distortion",
-    "LabelledFrame": "simtest.dataset.frame",
+    "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.isophotes",
     "Reason": "simtest.errors",
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",
-    "Specularity": "simtest.reconstruction",
+    "Specularity": "simtest.reconstruction.pipeline",
     "ViewMask": "simtest.geometry.camera",
     "export": "simtest.api",
-    "load_calibration": "simtest.spec.calibration",
-    "load_camera": "simtest.spec.camera",
+    "load_calibration": "simtest.spec.calibration_file",
+    "load_camera": "simtest.spec.camera_spec",
     "load_experiment": "simtest.spec.experiment",
     "load_scene": "simtest.spec.scene",
-    "reconstruct": "simtest.reconstruction",
+    "reconstruct": "simtest.reconstruction.pipeline",
     "render": "simtest.api",
-    "save_camera": "simtest.spec.camera",
+    "save_camera": "simtest.spec.camera_spec",
     "validate": "simtest.api",
 }
 """Public name and the module that defines it. A change here is a change of the interface."""
@@ -90,7 +90,7 @@ def test_reconstructing_loads_neither_renderer_nor_viewer():
 
 def test_estimators_that_are_registered():
     from simtest.estimators.registry import GROUP, available
-    from simtest.reconstruction import DEFAULT_ESTIMATORS
+    from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {"circle_pose", "brightest_point", "cone_axis"} <= set(project["entry-points"][GROUP])

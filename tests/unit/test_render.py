@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from simtest.anatomy import Shape, TriangleMesh
 from simtest.rendering import Session
 from simtest.rendering.materials import bsdf_dict
 from simtest.rendering.shapes import make_shape
 from simtest.spec import scene_from_dict
+from simtest.surfaces import Shape, TriangleMesh
 
 pytestmark = pytest.mark.render
 

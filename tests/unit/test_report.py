@@ -10,12 +10,12 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.pages.style import Axis, colours, number
 from simtest.report import write_report
 from simtest.report.interactive import surface_3d as interactive_surface
-from simtest.report.run import read_run
+from simtest.report.run_folder import read_run
 from simtest.report.series import law_misses, line_figures
 from simtest.report.static import heat_range
-from simtest.report.style import Axis, colours, number
 from simtest.report.surface3d import surface_3d
 from simtest.report.tables import heat_maps
 from simtest.validation import laws

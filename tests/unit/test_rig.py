@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.rendering import Session
-from simtest.seeds import Stage, integer
+from simtest.runtime.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
 from simtest.spec.experiment import Experiment
-from simtest.spec.reading import apply_settings
 from simtest.spec.rig import COLOCATED_MM, PRESETS, Rig
+from simtest.spec.toml_input import apply_settings
 from simtest.validation.cases import expand
 
 render = pytest.mark.render

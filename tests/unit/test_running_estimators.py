@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.base import answers_each
 from simtest.estimators.brightest_point import brightest_point
-from simtest.estimators.checked import run, run_each
 from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.execution_guard import run, run_each
+from simtest.estimators.protocol import answers_each
 from simtest.geometry import Camera, Patch, smooth
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)

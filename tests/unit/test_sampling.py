@@ -9,8 +9,8 @@ import pytest
 
 from simtest import api
 from simtest.errors import InputError
+from simtest.simulation.viewpoints import NO_HIGHLIGHT, along_path, candidates, sample_views
 from simtest.spec import load_scene
-from simtest.validation.sampling import NO_HIGHLIGHT, along_path, candidates, sample_views
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
 

@@ -8,17 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.api import render
+from simtest.api import reconstruct_picture, render
 from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
-from simtest.picture import reconstruct_picture
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.simulation.rendered_view import view
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
 from simtest.validation.predicted import unknown_falloff
-from simtest.validation.realise import view
 from simtest.validation.runner import run_experiment
 
 pytestmark = pytest.mark.render

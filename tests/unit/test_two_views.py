@@ -5,13 +5,13 @@ import pytest
 
 from simtest.calibration import Calibration, Known
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.base import Estimate, EstimatedCurvature
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
+from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.estimators.two_views import rank_by_motion
-from simtest.reconstruction import reconstruct
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
 from simtest.spec import scene_from_dict
 
 D, EXPONENT = 10.0, 50.0

@@ -12,18 +12,19 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction import Specularity, reconstruct
+from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.rendering.frames import TrueHighlight
-from simtest.seeds import Stage, from_integer, generator, integer, key, sequence
+from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
+from simtest.simulation.rendered_view import view
+from simtest.simulation.true_highlights import JudgedHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
 from simtest.validation.metrics import SCHEMA, RowContext, rows, table
-from simtest.validation.realise import realise, view
+from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
 from simtest.validation.statistics import figures, mean_interval, summarise
-from simtest.validation.truth import JudgedHighlight
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 NORTH = np.array([0.0, 0.0, -1.0])

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
+from simtest.report.viewer import Content, make_content, save_screenshot, show, window
 from simtest.spec import load_scene
-from simtest.viewer import Content, make_content, save_screenshot, show, window
 
 SMALL = {"camera.width": 120, "camera.height": 120, "camera.fx": 120.0, "camera.fy": 120.0}
 
@@ -73,8 +73,8 @@ def test_a_window_without_a_display_is_refused(content, monkeypatch):
 @pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 @pytest.mark.parametrize("target", [["--screenshot", "nowhere/view.png"], ["--screenshot", "view.jpg"], []])
 def test_the_command_refuses_before_it_renders(monkeypatch, tmp_path, capsys, target):
-    from simtest import viewer
     from simtest.cli.main import main
+    from simtest.report import viewer
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)

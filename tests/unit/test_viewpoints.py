@@ -6,13 +6,13 @@ import igl
 import numpy as np
 import pytest
 
-from simtest.anatomy.colon import Colon
-from simtest.anatomy.liver import Liver
-from simtest.anatomy.mesh import MeshSurface
-from simtest.anatomy.recipe import ColonRecipe, LiverRecipe, load_recipe
-from simtest.anatomy.viewpoints import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
 from simtest.errors import InputError
 from simtest.spec.surface import AnatomySurface
+from simtest.surfaces.colon import Colon
+from simtest.surfaces.liver import Liver
+from simtest.surfaces.mesh_surface import MeshSurface
+from simtest.surfaces.poses import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
+from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 MESHES = ROOT.parent / "shared/data/meshes"

@@ -6,7 +6,8 @@ from functools import cache, partial
 import polars as pl
 
 from simtest.errors import BackendError
-from simtest.nightly.canaries import geometry, noise, rendered
+from simtest.nightly.canaries import geometry, rendered
+from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries.record import Canary, as_figures
 from simtest.rendering import Session
 from simtest.spec import Experiment
@@ -34,8 +35,8 @@ def run_canaries(
     Returns
     -------
     polars.DataFrame
-        Columns `simtest.gate.records.FIGURES`, kind "canary". One that cannot be measured for an error has no value,
-        and has not passed; its `about` holds the error.
+        Columns `simtest.nightly.gate.records.FIGURES`, kind "canary". One that cannot be measured for an error has no
+        value, and has not passed; its `about` holds the error.
 
     Raises
     ------

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from simtest.gate.records import FIGURES
+from simtest.nightly.gate.records import FIGURES
 
 
 @dataclass(frozen=True)

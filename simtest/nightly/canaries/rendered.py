@@ -10,9 +10,10 @@ from simtest.estimators import Estimate, load_estimators
 from simtest.nightly.canaries import by_hand
 from simtest.nightly.canaries.record import Canary
 from simtest.rendering import Session
+from simtest.simulation.rendered_view import view
 from simtest.spec import Experiment, Scene, scene_from_dict
 from simtest.validation.cases import expand
-from simtest.validation.realise import Realisation, realise, view
+from simtest.validation.realisation import Realisation, realise
 
 Array = by_hand.Array
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, Array
 from simtest.report.laws.judge import SLOPE, LawResult
 from simtest.report.static import log_range
-from simtest.report.style import ESTIMATOR_COLOURS, NEUTRAL, Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

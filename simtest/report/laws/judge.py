@@ -7,9 +7,9 @@ from typing import get_args
 import numpy as np
 import polars as pl
 
-from simtest.report.run import Run
+from simtest.pages.style import Array, degrees, number
+from simtest.report.run_folder import Run
 from simtest.report.series import TOLERANCE_DEG, TOLERANCE_SHARE
-from simtest.report.style import Array, degrees, number
 from simtest.spec.experiment import LawName
 from simtest.validation import laws
 

@@ -6,7 +6,7 @@ from typing import Any
 from simtest.report import static
 from simtest.report.laws import drawing
 from simtest.report.laws.judge import law_results, sentence
-from simtest.report.run import Run
+from simtest.report.run_folder import Run
 
 
 def laws_section(run: Run, folder: Path) -> tuple[dict[str, Any], dict[str, str]] | None:

@@ -1,8 +1,8 @@
 """Why this run departs from the article, where it does: two sentences each, shown under the table."""
 
 from simtest.conventions import PAPER_SMOOTHING_PX
+from simtest.pages.style import number
 from simtest.report.paper.sweeps import Sweep
-from simtest.report.style import number
 
 NEAR_ZERO_SLANT = (
     "Near θ = 0 circle pose is at its branch point: a relative axis error δ tilts the normal by √(2δ), so that even "

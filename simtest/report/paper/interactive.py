@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from simtest.report import style
+from simtest.pages import style
+from simtest.pages.style import NEUTRAL
 from simtest.report.interactive import layout
 from simtest.report.paper.isocurves import KAPPA, REACH, Branch, IsocurveFigure
 from simtest.report.paper.static import (
@@ -23,7 +24,6 @@ from simtest.report.paper.static import (
 )
 from simtest.report.paper.sweeps import Sweep, SweepFigure
 from simtest.report.static import visible
-from simtest.report.style import NEUTRAL
 
 _SHARE = 0.2
 """Height of the failures' strip."""

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from simtest.pages import style
+from simtest.pages.style import degrees, labelled, number
 from simtest.report import static as base
-from simtest.report import style
 from simtest.report.paper import static
 from simtest.report.paper.isocurves import isocurve_figure
 from simtest.report.paper.stages import Stages, stages
 from simtest.report.paper.stages_static import draw_panels, draw_stages
 from simtest.report.paper.statements import AGREES, ARTICLE, DIFFERS, Statement, statements
 from simtest.report.paper.sweeps import Sweep, SweepFigure, departures, sweep_figures
-from simtest.report.run import Run
-from simtest.report.style import degrees, labelled, number
+from simtest.report.run_folder import Run
 
 _PANEL_BYTES = 60_000
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from simtest.geometry.vectors import angle_deg
 from simtest.report.gallery import estimated_normals, vector
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
-from simtest.report.run import GalleryItem, Run
+from simtest.report.run_folder import GalleryItem, Run
 
 Array = npt.NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from simtest.pages.style import NEUTRAL, TRUTH, Array
 from simtest.report.gallery import GAMMA
 from simtest.report.paper.stages import Stages
-from simtest.report.style import NEUTRAL, TRUTH, Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from simtest.pages.style import Array, degrees, number
 from simtest.report.paper import explanations, fits
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.paper.sweeps import Sweep, SweepFigure
-from simtest.report.style import Array, degrees, number
 
 AGREES, DIFFERS, ABSENT = "agrees", "differs", "not in this run"
 PART, FEW = "only part of the range", "too few realisations"

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtest.report import style
+from simtest.pages import style
+from simtest.pages.style import NEUTRAL, Array
 from simtest.report.curves import finite
 from simtest.report.paper.isocurves import KAPPA, REACH, Branch, IsocurveFigure
 from simtest.report.paper.sweeps import Sweep, SweepFigure
 from simtest.report.static import visible
-from simtest.report.style import NEUTRAL, Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.pages.style import Array, Axis, estimator_order
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
-from simtest.report.run import Run
-from simtest.report.style import Array, Axis, estimator_order
+from simtest.report.run_folder import Run
 
 _WIDE = 20.0
 """Means that span more than this factor are drawn on a logarithmic axis."""

@@ -8,10 +8,10 @@ import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.geometry.isocurves import brightest_point
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
 from simtest.spec import camera_table
 from simtest.spec.paper import PaperSetting
-from simtest.validation.gallery import MAP_SIDE, drawn, write_item
+from simtest.validation.gallery_items import MAP_SIDE, drawn, write_item
 from simtest.validation.paper.pipeline import Stages
 from simtest.validation.paper.protocol import Box, plane_from_image, texture, window_centre
 from simtest.validation.paper.rows import SURFACE, pipeline_with
@@ -86,7 +86,7 @@ def again(setting: PaperSetting, estimators: tuple[str, ...], seed: int) -> str:
     """Give the command that makes a realisation again alone: it prints the estimates."""
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     return (
-        'python -c "from simtest.seeds import from_integer; from simtest.spec.paper import PaperSetting; '
+        'python -c "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; '
         "from simtest.validation.paper.rows import pipeline_with; "
         f'print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"'
     )

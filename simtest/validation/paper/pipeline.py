@@ -12,8 +12,8 @@ import numpy.typing as npt
 from simtest.detection import estimate_noise
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.estimators.base import BatchEstimator
 from simtest.estimators.circle_pose import circle_poses
+from simtest.estimators.protocol import BatchEstimator
 from simtest.geometry import Patch
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.protocol import (

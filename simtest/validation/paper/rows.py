@@ -9,11 +9,11 @@ import polars as pl
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.checked import one_by_one
 from simtest.estimators.circle_pose import circle_poses
+from simtest.estimators.execution_guard import one_by_one
 from simtest.estimators.photometric import photometric_plane
 from simtest.geometry.vectors import angle_deg
-from simtest.seeds import from_integer
+from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import SCHEMA, mahalanobis2
 from simtest.validation.paper.pipeline import Pipeline

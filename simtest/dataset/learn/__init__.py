@@ -1,0 +1,19 @@
+"""Learning from datasets with PyTorch (extra ``learn``): samples as tensors, and crops of highlights."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from simtest.dataset.learn.crops import Crops, read_crops
+    from simtest.dataset.learn.samples import Samples
+
+_HOMES = {"Crops": "crops", "Samples": "samples", "read_crops": "crops"}
+
+__all__ = ["Crops", "Samples", "read_crops"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'simtest.dataset.learn' has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(f"simtest.dataset.learn.{_HOMES[name]}"), name)

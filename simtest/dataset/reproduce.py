@@ -1,0 +1,67 @@
+"""Makes one sample of a dataset again, alone, and compares it with the stored one."""
+
+from pathlib import Path
+
+from simtest.dataset.reader import open_manifest
+from simtest.dataset.sample import Maker, sample_key
+from simtest.dataset.shard import BrokenShardError, read_member, samples
+from simtest.errors import InputError
+from simtest.runtime.files import make_folder
+
+
+def sample_again(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
+    """Make a sample again and write its members as files.
+
+    Parameters
+    ----------
+    folder : Path
+        The dataset's.
+    index : int
+        Sample, from 0.
+    out : Path
+        Folder for the files, made if need be.
+    variant : str, optional
+        Mitsuba variant; default the dataset's.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    InputError
+        If there is no such sample, or the folder cannot be written.
+    """
+    manifest = open_manifest(folder)
+    plan = manifest.plan()
+    if not 0 <= index < plan.dataset.samples:
+        raise InputError(f"INDEX = {index}: must be 0 to {plan.dataset.samples - 1}")
+    made = Maker(plan, variant or str(manifest.origin["variant"])).make(index)
+    make_folder(out)
+    files = []
+    try:
+        for suffix, data in made.encode().items():
+            files.append(out / f"{made.key}.{suffix}")
+            files[-1].write_bytes(data)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+    return files
+
+
+def compare(folder: Path, index: int, out: Path) -> str:
+    """Say whether the files that `sample_again` wrote are the stored sample's."""
+    shard, key = open_manifest(folder).plan().shard_of(index), sample_key(index)
+    try:
+        with (folder / shard.name).open("rb") as file:
+            stored = next((sample for sample in samples(file, check=False) if sample.key == key), None)
+            if stored is None:
+                return f"{shard.name} holds no sample {key}"
+            different = [s for s in stored.members if read_member(file, stored, s) != _bytes(out / f"{key}.{s}")]
+    except (OSError, BrokenShardError) as error:
+        return f"{shard.name}: cannot be compared ({error})"
+    return f"{shard.name}: differs in {', '.join(different)}" if different else f"{shard.name}: same bytes"
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None

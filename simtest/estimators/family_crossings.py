@@ -1,0 +1,176 @@
+"""The crossings of a highlight's isophotes in a basis across its axis, their conics there, and how noise moves them.
+
+All isophotes are worked on at once: a call for each would cost more than the work.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.estimators.peak_value import Top
+from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
+from simtest.estimators.protocol import FittedIsophote
+from simtest.geometry import Camera, Patch
+from simtest.geometry.level_sets import Sensitivities
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+STEP_PX = 0.1
+"""Step of the central differences of a distorting lens' sightlines."""
+
+
+@dataclass(frozen=True)
+class SpotCrossings:
+    """The points of K isophotes, N in all, one isophote's after the other's.
+
+    Parameters
+    ----------
+    patch : Patch
+        Region of interest.
+    camera : Camera
+        Calibration.
+    isophotes : tuple of FittedIsophote
+        Each the cone of an ellipse.
+    frame : ndarray, shape (3, 3)
+        Two unit vectors across the axis, and the axis.
+    """
+
+    patch: Patch
+    camera: Camera
+    isophotes: tuple[FittedIsophote, ...]
+    frame: Array
+
+    @cached_property
+    def isovalues(self) -> Array:
+        """Isovalue of each isophote, shape (K,)."""
+        return np.array([isophote.isovalue for isophote in self.isophotes])
+
+    @cached_property
+    def conics(self) -> Array:
+        """(a, b, c, d, e) of each isophote's a x^2 + b x y + c y^2 + d x + e y = 1 in the basis, shape (K, 5)."""
+        C = self.frame @ np.array([isophote.cone for isophote in self.isophotes]) @ self.frame.T
+        C = C / -C[:, 2:, 2:]
+        return np.array([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]]).T
+
+    def tangents(self, points: Array) -> Array:
+        """Give the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
+        if self.camera.distortion is None:
+            return self._pinhole(points)[0]
+        along = self.frame @ self.camera.unproject(points).T
+        return np.asarray(along[:2] / along[2])
+
+    def _pinhole(self, points: Array) -> tuple[Array, Array]:
+        """Give the tangents, and the third of the coordinates that they are ratios of: a homography of the image."""
+        H = self._from_image
+        along = H[:, :2] @ points.T
+        along += H[:, 2:]
+        return along[:2] / along[2], along[2]
+
+    @cached_property
+    def _from_image(self) -> Array:
+        return np.asarray(self.frame @ np.linalg.inv(self.camera.K))
+
+    @cached_property
+    def residuals(self) -> Array:
+        """RMS distance of each isophote's points from its conic, over its mean radius, shape (K,)."""
+        F, (by_x, by_y) = self._misses
+        squares = F * F / (by_x * by_x + by_y * by_y)
+        mean = np.add.reduceat(squares, [part.start for part in self._parts]) / self._counts
+        a, b, c = self.conics.T[:3]
+        return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
+
+    def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, Top] | None = None) -> Rows:
+        """Give what the noise's standard deviation in each raw pixel moves quantities by; the noise must be known.
+
+        Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
+        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
+
+        Parameters
+        ----------
+        by_conic : ndarray, shape (K, Q, 5)
+            How each quantity moves with each isophote's conic.
+        by_level : tuple of ndarray, shape (Q,), and Top, optional
+            How it moves with all -ln t, and the top that these are over: they move with it, and against the peak's
+            pixel.
+
+        Returns
+        -------
+        ndarray of float32, shape (Q, P)
+        """
+        noise, moved = self.patch.noise, self._sensitivities
+        assert noise is not None
+        by_moment, moments = self._conics_by_crossings
+        by_crossing = np.concatenate(
+            [each @ moments[:, part] for each, part in zip(by_conic @ by_moment, self._parts, strict=True)], axis=1
+        )
+        by_peak = by_crossing @ (moved.level * np.repeat(self.isovalues, self._counts))
+        moves, pixels = [(by_crossing[:, :, None] * moved.weights).reshape(len(by_peak), -1)], [self._pixels]
+        if by_level is not None:
+            by_shift, top = by_level
+            by_peak = by_peak - by_shift / self.patch.peak_value
+            moves.append(by_shift[:, None] * top.weights)
+            pixels.append(top.pixels)
+        width, (column, row) = self.patch.values.shape[1], self.patch.peak_pixel
+        flat = np.concatenate([*pixels, np.array([row * width + column])])
+        return raw_moves(
+            flat, np.concatenate([*moves, by_peak[:, None]], axis=1), width, noise, self.patch.smoothing_px
+        )
+
+    @cached_property
+    def _counts(self) -> npt.NDArray[np.intp]:
+        """Points of each isophote, shape (K,)."""
+        return np.array([len(isophote.points) for isophote in self.isophotes])
+
+    @cached_property
+    def _parts(self) -> list[slice]:
+        """Where each isophote's points are among those of all."""
+        ends = np.cumsum(self._counts).tolist()
+        return [slice(end - count, end) for end, count in zip(ends, self._counts.tolist(), strict=True)]
+
+    @cached_property
+    def _points(self) -> Array:
+        """Points of all isophotes, shape (N, 2), px."""
+        return np.concatenate([isophote.points for isophote in self.isophotes])
+
+    @cached_property
+    def _places(self) -> Array:
+        """Their tangents, shape (2, N)."""
+        return self.tangents(self._points)
+
+    def _steps(self, vertical: Mask) -> Array:
+        """Tell how the tangents change as each point moves along its line, per px, shape (2, N)."""
+        if self.camera.distortion is None:
+            places, depth = self._pinhole(self._points)
+            along = self._from_image.take(vertical.astype(np.intp), axis=1)
+            return np.asarray((along[:2] - places * along[2]) / depth)
+        step, count = STEP_PX * np.array([~vertical, vertical]).T, len(vertical)
+        there = self.tangents(np.concatenate([self._points + step, self._points - step]))
+        return np.asarray((there[:, :count] - there[:, count:]) / (2 * STEP_PX))
+
+    @cached_property
+    def _misses(self) -> tuple[Array, Array]:
+        """What each point makes of its conic's left side less 1, shape (N,), and the gradient there, shape (2, N)."""
+        x, y = self._places
+        a, b, c, d, e = np.repeat(self.conics.T, self._counts, axis=1)
+        ax, by, bx, cy = a * x, b * y, b * x, c * y
+        return (ax + by + d) * x + (cy + e) * y - 1, np.array([2 * ax + by + d, bx + 2 * cy + e])
+
+    @cached_property
+    def _sensitivities(self) -> Sensitivities:
+        """How the points move along their lines with the patch's pixels."""
+        return self.patch.sensitivities(self.isovalues.tolist(), [isophote.cut for isophote in self.isophotes])
+
+    @cached_property
+    def _pixels(self) -> npt.NDArray[np.intp]:
+        """Places in the flattened patch of the two pixels beside each point, shape (2 N,)."""
+        pixels = self._sensitivities.pixels
+        return np.asarray(pixels[..., 1] * self.patch.values.shape[1] + pixels[..., 0]).ravel()
+
+    @cached_property
+    def _conics_by_crossings(self) -> tuple[Array, Array]:
+        moves = self._steps(self._sensitivities.vertical)
+        cut = [isophote.cut for isophote in self.isophotes]
+        return conics_by_crossings(self._places, self._misses[1], moves, self._parts, cut)

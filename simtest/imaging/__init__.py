@@ -1,1 +1,0 @@
-"""Pictures, folders and videos: reading, describing, tracking, comparing with a reference surface, exporting."""

@@ -1,0 +1,219 @@
+"""One-sided tests of "worse by more than the margin", of many places at once: a studentised mean with Student's tail.
+
+Resampling cannot reach the levels that a family of hundreds of tests asks for (1e-5 and less) with the ten or twenty
+units of a setting: signs of ten differences have 2^10 patterns. Student's tail can, and docs/gate.md has its measured
+error rates. A mean of rows is a ratio of sums over units; its variance is that of the units' residuals about it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy import stats
+
+from simtest.nightly.gate.quantities import Quantity
+from simtest.validation.statistics import CONFIDENCE
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What tests of one quantity at N places say, in its harm; NaN where there is nothing to say it from.
+
+    Parameters
+    ----------
+    n : ndarray of int, shape (N,)
+        Units; of the smaller night where they are not paired.
+    baseline, tonight : ndarray, shape (N,)
+        Means.
+    difference, low, high : ndarray, shape (N,)
+        Tonight less the baseline, and its 95 % interval.
+    margin : ndarray, shape (N,)
+        What the difference may be.
+    worse, better : ndarray, shape (N,)
+        p-values of "no worse than by the margin" and of "no better".
+    within : ndarray of bool, shape (N,)
+        Whether no pair differs by more than the margin.
+    deviation, freedom : ndarray, shape (N,)
+        Standard error of the difference and its degrees of freedom, 0 where there is no error to be had.
+    """
+
+    n: npt.NDArray[np.int64]
+    baseline: Array
+    tonight: Array
+    difference: Array
+    low: Array
+    high: Array
+    margin: Array
+    worse: Array
+    better: Array
+    within: npt.NDArray[np.bool_]
+    deviation: Array
+    freedom: Array
+
+
+def margin_of(quantity: Quantity, baseline: Array) -> Array:
+    """Give the margin at baselines: the larger of the share and the absolute one."""
+    return np.maximum(quantity.relative * baseline, quantity.absolute)
+
+
+def tail(estimate: Array, deviation: Array, freedom: Array) -> Array:
+    """Give the chance of an estimate as large or larger where its mean is 0; NaN without a degree of freedom.
+
+    Without variance what is above 0 is above it for certain, and what is not is not.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        statistic = np.where(
+            deviation > 0, estimate / deviation, np.where(estimate > 0, np.inf, np.where(estimate < 0, -np.inf, 0.0))
+        )
+    usable = freedom >= 1
+    return np.where(usable, stats.t.sf(statistic, np.where(usable, freedom, 1.0)), np.nan)
+
+
+def half_width(deviation: Array, freedom: Array) -> Array:
+    """Give half of the 95 % interval's width; NaN without a degree of freedom."""
+    usable = freedom >= 1
+    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, np.where(usable, freedom, 1.0))
+    return np.where(usable, quantile * deviation, np.nan)
+
+
+def _margins(quantity: Quantity) -> list[tuple[float, float]]:
+    """Give the share and the absolute margin; both must be exceeded."""
+    return [(quantity.relative, 0.0), (0.0, quantity.absolute)] if quantity.relative else [(0.0, quantity.absolute)]
+
+
+def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
+    """Test pairs.
+
+    Parameters
+    ----------
+    sums : polars.DataFrame
+        See `simtest.nightly.gate.pairing_units.paired_sums`; of one quantity.
+    quantity : Quantity
+        Which.
+
+    Returns
+    -------
+    Outcomes
+    """
+    s = {name: sums[name].to_numpy().astype(float) for name in sums.columns if name not in ("place", "quantity")}
+    units, rows = s["units"], s["rows"]
+    baseline, difference = s["x"] / rows, s["d"] / rows
+    margin = margin_of(quantity, baseline)
+    moments = dict(s)
+    if quantity.span:
+        # Two invented units, one that harms tonight alone and one that harmed before alone.
+        size = rows / units
+        most = quantity.span * size
+        moments |= {"units": units + 2, "rows": rows + 2 * size, "x": s["x"] + most, "nn": s["nn"] + 2 * size**2}
+        moments |= {"dd": s["dd"] + 2 * most**2, "xx": s["xx"] + most**2, "dx": s["dx"] - most**2}
+        moments["xn"] = s["xn"] + most * size
+
+    def contrast(share: float, shift: float, sign: float) -> tuple[Array, Array]:
+        """Give sign d - share x - shift, mean and standard error."""
+        m = moments
+        mean = (sign * m["d"] - share * m["x"]) / m["rows"] - shift
+        # Of the residual sign d - share x - (mean + shift) n.
+        c = mean + shift
+        squares = (
+            m["dd"] + share**2 * m["xx"] + c**2 * m["nn"]
+            - 2 * (sign * share * m["dx"] + sign * c * m["dn"] - share * c * m["xn"])
+        )  # fmt: skip
+        count = m["units"]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = np.maximum(squares, 0.0) / (count * (count - 1)) / (m["rows"] / count) ** 2
+        return mean, np.sqrt(variance)
+
+    freedom = units - 1
+    p = [
+        np.max([tail(*contrast(share, shift, sign), freedom) for share, shift in _margins(quantity)], axis=0)
+        for sign in (1.0, -1.0)
+    ]
+    centre, deviation = contrast(0.0, 0.0, 1.0)
+    half = half_width(deviation, freedom)
+    return Outcomes(
+        units.astype(np.int64), baseline, baseline + difference, difference, centre - half, centre + half, margin,
+        p[0], p[1], s["largest"] <= margin, deviation, freedom,
+    )  # fmt: skip
+
+
+def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> Outcomes:
+    """Test two nights of different seeds, versions or numbers of units by Welch's statistic.
+
+    Parameters
+    ----------
+    before, after : polars.DataFrame
+        See `simtest.nightly.gate.pairing_units.sums`; of one quantity, the same places in the same order.
+    quantity : Quantity
+        Which.
+
+    Returns
+    -------
+    Outcomes
+        `within` is false: there are no pairs.
+    """
+    x, y = (_Arm.of(table, quantity.span) for table in (before, after))
+    margin = margin_of(quantity, x.shown)
+
+    def test(worse: _Arm, better: _Arm, share_of: _Arm) -> Array:
+        """Give the p-value of the first arm's mean being above the second's by no more than the margin."""
+        found = []
+        for share, shift in _margins(quantity):
+            # The share is the baseline's, whichever arm that is.
+            a, b = (1 - share if arm is share_of and arm is worse else 1.0 for arm in (worse, better))
+            b = 1 + share if better is share_of else b
+            found.append(tail(a * worse.mean - b * better.mean - shift, *_welch(worse, better, a, b)))
+        return np.asarray(np.max(found, axis=0))
+
+    deviation, freedom = _welch(x, y, 1.0, 1.0)
+    half = half_width(deviation, freedom)
+    centre = y.mean - x.mean
+    return Outcomes(
+        np.minimum(x.units, y.units).astype(np.int64), x.shown, y.shown, y.shown - x.shown, centre - half,
+        centre + half, margin, test(y, x, x), test(x, y, x), np.zeros(len(margin), dtype=bool), deviation,
+        freedom,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """One night's means at N places: `shown` as they are, `mean` with the invented units."""
+
+    units: Array
+    shown: Array
+    mean: Array
+    variance: Array
+    freedom: Array
+
+    @classmethod
+    def of(cls, table: pl.DataFrame, span: float) -> "_Arm":
+        units, rows, x, xx, nn, xn = (
+            table[name].to_numpy().astype(float) for name in ("units", "rows", "x", "xx", "nn", "xn")
+        )
+        shown, seen = x / rows, units
+        if span:
+            # One that harms and one that does not [Agresti and Caffo 2000].
+            size = rows / units
+            most = span * size
+            x, xx, nn, xn = x + most, xx + most**2, nn + 2 * size**2, xn + most * size
+            rows, units = rows + 2 * size, units + 2
+        mean = x / rows
+        with np.errstate(divide="ignore", invalid="ignore"):
+            squares = np.maximum(xx - 2 * mean * xn + mean**2 * nn, 0.0)
+            # A constant's squares cancel to rounding.
+            squares = np.where(squares > 1e-13 * xx, squares, 0.0)
+            variance = squares / (units * (units - 1)) / (rows / units) ** 2
+        return cls(seen, shown, mean, variance, seen - 1)
+
+
+def _welch(first: _Arm, second: _Arm, a: float, b: float) -> tuple[Array, Array]:
+    """Give the standard error of a times one mean less b times the other, and its degrees of freedom."""
+    v, w = a**2 * first.variance, b**2 * second.variance
+    least = np.minimum(first.freedom, second.freedom)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = (v + w) ** 2 / (v**2 / first.freedom + w**2 / second.freedom)
+    # Without variance in both there is no ratio of variances; with one unit in one there is no variance.
+    freedom = np.where(np.isfinite(freedom) & (v + w > 0), freedom, least)
+    return np.sqrt(v + w), np.where(least >= 1, freedom, 0.0)

@@ -1,0 +1,73 @@
+"""One test over all places of an estimator: what is too small to show in ten realisations of one setting shows in many.
+
+Each place gives one number, its difference over the mean of the two nights' figures: symmetric about 0 where nothing
+changed, and never beyond 2, however heavy the errors' tails. A sum of pairs of places cannot then hang on one of them.
+"""
+
+import numpy as np
+
+from simtest.nightly.gate.contrasts import Array, Outcomes, half_width, tail
+from simtest.nightly.gate.quantities import Quantity
+
+MIN_UNITS = 5
+"""Where each place has as many units, the places' own standard errors are taken."""
+
+MIN_PLACES = 10
+"""Where not, but there are as many places, the places themselves are the sample."""
+
+MOST_SHARE = 2.0
+"""A difference over the mean of both nights is no larger."""
+
+
+def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
+    """Test many places at once.
+
+    Parameters
+    ----------
+    found : Outcomes
+        Of the places.
+    quantity : Quantity
+        Which.
+
+    Returns
+    -------
+    Outcomes
+        Of shape (1,). Relative quantities are shares of the places' own means: the baseline is 1, the margin the
+        relative one, which is the absolute margin where a mean is so small that this is the larger. p-values are NaN
+        where the places are too few, with too few units.
+    """
+    shares, deviations = found.difference, found.deviation
+    margin = quantity.relative or quantity.absolute
+    if quantity.relative:
+        scale = np.maximum((found.baseline + found.tonight) / 2, quantity.scale_floor)
+        shares, deviations = shares / scale, deviations / scale
+    mean, deviation, freedom = _mean(
+        shares, deviations, found, MOST_SHARE if quantity.relative and quantity.span else quantity.span
+    )
+    half = half_width(deviation, freedom)
+    baseline = np.ones(1) if quantity.relative else np.array([found.baseline.mean()])
+    return Outcomes(
+        np.array([int(found.n.sum())]), baseline, baseline + mean, mean, mean - half, mean + half,
+        np.array([margin]), tail(mean - margin, deviation, freedom), tail(-mean - margin, deviation, freedom),
+        np.array([bool(found.within.all())]), deviation, freedom,
+    )  # fmt: skip
+
+
+def _mean(shares: Array, deviations: Array, found: Outcomes, span: float) -> tuple[Array, Array, Array]:
+    """Give the mean over places, its standard error and degrees of freedom, each of shape (1,)."""
+    count = len(shares)
+    mean = np.array([shares.mean()])
+    if (found.n >= MIN_UNITS).all():
+        variances = deviations**2 / count**2
+        whole = variances.sum()
+        freedom = whole**2 / np.sum(variances**2 / found.freedom) if whole > 0 else float(found.freedom.min())
+        return mean, np.array([np.sqrt(whole)]), np.array([freedom])
+    if count < MIN_PLACES:
+        return mean, np.array([np.nan]), np.zeros(1)
+    residuals = shares - mean
+    if span:
+        # Two invented units, as in each place.
+        extra = span * float(np.mean(1 / found.n))
+        residuals = np.append(residuals, [extra, -extra])
+    deviation = np.sqrt(np.sum(residuals**2) / (count - 1) / count)
+    return mean, np.array([deviation]), np.array([count - 1.0])

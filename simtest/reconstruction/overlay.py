@@ -1,0 +1,128 @@
+"""The picture with its isophotes, ellipses and normals: overlay.png of `simtest reconstruct`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.pages.style import colours
+
+Image = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+SHORTEST_PX, CROWDED_PX = 900, 2000
+"""A picture whose longer side is shorter is enlarged, by a whole number, so that lines and numbers have room; the
+second where there are many."""
+
+MANY = 40
+
+ARROW_SHARE = 0.09
+"""Length of a drawn normal over the picture's larger side, for a normal across the view; less where there are many."""
+
+ISOPHOTE: Colour = (0, 235, 255)
+NUMBER: Colour = (0, 255, 255)
+FRACTION_BITS = 4
+
+
+def draw_overlay(picture: Image, spots: Sequence[dict[str, Any]], numbers: Sequence[str] | None = None) -> Bytes:
+    """Draw a picture with what was reconstructed in it, as the article does: isophote, ellipse, both normals, number.
+
+    Parameters
+    ----------
+    picture : ndarray of float32, shape (H, W) or (H, W, 3)
+        In [0, 1], as encoded, RGB.
+    spots : sequence of dict
+        Specularities as in normals.json.
+    numbers : sequence of str, optional
+        What stands beside each; default their ids.
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w, 3)
+        In OpenCV's order of channels, with a legend below.
+    """
+    height, width = picture.shape[:2]
+    wanted = CROWDED_PX if len(spots) > MANY else SHORTEST_PX
+    scale = max(1, -(-wanted // max(height, width)))
+    values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+    canvas = cv2.cvtColor(values, cv2.COLOR_GRAY2BGR if values.ndim == 2 else cv2.COLOR_RGB2BGR)
+    if scale > 1:
+        canvas = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    palette = {name: _bgr(colour) for name, colour in colours(n for s in spots for n in s["estimates"]).items()}
+    reach = ARROW_SHARE * max(width, height) * scale * min(1.0, 3 / np.sqrt(max(len(spots), 1)))
+    shown: dict[str, Colour] = {}
+    for i, spot in enumerate(spots):
+        _draw_spot(canvas, spot, palette, scale, reach, shown)
+        x, y, w, h = spot["box_px"]
+        place = (int((x + 0.75 * w) * scale), int((y + 0.25 * h) * scale))
+        _text(canvas, numbers[i] if numbers else str(spot["id"]), place, NUMBER, 0.42)
+    return np.vstack([canvas, _legend(canvas.shape[1], len(spots), shown)])
+
+
+def _draw_spot(
+    canvas: Bytes, spot: dict[str, Any], palette: dict[str, Colour], scale: int, reach: float, shown: dict[str, Colour]
+) -> None:
+    """Draw the isophote at half height, the ellipses and candidates of circle_pose, and the best normal."""
+    for name in dict.fromkeys(("circle_pose", spot["best"])):
+        result = spot["estimates"].get(name) if name else None
+        if result is None or result["status"] != "ok":
+            continue
+        colour = palette[name]
+        shown[name] = colour
+        if name == "circle_pose":
+            for isophote in result["isophotes"]:
+                _polyline(canvas, isophote["points"], ISOPHOTE, scale)
+                shown["isophote"] = ISOPHOTE
+            for curve in result["curves"]:
+                _polyline(canvas, curve, colour, scale)
+        if None not in result["look_px"]:
+            for k, normal in enumerate(result["candidates"]):
+                _arrow(canvas, result["look_px"], normal, colour, (scale, reach), 1 if k else 2)
+
+
+def _polyline(canvas: Bytes, points: Sequence[Sequence[float]], colour: Colour, scale: int) -> None:
+    if len(points) < 2:
+        return
+    # Pixel centres are at + 0.5 here, and integers in OpenCV.
+    places = np.rint((np.array(points) * scale - 0.5) * 2**FRACTION_BITS).astype(np.int32)
+    cv2.polylines(canvas, [places.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
+
+
+def _arrow(
+    canvas: Bytes, look: Sequence[float], normal: Sequence[float], colour: Colour, size: tuple[int, float], width: int
+) -> None:
+    """Draw a normal by its part across the view."""
+    scale, reach = size
+    start = np.array(look) * scale - 0.5
+    end = start + reach * np.array(normal[:2])
+    if not (np.abs([start, end]) < 2**20).all():
+        return
+    ends = [tuple(int(v) for v in np.rint(point * 2**FRACTION_BITS)) for point in (start, end)]
+    length = float(np.hypot(*(end - start)))
+    tip = min(0.25, 6 / length) if length > 0 else 0.25
+    cv2.arrowedLine(canvas, ends[0], ends[1], colour, width, cv2.LINE_AA, FRACTION_BITS, tip)
+
+
+def _text(canvas: Bytes, text: str, place: tuple[int, int], colour: Colour, size: float) -> None:
+    for shade, width in (((0, 0, 0), 3), (colour, 1)):
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
+
+
+def _legend(width: int, count: int, shown: dict[str, Colour]) -> Bytes:
+    strip = np.full((30, width, 3), 32, dtype=np.uint8)
+    what = "specularity" if count == 1 else "specularities"
+    _text(strip, f"{count} {what}", (8, 20), (255, 255, 255), 0.45)
+    x = 150
+    for name, colour in shown.items():
+        cv2.line(strip, (x, 16), (x + 18, 16), colour, 2, cv2.LINE_AA)
+        _text(strip, name, (x + 24, 20), (230, 230, 230), 0.42)
+        x += 44 + 8 * len(name)
+    return strip
+
+
+def _bgr(colour: str) -> Colour:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return blue, green, red

@@ -1,0 +1,64 @@
+"""Checks the backend by rendering a small scene in a child process."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+from simtest.rendering import backend
+
+RENDER_TIMEOUT_S = 180
+
+
+def examine(variant: str | None = None) -> dict[str, Any]:
+    """Examine the rendering backend; this process loads nothing.
+
+    Parameters
+    ----------
+    variant : str, optional
+        See `simtest.rendering.backend.requested_variant`.
+
+    Returns
+    -------
+    dict
+        JSON-ready: variant, library, candidates with verdicts, versions, can_render, and problem (one line, or None).
+    """
+    report = backend.describe(variant)
+    if report["problem"] is None:
+        report["problem"] = _try_rendering(report["variant"])
+    report["can_render"] = report["problem"] is None
+    return report
+
+
+def _try_rendering(variant: str) -> str | None:
+    """Render a plane in a child process; gives the problem, or None."""
+    command = [sys.executable, "-m", "simtest.rendering.backend_check", variant]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"rendering a small scene took more than {RENDER_TIMEOUT_S} s"
+    if child.returncode == 0:
+        return None
+    if child.returncode < 0:
+        return f"rendering a small scene ended the process (signal {-child.returncode}). To mend it: {backend.MENDING}"
+    lines = [line for line in (child.stdout + child.stderr).splitlines() if line.strip()]
+    return lines[-1] if lines else f"rendering a small scene ended with exit code {child.returncode}"
+
+
+def _main() -> int:
+    from simtest.errors import SimtestError
+    from simtest.rendering.session import Session
+    from simtest.spec import scene_from_dict
+
+    scene = scene_from_dict({"surface": {"type": "plane"}, "camera": {"width": 17, "height": 17, "fx": 17, "fy": 17}})
+    try:
+        peak = float(Session(scene, sys.argv[1]).radiance().total.max())
+    except SimtestError as error:
+        print(json.dumps(str(error))[1:-1])
+        return 1
+    # At 10 mm the peak of a Phong plane of scale 1 is 1/100.
+    return 0 if abs(peak - 0.01) < 1e-3 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

@@ -1,0 +1,112 @@
+"""From a ray tracer's hits to exact points of the smooth surface, in double precision."""
+
+from typing import Any
+
+import numpy as np
+
+from simtest.rendering.frames import Array, TruthMaps
+from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
+
+
+def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
+    """Trace rays against the rendered shape.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    scene : mitsuba.Scene
+        Holds one surface.
+    shape : Shape
+        That surface.
+    origins, directions : ndarray, shape (N, 3)
+        Model frame, mm; unit directions, NaN where there is no ray.
+
+    Returns
+    -------
+    hits : RayHits
+        Where the rays meet the shape.
+    shading, geometric : ndarray, shape (N, 3)
+        Normals of the rendered shape, model frame; NaN where the ray misses.
+    """
+    if not len(origins):
+        # Dr.Jit ends the process on a kernel without rays.
+        none = np.empty((0, 3))
+        return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
+    import drjit as dr
+
+    asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
+    # No NaN may enter the renderer.
+    ray = mi.Ray3f(
+        mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),
+        mi.Vector3f(_columns(np.where(asked[:, None], directions, [0.0, 0.0, 1.0]))),
+    )
+    preliminary = scene.ray_intersect_preliminary(ray, False, mi.Bool(asked))
+    si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(asked))
+    valid = si.is_valid()
+    normals = (mi.Vector3f(si.sh_frame.n), mi.Vector3f(si.n))
+    dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
+    missed = ~np.array(valid)
+    hits = pack_hits(
+        np.where(missed, np.nan, np.array(preliminary.t)),
+        np.array(preliminary.prim_index),
+        np.array(preliminary.prim_uv).T,
+    )
+    shading, geometric = (np.array(n, dtype=np.float64).T for n in normals)
+    if shape.kind == "mesh":
+        with np.errstate(invalid="ignore"):
+            geometric = geometric * np.where(np.einsum("ij,ij->i", geometric, directions) > 0, -1.0, 1.0)[:, None]
+    for normal in (shading, geometric):
+        normal[missed] = np.nan
+    return hits, shading, geometric
+
+
+def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
+    """Make `RayHits` from single-precision values, shapes (N,), (N,) and (N, 2); a NaN distance is a miss."""
+    missed = np.isnan(distance)
+    # What a miss left in its place may be no number: it is dropped before it is converted.
+    return RayHits(
+        np.where(missed, np.float32(np.inf), distance).astype(np.float64),
+        np.where(missed, 0, face).astype(np.int64),
+        np.where(missed[:, None], np.float32(0), barycentric).astype(np.float64),
+    )
+
+
+def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+    """Give the exact points on rays of the model frame, shape (N, 3), in the camera frame."""
+    exact = surface.points(np.asarray(origins), directions, hits)
+    rotation = surface.model_from_camera[:3, :3]
+    return SurfacePoints(
+        distance=exact.distance,
+        position=(exact.position - surface.model_from_camera[:3, 3]) @ rotation,
+        normal=exact.normal @ rotation,
+        k_min=exact.k_min,
+        k_max=exact.k_max,
+        direction_min=exact.direction_min @ rotation,
+        direction_max=exact.direction_max @ rotation,
+        valid=exact.valid,
+    )
+
+
+def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tuple[int, int]) -> TruthMaps:
+    """Arrange points and the renderer's normals, all of H W rays in the camera frame, as maps of `size` (H, W)."""
+
+    def image(values: Array) -> Array:
+        return values.reshape(*size, *values.shape[1:])
+
+    return TruthMaps(
+        depth=image(points.distance),
+        position=image(points.position),
+        normal=image(points.normal),
+        shading_normal=image(shading),
+        geometric_normal=image(geometric),
+        k_min=image(points.k_min),
+        k_max=image(points.k_max),
+        direction_min=image(points.direction_min),
+        direction_max=image(points.direction_max),
+        mask=points.valid.reshape(size),
+    )
+
+
+def _columns(values: Array) -> Any:
+    return np.ascontiguousarray(values.T, dtype=np.float32)

@@ -1,0 +1,244 @@
+"""A scene as a Mitsuba XML file with its mesh, that Mitsuba itself loads and renders to the same picture."""
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.rendering import backend, phong
+from simtest.rendering.frames import Array
+from simtest.rendering.materials import bsdf_dict
+from simtest.rendering.shapes import make_shape
+from simtest.runtime import provenance
+from simtest.runtime.files import make_folder, write_atomically
+from simtest.spec import Scene
+from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.toml_input import Spec
+from simtest.surfaces import Shape, SurfaceModel, make_surface
+
+SCENE_FILE, MESH_FILE = "scene.xml", "surface.ply"
+
+SAMPLES = 64
+"""Samples a pixel where a single ray through its centre cannot do: several lights, or light that bounces."""
+
+MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Mitsuba's cameras look along z too, but with x to the left and y up."""
+
+CLIP = (1e-4, 1e4)
+"""Nearest and farthest distance that is rendered, over the surface's own scale."""
+
+VIEW_MARGIN = 1.05
+"""Half-size of an exported plane over the farthest point that is seen of it."""
+
+_CAMERA_KEYS = frozenset({"width", "height", "fx", "fy", "cx", "cy", "skew"})
+# A preset's lights stand in `lights`; the seed draws the places that are rendered.
+_RIG_KEYS = frozenset(
+    {"lights", "preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each", "seed", "emission_known"}
+)
+_LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "direction", "position_error_mm"})
+
+
+def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
+    """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply.
+
+    The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) has no place in it.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    out : Path
+        Folder, made if need be.
+    variant : str, optional
+        Mitsuba variant that parses the scene; the files are the same for all.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    InputError
+        If the camera or a light has what Mitsuba cannot express, the surface's file is malformed, or the folder cannot
+        be written.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    for key, value, why in _inexpressible(scene):
+        raise InputError(f"scene {scene.name}: {key} = {value!r}: cannot be exported; {why}")
+    mi = backend.load(variant)
+    plugin = phong.register(mi, str(mi.variant()))
+    surface = make_surface(scene.surface)
+    shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
+    text = _xml(mi, scene, surface, shape, plugin)
+    make_folder(out)
+    files = [out / SCENE_FILE]
+    try:
+        if shape.mesh:
+            files.append(out / MESH_FILE)
+            mesh = make_shape(mi, shape, {"type": "diffuse"})
+            write_atomically(files[1], lambda part: mesh.write_ply(str(part)))
+        write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
+    except (OSError, RuntimeError) as error:
+        cause = getattr(error, "strerror", None) or error
+        raise InputError(f"--out {out}: cannot be written ({cause})") from error
+    return files
+
+
+def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
+    """Give the keys, values and reasons of what Mitsuba's perspective camera and point lights cannot do."""
+    camera = scene.camera
+    if camera.fx != camera.fy:
+        yield "camera.fx", camera.fx, f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
+    if camera.skew != 0:
+        yield "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"
+    yield from _beyond(camera, _CAMERA_KEYS, "camera", "Mitsuba's perspective camera")
+    yield from _beyond(scene.rig, _RIG_KEYS, "rig", "Mitsuba's point light")
+    for i, light in enumerate(scene.rig.lights):
+        yield from _beyond(light, _LIGHT_KEYS, f"rig.lights.{i}", "Mitsuba's point light")
+
+
+def _beyond(spec: Spec, known: frozenset[str], path: str, what: str) -> Iterator[tuple[str, Any, str]]:
+    """Give what a part of the scene sets beyond the keys that are exported: refused rather than left out."""
+    for name, field in type(spec).model_fields.items():
+        default = field.get_default(call_default_factory=True, validated_data={})
+        value = getattr(spec, name)
+        if name not in known and value != default:
+            yield (
+                f"{path}.{name}",
+                value,
+                f"{what} does not know it: must be {'left out' if default is None else repr(default)}",
+            )
+
+
+def _cut_to_view(shape: Shape, surface: SurfaceModel, camera: Camera) -> Shape:
+    """Cut a plane to what the camera sees, where that is finite.
+
+    Mitsuba interpolates the hit between the rectangle's corners. Those of simtest's plane lie so far out that a per
+    mille of the radiance would be lost; a plane neither shades nor lights itself, so the rest is not missed.
+    """
+    if shape.kind != "plane":
+        return shape
+    pose = surface.model_from_camera
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
+    directions = camera.unproject(corners) @ pose[:3, :3].T
+    if (directions[:, 2] >= 0).any():
+        return shape
+    seen = pose[:2, 3] - pose[2, 3] / directions[:, 2:] * directions[:, :2]
+    whole = shape.parameters["to_model"]
+    reach = min(VIEW_MARGIN * float(np.abs(seen).max()), whole[0, 0])
+    return replace(shape, parameters={"to_model": np.diag([reach, reach, 1.0, 1.0])})
+
+
+def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> dict[str, Any]:
+    camera = scene.camera.model()
+    if shape.mesh:
+        scale = float(np.linalg.norm(np.ptp(shape.mesh.vertices, axis=0)))
+    else:
+        scale = float(np.linalg.norm(surface.model_from_camera[:3, 3]))
+    near, far = (scale * share for share in CLIP)
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": math.degrees(2 * math.atan(camera.width / (2 * camera.fx))),
+        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
+        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
+        "near_clip": near,
+        "far_clip": far,
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": _sampler(scene),
+    }
+
+
+def _through_centres(scene: Scene) -> bool:
+    """Tell whether one ray through each pixel's centre gives the picture: with one light that does not bounce."""
+    effort = scene.render
+    return effort.samples_per_pixel == 1 and effort.path_depth == 2 and len(scene.rig.lights) == 1
+
+
+def _sampler(scene: Scene) -> dict[str, Any]:
+    if _through_centres(scene):
+        # One stratum without jitter: the ray through the pixel's centre.
+        return {"type": "stratified", "sample_count": 1, "jitter": False}
+    samples = scene.render.samples_per_pixel
+    return {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": scene.render.seed}
+
+
+def _lights(scene: Scene, surface: SurfaceModel) -> dict[str, Any]:
+    pose = surface.model_from_camera
+    return {
+        f"light_{i}": {
+            "type": "point",
+            "position": (pose[:3, :3] @ place + pose[:3, 3]).tolist(),
+            "intensity": {"type": "uniform", "value": light.power},
+        }
+        for i, (light, place) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
+    }
+
+
+def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
+    bsdf = bsdf_dict(scene.reflectance, plugin, diffuse_only=False)
+    effort = scene.render
+    described = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": effort.path_depth, "rr_depth": effort.path_depth},
+        "sensor": _sensor(scene, surface, shape),
+        "surface": {"type": "ply", "filename": MESH_FILE, "bsdf": bsdf} if shape.mesh else make_shape(mi, shape, bsdf),
+        **_lights(scene, surface),
+    }
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
+    for node in state.nodes:
+        if node.props.plugin_name() == plugin:
+            # Mitsuba does not know what a plugin written in Python is.
+            node.type = mi.ObjectType.BSDF
+    written = mi.parser.write_string(state, add_section_headers=True)
+    root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    _place(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
+    if not shape.mesh:
+        _place(root, "shape", shape.parameters["to_model"])
+    root.insert(0, ET.Comment(_head(scene)))
+    ET.indent(root, " " * 4)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _place(root: ET.Element, tag: str, world_from_local: Array) -> None:
+    """Give an object its transform as a matrix: Mitsuba's writer decomposes it, wrongly where it is anisotropic."""
+    element = root.find(tag)
+    assert element is not None
+    for written in element.findall("transform"):
+        element.remove(written)
+    transform = ET.Element("transform", name="to_world")
+    ET.SubElement(transform, "matrix", value=" ".join(repr(float(x)) for x in world_from_local.ravel()))
+    element.insert(0, transform)
+
+
+def _head(scene: Scene) -> str:
+    """Give the comment at the file's head; XML allows no two hyphens in a row there."""
+    lines = [
+        f'Scene "{scene.name}", written by simtest {provenance.version()}. World: model frame of the surface, mm.',
+        "Without the sensor: no noise, no exposure, linear radiance.",
+    ]
+    if isinstance(scene.reflectance, PhongReflectance):
+        lines += [
+            f'The reflectance "{phong.PLUGIN}" is a plugin of simtest. After mitsuba.set_variant and before loading:',
+            "    from simtest.rendering.plugins import register; register()",
+        ]
+    if _through_centres(scene):
+        lines.append("One ray through each pixel's centre: a sampler of one stratum without jitter.")
+    elif scene.render.samples_per_pixel == 1:
+        lines.append(f"simtest sends one ray through each pixel's centre; here {SAMPLES} spread over the pixel.")
+    return "\n" + "\n".join(f"        {re.sub('-(?=-)', '- ', line)}" for line in lines) + "\n    "

@@ -1,0 +1,175 @@
+"""Draws the 3D view, in a process of its own: VTK takes the whole process with it where there is no way to draw.
+
+python -m simtest.report.viewer.window CONTENT.npz [SCREENSHOT.png]
+"""
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from simtest.errors import InputError
+from simtest.report.viewer.content import Content
+from simtest.runtime.files import write_atomically
+
+OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+"""VTK's ways to draw without a display: libegl1, libosmesa6."""
+
+TIMEOUT_S = 180
+SIZE = (1280, 800)
+COLOURS = {"circle_pose": "#d95f02", "brightest_point": "#7570b3", "cone_axis": "#1b9e77"}
+OTHER = "#666666"
+TRUE = "black"
+LIGHT = "#f2c500"
+DONE = "simtest view: drawn"
+
+
+def check_target(path: Path | None) -> None:
+    """Raise `InputError` where it is plain before anything is rendered that a PNG, or a window, cannot be had."""
+    if path is None:
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise InputError("no display (DISPLAY is not set); --screenshot FILE draws without one")
+        return
+    if path.suffix.lower() != ".png":
+        raise InputError(f"--screenshot {path}: suffix {path.suffix!r}; must be .png")
+    if not path.parent.is_dir():
+        raise InputError(f"--screenshot {path}: no such folder")
+
+
+def save_screenshot(content: Content, path: Path) -> None:
+    """Draw to a PNG without a display.
+
+    Raises
+    ------
+    InputError
+        If the suffix is not .png, the file cannot be written, or this machine has no way to draw off-screen.
+    """
+    check_target(path)
+    said = ""
+    with tempfile.TemporaryDirectory() as folder:
+        stored = Path(folder) / "content.npz"
+        picture = Path(folder) / "view.png"
+        content.save(stored)
+        for window in OFF_SCREEN:
+            done, said = _draw([str(stored), str(picture)], {"VTK_DEFAULT_OPENGL_WINDOW": window}, TIMEOUT_S)
+            if done and picture.is_file():
+                try:
+                    write_atomically(path, functools.partial(shutil.copyfile, picture))
+                except OSError as error:
+                    raise InputError(f"--screenshot {path}: cannot be written ({error.strerror})") from error
+                return
+    raise InputError(
+        "--screenshot: nothing here draws without a display; install libegl1 (with libgl1-mesa-dri) or libosmesa6"
+        f" ({said})"
+    )
+
+
+def show(content: Content) -> None:
+    """Open a window and wait until it is closed.
+
+    Raises
+    ------
+    InputError
+        If no window can be opened.
+    """
+    check_target(None)
+    with tempfile.TemporaryDirectory() as folder:
+        stored = Path(folder) / "content.npz"
+        content.save(stored)
+        done, said = _draw([str(stored)], {}, None)
+    if not done:
+        raise InputError(f"no window could be opened ({said}); --screenshot FILE draws without a display")
+
+
+def _draw(arguments: list[str], environment: dict[str, str], timeout: float | None) -> tuple[bool, str]:
+    """Run the drawing process; gives whether it ended well, and else the last it said."""
+    command = [sys.executable, "-m", "simtest.report.viewer.window", *arguments]
+    # The child finds the same simtest as this process, wherever that was started.
+    here = str(Path(__file__).resolve().parents[3])
+    path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
+    surroundings = {**os.environ, **environment, "PYTHONPATH": path}
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, env=surroundings, timeout=timeout)
+    except subprocess.TimeoutExpired:
+        return False, f"no answer within {timeout} s"
+    lines = (child.stderr + child.stdout).strip().splitlines()
+    said = lines[-1] if lines else f"exit code {child.returncode}"
+    return child.returncode == 0 and DONE in child.stdout, said
+
+
+def _plot(content: Content, screenshot: str | None) -> None:
+    """Draw; in this process."""
+    import numpy as np
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=screenshot is not None, window_size=SIZE)
+    plotter.set_background("white")
+    faces = np.column_stack([np.full(len(content.faces), 3), content.faces]).ravel()
+    surface = pyvista.PolyData(content.vertices, faces)
+    surface["curvature"] = content.curvature
+    # A few sharp edges must not take all the colours.
+    limit = max(float(np.quantile(np.abs(content.curvature[np.isfinite(content.curvature)]), 0.97)), 1e-4)
+    plotter.add_mesh(
+        surface, scalars="curvature", cmap="RdBu_r", clim=(-limit, limit), nan_color="grey", smooth_shading=True,
+        ambient=0.8, diffuse=0.2,
+        scalar_bar_args={"title": "curvature of larger size (1/mm), convex positive", "color": "black",
+                         "vertical": False, "fmt": "%.3g", "n_labels": 5, "title_font_size": 18, "label_font_size": 15,
+                         "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25,
+                         "position_y": 0.02},
+    )  # fmt: skip
+    near = float(np.quantile(np.linalg.norm(content.vertices, axis=1), 0.05))
+    reach = 0.35 * float(np.median(np.linalg.norm(content.vertices, axis=1)))
+    _add_camera(plotter, content, 0.5 * near)
+    plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
+    legend: list[tuple[str, str]] = [("camera", "black"), ("light", LIGHT)]
+    if len(content.places):
+        legend.append(("true normal", TRUE))
+    for place, normal in zip(content.places, content.normals, strict=True):
+        # Longer than the estimates', so that it shows where they lie on it.
+        plotter.add_mesh(pyvista.Line(place, place + 1.3 * reach * normal), color=TRUE, line_width=3)
+    for name, look, normal in zip(content.estimator, content.looks, content.estimates, strict=True):
+        colour = COLOURS.get(str(name), OTHER)
+        plotter.add_mesh(pyvista.Line(look, look + reach * normal), color=colour, line_width=6)
+        if (str(name), colour) not in legend:
+            legend.append((str(name), colour))
+    plotter.add_legend([list(entry) for entry in legend], bcolor="white", border=True, size=(0.16, 0.032 * len(legend)))
+    _place_viewer(plotter, content)
+    if screenshot is None:
+        plotter.show(title="simtest view")
+    else:
+        plotter.screenshot(screenshot)
+    plotter.close()
+
+
+def _add_camera(plotter: object, content: Content, reach: float) -> None:
+    """Add the camera's frustum as lines: to the corners of the image and around it."""
+    import pyvista
+
+    corners = reach * content.frustum / content.frustum[:, 2:3]
+    for i, corner in enumerate(corners):
+        for end in ((0.0, 0.0, 0.0), corners[(i + 1) % 4]):
+            plotter.add_mesh(pyvista.Line(end, corner), color="black", line_width=2)  # type: ignore[attr-defined]
+
+
+def _place_viewer(plotter: object, content: Content) -> None:
+    """Look from behind the camera and above it, at a place between it and the middle of what it sees."""
+    import numpy as np
+
+    middle = np.median(content.vertices, axis=0)
+    size = float(np.linalg.norm(middle))
+    place, target = (1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist()
+    plotter.camera_position = [place, target, (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
+    plotter.reset_camera_clipping_range()  # type: ignore[attr-defined]
+
+
+def main() -> None:
+    """Draw what the arguments name."""
+    _plot(Content.load(Path(sys.argv[1])), sys.argv[2] if len(sys.argv) > 2 else None)
+    print(DONE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Writing files so that a reader never meets half of one."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
+
+
+def refuse_file(folder: Path) -> None:
+    """Raise `InputError` where a folder for results is wanted and a file stands."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results; raise `InputError` where that cannot be."""
+    refuse_file(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
+
+
+def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file under a temporary name, flush it to disk, then rename it into place.
+
+    Parameters
+    ----------
+    path : Path
+        The final file.
+    write : callable
+        Writes to the path it is given, which has the final file's suffix.
+    """
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        write(part)
+        with part.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's list of files to disk: a rename into it then outlasts a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_json(path: Path, value: Any, compact: bool = False) -> None:
+    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none."""
+    how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
+    text = json.dumps(value, allow_nan=False, **how) + "\n"
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

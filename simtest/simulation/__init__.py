@@ -1,0 +1,1 @@
+"""A labelled frame: a rendering session, the camera chain, true highlights and viewpoints."""

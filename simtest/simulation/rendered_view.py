@@ -1,0 +1,112 @@
+"""A rendered scene with its judged truth, exposed and ready for the camera's noise."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.calibration import Calibration, NoiseModel
+from simtest.rendering import Radiance, Session, TrueHighlight
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.true_highlights import JudgedHighlight, judge
+from simtest.spec import Scene
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+LEAST_SHARE = 1e-12
+"""A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered scene with its judged truth: what all noise realisations of a fixed scene share.
+
+    Parameters
+    ----------
+    scene : Scene
+        What was rendered.
+    radiance : Radiance
+        Noise-free, before the lens.
+    light : ndarray of float32, shape (H, W) or (H, W, 3)
+        Noise-free radiance behind the lens: what reaches the sensor.
+    truths : list of JudgedHighlight
+        All true highlights, those included that do not count.
+    full_scale : float
+        Radiance behind the lens that becomes 1 (`Exposure`); 0 where no light reaches the sensor.
+    calibration : Calibration
+        What reconstruction is told.
+    """
+
+    scene: Scene
+    radiance: Radiance
+    light: Image
+    truths: list[JudgedHighlight]
+    full_scale: float
+    calibration: Calibration
+
+    def frame(self, seed: int) -> Image:
+        """Give the sensor's frame with the noise of a seed."""
+        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed))
+
+
+def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> View:
+    """Render a scene and judge its true highlights.
+
+    Parameters
+    ----------
+    session : Session
+        Is moved to the scene.
+    scene : Scene
+        The scene.
+    radiance : Radiance, optional
+        Of the scene, where it is rendered already.
+
+    Returns
+    -------
+    View
+    """
+    session.update(scene)
+    if radiance is None:
+        radiance = session.radiance()
+    light = collect(radiance.total, scene.sensor, session.camera)
+    mean = light if light.ndim == 2 else light.mean(axis=2, dtype=np.float32)
+    highlights, seen = session.highlights(radiance), session.camera.seen
+    full_scale = _full_scale(scene, mean, highlights, seen)
+    # Noise is independent in each channel; estimators see the channels' mean.
+    truths = judge(highlights, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
+    nearest = max((t.highlight for t in truths if t.highlight.lit), key=lambda h: h.radiance, default=None)
+    told = scene.calibration(None if nearest is None else nearest.distance)
+    return View(scene, radiance, light, truths, full_scale, told)
+
+
+def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], seen: Mask | None) -> float:
+    """Give the radiance that becomes 1; 0, with a warning, where there is no light at all."""
+    exposure, peak = scene.sensor.exposure, float(light.max())
+    if peak <= 0:
+        warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=3)
+        return 0.0
+    if exposure.full_scale is not None:
+        radiance = exposure.full_scale
+    elif exposure.percentile is not None:
+        radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))
+        if radiance <= LEAST_SHARE * peak:
+            warnings.warn(
+                f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is "
+                f"{radiance:g}, {LEAST_SHARE:g} of its maximum or less; the frame's maximum becomes full scale",
+                stacklevel=3,
+            )
+            radiance = peak
+    else:
+        # Which highlights are isolated is judged without noise first.
+        isolated = [j.highlight.bp_px for j in judge(highlights, light, NoiseModel(), peak, 1, seen) if j.isolated]
+        radiance = max((_nearest(light, place) for place in isolated), default=peak)
+    return radiance / exposure.gain
+
+
+def _nearest(light: Image, place: npt.NDArray[np.float64]) -> float:
+    """Give the light at the pixel that a place, px, lies in."""
+    column, row = (min(int(v), size - 1) for v, size in zip(place, light.shape[::-1], strict=True))
+    return float(light[row, column])

@@ -1,0 +1,91 @@
+"""Pictures of views: one each, a sheet of all of them, and a film of a sequence."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+from simtest.runtime.files import write_atomically
+from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.labelled_frame import encoded_png
+from simtest.simulation.rendered_view import View
+
+FRAMES_PER_SECOND = 25.0
+SHEET_WIDTH = 1600
+SHEET_COLUMNS = 10
+
+Picture = npt.NDArray[np.uint8]
+
+
+class ViewWriter:
+    """Writes views as they come.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists. Pictures of an earlier call go.
+    film : bool
+        Write film.avi too.
+    """
+
+    def __init__(self, folder: Path, film: bool) -> None:
+        self._folder = folder
+        self._thumbnails: list[Picture] = []
+        self._film: Any = None
+        self._wanted = film
+        for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / "film.avi"):
+            old.unlink(missing_ok=True)
+
+    def add(self, seen: View) -> dict[str, Any]:
+        """Write the frame of a view; gives what views.json says of it.
+
+        Each has noise of its own, of seeds that count on from the scene's: a film's noise must not stand still.
+        """
+        seed = seen.scene.sensor.seed + len(self._thumbnails)
+        frame = seen.frame(seed)
+        name = f"view_{len(self._thumbnails):04d}.png"
+        data = encoded_png(frame, seen.scene.sensor)
+        write_atomically(self._folder / name, lambda part: part.write_bytes(data))
+        shown = to_uint8(seen.scene.sensor.response.model().decode(frame).astype(np.float32))
+        shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
+        if self._wanted:
+            self._write(shown)
+        width = SHEET_WIDTH // SHEET_COLUMNS
+        small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
+        self._thumbnails.append(np.asarray(small, dtype=np.uint8))
+        return {"picture": name, "sensor.seed": seed}
+
+    def _write(self, picture: Picture) -> None:
+        if self._film is None:
+            # Motion JPEG is the codec that OpenCV writes everywhere.
+            file, codec = str(self._folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG")
+            self._film = cv2.VideoWriter(file, codec, FRAMES_PER_SECOND, (picture.shape[1], picture.shape[0]))
+            if not self._film.isOpened():
+                raise InputError(f"{file}: no film can be written here (OpenCV has no Motion JPEG)")
+        self._film.write(picture)
+
+    def close(self) -> list[Path]:
+        """Write what is left; gives sheet.png and film.avi, those of them that there are."""
+        if self._film is not None:
+            self._film.release()
+        if self._thumbnails:
+            ok, data = cv2.imencode(".png", _sheet(self._thumbnails))
+            assert ok
+            write_atomically(self._folder / "sheet.png", lambda part: part.write_bytes(bytes(data)))
+        return [file for name in ("sheet.png", "film.avi") if (file := self._folder / name).is_file()]
+
+
+def _sheet(pictures: list[Picture]) -> Picture:
+    """Arrange pictures of one size in rows, in order."""
+    height, width = pictures[0].shape[:2]
+    columns = min(SHEET_COLUMNS, len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    sheet = np.zeros((rows * height, columns * width, 3), dtype=np.uint8)
+    for i, picture in enumerate(pictures):
+        row, column = divmod(i, columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
+    return sheet

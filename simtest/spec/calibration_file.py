@@ -1,0 +1,110 @@
+"""Calibration files: a camera with its response, vignetting, emission and noise."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from simtest.calibration import Calibration, Known, NoiseModel, Response
+from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
+from simtest.spec.falloff import CosineProfile, Profile
+from simtest.spec.ranges import Coordinate, Millimetres
+from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
+from simtest.spec.toml_input import Spec, read_toml, validate
+
+
+class SensorCalibration(Spec):
+    """What is known of the sensor's noise and range."""
+
+    full_well: FullWell | None = Field(None, description="electrons at full scale")
+    read_noise: ReadNoise = Field(0.0, description="standard deviation, electrons")
+    bits: Bits | None = Field(None, description="of the values")
+    saturation_level: float | None = Field(
+        None, gt=0, le=1e6, description="value, share of the largest, at and above which a pixel counts as clipped"
+    )
+
+    @model_validator(mode="after")
+    def _electrons(self) -> "SensorCalibration":
+        check_electrons(self.full_well, self.read_noise)
+        return self
+
+
+class RigCalibration(Spec):
+    """What is known of the lights and of the working distance."""
+
+    lights_mm: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(
+        (), max_length=32, description="places of the lights, camera frame, mm; default not known"
+    )
+    distance_mm: Millimetres | None = Field(
+        None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
+    )
+    distance_sd_mm: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the true distance, mm")
+
+    @model_validator(mode="after")
+    def _about_a_distance(self) -> "RigCalibration":
+        if self.distance_sd_mm > 0 and self.distance_mm is None:
+            raise ValueError(f"distance_sd_mm = {self.distance_sd_mm:g}: needs distance_mm")
+        return self
+
+
+class SurfaceCalibration(Spec):
+    """What is known of the surface's lobe."""
+
+    phong_exponent: float | None = Field(None, gt=0, le=1e5, description="roughness exponent n; default not known")
+
+
+class CalibrationSpec(Spec):
+    """A calibration file; all tables but the camera may be left out."""
+
+    camera: CameraSpec
+    response: ResponseSpec | None = Field(None, description="how light became values; default: not stated")
+    vignetting: Profile = Field(
+        CosineProfile(), description="share of the light that the lens passes, over the angle from the optical axis"
+    )
+    emission: Profile = Field(
+        CosineProfile(), description="of a light at the camera, shining along the optical axis, over the same angle"
+    )
+    sensor: SensorCalibration = SensorCalibration()
+    rig: RigCalibration = RigCalibration()
+    surface: SurfaceCalibration = SurfaceCalibration()
+
+    def known(self) -> Known:
+        """Give what estimators are told of lights, distance and lobe."""
+        exponent = self.surface.phong_exponent
+        lobe = None if exponent is None else PhongReflectance(exponent=exponent).lobe_curvature
+        return Known(self.rig.lights_mm, self.rig.distance_mm, self.rig.distance_sd_mm, lobe)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration file, or a camera file.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level, under any name
+        that is not by its suffix a file of OpenCV, ROS or MATLAB; or anything else that `load_camera` reads.
+
+    Returns
+    -------
+    Calibration
+        What the file does not state is unknown: no response, no falloff, no noise model.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed.
+    """
+    path = Path(path)
+    camera = load_camera(path)
+    data = read_toml(path) if is_toml(path) else {}
+    if not isinstance(data.get("camera"), Mapping):
+        # The camera's keys stand at top level, before the other tables.
+        data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
+    # The camera's own table has been read, by its own rules.
+    spec = validate(CalibrationSpec, {**data, "camera": {}}, str(path))
+    response = spec.response.model() if spec.response is not None else None
+    sensor = spec.sensor
+    noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
+    falloff = (spec.vignetting.model(), spec.emission.model())
+    return Calibration(camera, response, *falloff, noise, sensor.saturation_level, spec.known())

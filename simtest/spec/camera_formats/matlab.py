@@ -1,0 +1,106 @@
+"""Camera files of MATLAB: structs of cameraParameters, saved in a .mat file of version 7 or older.
+
+MATLAB counts the centre of the first pixel as (1, 1), simtest as (0.5, 0.5): the principal point loses half a pixel.
+"""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
+
+MAX_BYTES = 50_000_000
+HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
+
+
+def read_matlab(path: Path) -> dict[str, Any]:
+    """Read a calibration of MATLAB as the table of a `CameraSpec`.
+
+    Parameters
+    ----------
+    path : Path
+        A .mat file that holds one struct with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
+        RadialDistortion and TangentialDistortion; the struct's own name is free.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        If the file is missing, malformed, of version 7.3, or holds a cameraParameters object in place of a struct.
+    """
+    where, fields = shown(path), _struct(path)
+    if "MappingCoefficients" in fields:
+        raise InputError(f"{where}: MappingCoefficients: MATLAB's fisheye model is not known; must be cameraParameters")
+    if "K" in fields:
+        matrix = _array(fields, "K", 9, where).reshape(3, 3)
+    else:
+        matrix = _array(fields, "IntrinsicMatrix", 9, where).reshape(3, 3).T
+    if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
+    height, width = _array(fields, "ImageSize", 2, where).tolist()
+    radial = _array(fields, "RadialDistortion", (2, 3), where).tolist()
+    tangential = _array(fields, "TangentialDistortion", 2, where).tolist()
+    lens = dict(zip(("k1", "k2", "k3", "p1", "p2"), [*radial, 0.0][:3] + tangential, strict=True))
+    return {
+        "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
+        "cx": float(matrix[0, 2]) - PIXEL_CENTRE, "cy": float(matrix[1, 2]) - PIXEL_CENTRE,
+        "skew": float(matrix[0, 1]),
+        "distortion": {"type": "brown_conrady", **lens} if any(lens.values()) else None,
+    }  # fmt: skip
+
+
+def _struct(path: Path) -> Mapping[str, Any]:
+    """Give the fields of the one struct in the file that is a calibration."""
+    where = shown(path)
+    try:
+        if not path.is_file():
+            raise InputError(f"{where}: no such file; a .mat file is needed")
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{where}: {path.stat().st_size} bytes; at most {MAX_BYTES} are allowed")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of variables that are no calibration
+            data = loadmat(str(path), simplify_cells=True)
+    except InputError:
+        raise
+    except NotImplementedError as error:
+        raise InputError(f"{where}: MATLAB 7.3 files (HDF5) are not read; {HOW}") from error
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:
+        # SciPy raises whatever its parser runs into.
+        raise InputError(f"{where}: no MATLAB file, or a damaged one ({type(error).__name__})") from error
+    found = {name: value for name, value in {"": data, **data}.items() if _is_calibration(value)}
+    if len(found) == 1:
+        return next(iter(found.values()))
+    if len(found) > 1:
+        raise InputError(f"{where}: holds {len(found)} calibrations ({', '.join(found)}); must be one")
+    if any(isinstance(value, MatlabOpaque | MatlabObject | MatlabFunction) for value in data.values()):
+        raise InputError(f"{where}: holds an object, which only MATLAB can read; {HOW}")
+    names = [name for name in data if not name.startswith("__")]
+    raise InputError(f"{where}: holds no struct with IntrinsicMatrix or K (but {shown(names, 80)}); {HOW}")
+
+
+def _is_calibration(value: Any) -> bool:
+    return isinstance(value, Mapping) and bool({"IntrinsicMatrix", "K", "MappingCoefficients"} & set(value))
+
+
+def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], where: str) -> Any:
+    """Give a field as numbers in row order."""
+    allowed = (counts,) if isinstance(counts, int) else counts
+    if name not in fields:
+        raise InputError(f"{where}: {name}: missing; {HOW}")
+    value = np.asarray(fields[name])
+    if value.dtype.kind not in "iuf" or value.size not in allowed:
+        said = " or ".join(str(count) for count in allowed)
+        raise InputError(f"{where}: {name} = {shown(repr(fields[name]), 80)}: must be {said} numbers")
+    return value.astype(float).ravel()

@@ -1,0 +1,289 @@
+"""Camera files of OpenCV (FileStorage: YAML, XML, JSON) and ROS (camera_info), read and written.
+
+Both count the centre of the first pixel as (0, 0), simtest as (0.5, 0.5): the principal point gains half a pixel on
+import and loses it on export.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.runtime.resources import shown
+from simtest.spec.camera_formats.plain_yaml import parse_yaml
+from simtest.spec.toml_input import read_text
+
+MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "mtx", "K", "k")
+LENS_NAMES = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "dist", "D", "d")
+WIDTH_NAMES = ("image_width", "image_Width", "imageWidth", "width")
+HEIGHT_NAMES = ("image_height", "image_Height", "imageHeight", "height")
+SIZE_NAMES = ("image_size", "imageSize", "image_resolution")
+
+MODELS = {
+    "plumb_bob": False, "radtan": False, "brown_conrady": False, "rational_polynomial": False,
+    "equidistant": True, "fisheye": True, "kannala_brandt": True,
+}  # fmt: skip
+"""Names of lens models, and whether each is a fisheye."""
+
+BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
+"""Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor."""
+
+
+def read_opencv(path: Path) -> dict[str, Any]:
+    """Read a calibration of OpenCV or ROS as the table of a `CameraSpec`.
+
+    Parameters
+    ----------
+    path : Path
+        .yml, .yaml, .xml or .json.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        If the file is missing, malformed, or holds a lens that simtest does not know.
+    """
+    data, where = _parse(path), shown(path)
+    width, height = _size(data, where)
+    name, given = _one_of(data, MATRIX_NAMES, where)
+    if name is None:
+        raise InputError(f"{where}: camera_matrix: missing; allowed names: {', '.join(MATRIX_NAMES)}")
+    matrix = np.array(_numbers(given, where, name, (9,))).reshape(3, 3)
+    if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        raise InputError(f"{where}: {name} = {matrix.tolist()}: must be upper triangular with 1 in its last corner")
+    _check_whole(data, where)
+    table = {
+        "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
+        "cx": float(matrix[0, 2]) + PIXEL_CENTRE, "cy": float(matrix[1, 2]) + PIXEL_CENTRE,
+        "skew": float(matrix[0, 1]), "distortion": _lens(data, where),
+    }  # fmt: skip
+    if "view_mask" in data:
+        cx, cy, radius = _numbers(data["view_mask"], where, "view_mask", (3,))
+        table["view_mask"] = {"cx": cx + PIXEL_CENTRE, "cy": cy + PIXEL_CENTRE, "radius": radius}
+    return table
+
+
+def _parse(path: Path) -> Mapping[str, Any]:
+    """Read a file's keys into plain dicts, lists, numbers and text."""
+    text, where = read_text(path, "camera"), shown(path)
+    kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower(), "YAML")
+    try:
+        data = {"JSON": _parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
+    except RecursionError:
+        raise InputError(f"{where}: not valid {kind}: nested too deeply") from None
+    except (ValueError, ElementTree.ParseError) as error:
+        raise InputError(f"{where}: not valid {kind}: {shown(error, 80)}") from error
+    if not isinstance(data, Mapping) or not data:
+        raise InputError(f"{where}: holds no keys; must be a calibration of OpenCV or ROS")
+    return data
+
+
+def _parse_json(text: str) -> Any:
+    # OpenCV has long written 1. for 1.0, which is no JSON.
+    return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
+
+
+def _parse_xml(text: str) -> Any:
+    """Read OpenCV's XML; its own parser does not end on some malformed files."""
+    return _plain_xml(ElementTree.fromstring(text))
+
+
+def _plain_xml(element: ElementTree.Element) -> Any:
+    children = list(element)
+    if children:
+        if all(child.tag == "_" for child in children):
+            return [_plain_xml(child) for child in children]
+        return {child.tag: _plain_xml(child) for child in children}
+    words = (element.text or "").split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words).strip('"')
+    return values[0] if len(values) == 1 else values
+
+
+def _one_of(data: Mapping[str, Any], names: Sequence[str], where: str) -> tuple[str | None, Any]:
+    found = [name for name in names if name in data]
+    if len(found) > 1:
+        raise InputError(f"{where}: {found[1]}: given beside {found[0]}; only one of them is allowed")
+    return (found[0], data[found[0]]) if found else (None, None)
+
+
+def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[float]:
+    """Give a matrix or list as numbers in row order; `counts` are the numbers of values that are allowed."""
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    flat: list[Any] = []
+    for item in value if isinstance(value, list) else [value]:
+        flat += item if isinstance(item, list) else [item]
+    wrong = next((item for item in flat if isinstance(item, bool) or not isinstance(item, int | float)), None)
+    if not isinstance(value, list) or wrong is not None:
+        raise InputError(f"{where}: {name} = {shown(repr(value), 80)}: must be a matrix or a list of numbers")
+    if len(flat) not in counts:
+        allowed = " or ".join(str(count) for count in counts)
+        raise InputError(f"{where}: {name}: {len(flat)} values; must be {allowed}")
+    return [float(item) for item in flat]
+
+
+def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
+    """Give the image's width and height; their ranges are checked by the schema."""
+    name, both = _one_of(data, SIZE_NAMES, where)
+    if name is not None:
+        width, height = _numbers(both, where, name, (2,))
+        return width, height
+    found = []
+    for names in (WIDTH_NAMES, HEIGHT_NAMES):
+        name, value = _one_of(data, names, where)
+        if name is None:
+            raise InputError(f"{where}: {names[0]}: missing; a camera needs the size of its images, px")
+        found.append(value)
+    return found[0], found[1]
+
+
+def _check_whole(data: Mapping[str, Any], where: str) -> None:
+    """Refuse a camera_info of cropped or binned images, to which K does not belong as it stands."""
+    for key in ("binning_x", "binning_y"):
+        if data.get(key, 0) not in (0, 1):
+            raise InputError(f"{where}: {key} = {data[key]!r}: must be 0 or 1; calibrate at the size that is used")
+    roi = data.get("roi")
+    roi = roi if isinstance(roi, Mapping) else {}
+    for key in ("x_offset", "y_offset", "width", "height"):
+        if roi.get(key, 0) != 0:
+            raise InputError(f"{where}: roi.{key} = {roi[key]!r}: must be 0; calibrate at the size that is used")
+
+
+def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
+    name, value = _one_of(data, LENS_NAMES, where)
+    fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
+    if name is None:
+        _check_no_other_lens(data, where)
+    if name is None or value in (None, []) or (isinstance(value, Mapping) and not value.get("data")):
+        if fisheye:
+            raise InputError(f"{where}: {LENS_NAMES[0]}: missing; a fisheye has 4 coefficients")
+        return None
+    if fisheye:
+        values = _numbers(value, where, name, (4,))
+        return {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), values, strict=True))}
+    counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
+    values = _numbers(value, where, name, counts)
+    for term, number in zip(UNKNOWN_TERMS, values[8:], strict=False):
+        if number != 0:
+            kind = "tilted sensor" if term.startswith("tau") else "thin prism"
+            raise InputError(
+                f"{where}: {name}: {term} = {number:g} ({kind}): must be 0; simtest does not know that term"
+            )
+    if not any(values):
+        return None
+    return {"type": "brown_conrady", **dict(zip(BROWN_ORDER, values, strict=False))}
+
+
+def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
+    """Refuse a file that speaks of a lens but whose coefficients stand under no name that is read."""
+    told = [key for key in data if key.lower().startswith("dist") and (key != "distortion_model" or data[key])]
+    if told:
+        raise InputError(
+            f"{where}: {told[0]} = {shown(repr(data[told[0]]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"allowed names: {', '.join(LENS_NAMES)}"
+        )
+
+
+def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:
+    model, flag = data.get("distortion_model"), data.get("fisheye_model")
+    if model in (None, ""):
+        return bool(flag)
+    if not isinstance(model, str) or model.lower() not in MODELS:
+        raise InputError(f"{where}: distortion_model = {shown(repr(model), 60)}: must be one of {', '.join(MODELS)}")
+    fisheye = MODELS[model.lower()]
+    if flag is not None and bool(flag) != fisheye:
+        raise InputError(f"{where}: fisheye_model = {flag!r}: does not fit distortion_model = {model!r}")
+    return fisheye
+
+
+# Writing ---------------------------------------------------------------------------------------------------------
+
+
+def opencv_text(camera: Camera, suffix: str) -> str:
+    """Give a camera as the text of an OpenCV FileStorage.
+
+    Parameters
+    ----------
+    camera : Camera
+        What to write.
+    suffix : {".yml", ".yaml", ".xml", ".json"}
+        Chooses the format.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        If the camera has a skew, which OpenCV ignores.
+    """
+    matrix, coefficients = _shifted(camera, "OpenCV")
+    kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}
+    flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | kinds.get(suffix, cv2.FILE_STORAGE_FORMAT_YAML)
+    storage = cv2.FileStorage()
+    storage.open("", flags)
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    if isinstance(camera.distortion, KannalaBrandt):
+        storage.write("fisheye_model", 1)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", np.array([coefficients]))
+    if (mask := _shifted_mask(camera)) is not None:
+        storage.write("view_mask", np.array([mask]))
+    return str(storage.releaseAndGetString())
+
+
+def ros_text(camera: Camera) -> str:
+    """Give a camera as the text of a ROS camera_info file (YAML), as `opencv_text` does."""
+    matrix, coefficients = _shifted(camera, "ROS")
+    model = "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
+    model = "equidistant" if isinstance(camera.distortion, KannalaBrandt) else model
+
+    def block(name: str, values: Any) -> list[str]:
+        rows = np.atleast_2d(values)
+        data = ", ".join(repr(float(v)) for v in rows.ravel())
+        return [f"{name}:", f"  rows: {rows.shape[0]}", f"  cols: {rows.shape[1]}", f"  data: [{data}]"]
+
+    lines = [
+        f"image_width: {camera.width}", f"image_height: {camera.height}", "camera_name: simtest",
+        *block("camera_matrix", matrix), f"distortion_model: {model}", *block("distortion_coefficients", coefficients),
+        *block("rectification_matrix", np.eye(3)), *block("projection_matrix", np.pad(matrix, ((0, 0), (0, 1)))),
+    ]  # fmt: skip
+    if (mask := _shifted_mask(camera)) is not None:
+        lines.append(f"view_mask: [{', '.join(repr(v) for v in mask)}]")
+    return "\n".join(lines) + "\n"
+
+
+def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
+    """Give K and the coefficients in the other convention."""
+    if camera.skew != 0:
+        raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {whose} ignores it; save as TOML instead")
+    matrix = camera.K - np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]])
+    lens = camera.distortion
+    if isinstance(lens, KannalaBrandt):
+        return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
+    values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]
+    return matrix, values if any(values[5:]) else values[:5]
+
+
+def _shifted_mask(camera: Camera) -> list[float] | None:
+    """Give the view mask's centre and radius in the other convention; neither OpenCV nor ROS has one, both skip it."""
+    mask = camera.view_mask
+    return None if mask is None else [float(mask.cx) - PIXEL_CENTRE, float(mask.cy) - PIXEL_CENTRE, float(mask.radius)]

@@ -1,0 +1,254 @@
+"""The camera of a scene, and camera files."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera, ViewMask
+from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
+from simtest.runtime.resources import shown
+from simtest.spec.toml_input import Spec, read_toml, validate
+from simtest.spec.toml_output import toml_tables, toml_value
+
+Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
+PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface"})
+"""Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_file` reads them."""
+
+OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
+MATLAB_SUFFIX = ".mat"
+
+
+class BrownConradySpec(Spec):
+    """A perspective lens: OpenCV's models of 5 and 8 coefficients, ROS' plumb_bob and rational_polynomial.
+
+    With x = X/Z, y = Y/Z, u = x^2 + y^2, x and y are multiplied by
+    (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3); then 2 p1 x y + p2 (u + 2 x^2) is added to x, and
+    p1 (u + 2 y^2) + 2 p2 x y to y.
+    """
+
+    type: Literal["brown_conrady"] = "brown_conrady"
+    k1: Coefficient = Field(0.0, description="radial")
+    k2: Coefficient = Field(0.0, description="radial")
+    p1: Coefficient = Field(0.0, description="tangential")
+    p2: Coefficient = Field(0.0, description="tangential")
+    k3: Coefficient = Field(0.0, description="radial")
+    k4: Coefficient = Field(0.0, description="radial, of the denominator")
+    k5: Coefficient = Field(0.0, description="radial, of the denominator")
+    k6: Coefficient = Field(0.0, description="radial, of the denominator")
+
+    def model(self) -> BrownConrady:
+        """Give the lens as the geometry package uses it."""
+        return BrownConrady(**self.model_dump(exclude={"type"}))
+
+
+class KannalaBrandtSpec(Spec):
+    """A fisheye: OpenCV's fisheye model, ROS' equidistant.
+
+    A direction at theta from the axis is imaged at theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal
+    lengths from the principal point, also at 90 deg and beyond. All coefficients 0 is the equidistant lens.
+    """
+
+    type: Literal["kannala_brandt"] = "kannala_brandt"
+    k1: Coefficient = 0.0
+    k2: Coefficient = 0.0
+    k3: Coefficient = 0.0
+    k4: Coefficient = 0.0
+
+    def model(self) -> KannalaBrandt:
+        """Give the lens as the geometry package uses it."""
+        return KannalaBrandt(**self.model_dump(exclude={"type"}))
+
+
+DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec, Field(discriminator="type")]
+
+
+class ViewMaskSpec(Spec):
+    """The round field of view of an endoscope; pixels whose centres lie outside see nothing."""
+
+    radius: float = Field(gt=0, le=1e6, description="px")
+    cx: PrincipalPoint | None = Field(None, description="centre, px; default the image's centre")
+    cy: PrincipalPoint | None = Field(None, description="centre, px; default the image's centre")
+
+
+class CameraSpec(Spec):
+    """A camera: a pinhole, or a lens with distortion; pixel centres at integer + 0.5."""
+
+    width: int = Field(406, ge=1, le=16384, description="px")
+    height: int = Field(406, ge=1, le=16384, description="px")
+    fx: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along x, px")
+    fy: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along y, px")
+    cx: PrincipalPoint | None = Field(None, description="principal point, px; default the image's centre")
+    cy: PrincipalPoint | None = Field(None, description="principal point, px; default the image's centre")
+    skew: float = Field(0.0, ge=-1e6, le=1e6, description="px")
+    distortion: DistortionSpec | None = Field(
+        None, description="the lens; default none, a pinhole. It must not fold over inside the image or the view mask"
+    )
+    view_mask: ViewMaskSpec | None = Field(None, description="default: the whole image is seen")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "CameraSpec":
+        if self.distortion is not None or self.view_mask is not None:
+            try:
+                self.model()
+            except InputError as error:
+                # The key's path is put before it.
+                raise ValueError(str(error).removeprefix("camera.")) from None
+        return self
+
+    def model(self) -> Camera:
+        """Give the camera as the geometry package uses it."""
+        middle = (self.width / 2, self.height / 2)
+        cx, cy = _centre(self.cx, self.cy, middle)
+        lens = None if self.distortion is None else self.distortion.model()
+        mask = None
+        if self.view_mask is not None:
+            mask = ViewMask(*_centre(self.view_mask.cx, self.view_mask.cy, middle), self.view_mask.radius)
+        return Camera(self.width, self.height, self.fx, self.fy, cx, cy, self.skew, lens, mask)
+
+
+def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> tuple[float, float]:
+    return middle[0] if cx is None else cx, middle[1] if cy is None else cy
+
+
+def camera_table(camera: Camera) -> dict[str, Any]:
+    """Give a camera as the nested table that `CameraSpec` reads; what is at its default is left out.
+
+    Parameters
+    ----------
+    camera : Camera
+
+    Returns
+    -------
+    dict
+    """
+    table: dict[str, Any] = {
+        name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "skew")
+    }
+    if camera.distortion is not None:
+        table["distortion"] = _lens_table(camera.distortion)
+    if camera.view_mask is not None:
+        table["view_mask"] = asdict(camera.view_mask)
+    return table
+
+
+def _lens_table(lens: Distortion) -> dict[str, Any]:
+    return {"type": "brown_conrady" if isinstance(lens, BrownConrady) else "kannala_brandt", **asdict(lens)}
+
+
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """Describe a camera for the JSON files that simtest writes: size, K, lens and view mask if any."""
+    table = camera_table(camera)
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "K": camera.K.tolist(),
+        "pixel_centres": "integer + 0.5",
+        **{key: table[key] for key in ("distortion", "view_mask") if key in table},
+    }
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read a camera file; the half pixel between conventions is added or taken off here (docs/cameras.md).
+
+    Parameters
+    ----------
+    path : str or Path
+        By its suffix: YAML (.yml, .yaml), XML or JSON as OpenCV or ROS (camera_info) write them; .mat as MATLAB saves a
+        struct of ``toStruct(cameraParams)``; anything else TOML with the keys of `CameraSpec`, at top level or under
+        ``[camera]``.
+
+    Returns
+    -------
+    Camera
+
+    Raises
+    ------
+    InputError
+        If the file is missing or malformed, or describes a lens that simtest does not know.
+    """
+    # Imported here: OpenCV and SciPy are slow to load, and scenes need neither.
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind in OPENCV_SUFFIXES:
+        from simtest.spec.camera_formats.opencv import read_opencv
+
+        return _validated(read_opencv(path), path)
+    if kind == MATLAB_SUFFIX:
+        from simtest.spec.camera_formats.matlab import read_matlab
+
+        return _validated(read_matlab(path), path)
+    data = {key: value for key, value in read_toml(path).items() if key not in NOT_OF_THE_CAMERA}
+    table = data.get("camera", data)
+    missing = [key for key in ("width", "height", "fx", "fy") if not isinstance(table, Mapping) or key not in table]
+    if missing:
+        raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, fx, fy")
+    return _validated(table, path)
+
+
+def is_toml(path: Path) -> bool:
+    """Tell whether `load_camera` reads a file as TOML: by its suffix it is none of OpenCV's, ROS' or MATLAB's."""
+    return path.suffix.lower() not in (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
+
+
+def _validated(table: Mapping[str, Any], path: Path) -> Camera:
+    return validate(CameraSpec, table, str(path)).model()
+
+
+CAMERA_FORMATS = ("toml", "opencv", "ros")
+
+
+def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "opencv", "ros"] | None = None) -> None:
+    """Write a camera file that `load_camera` reads back.
+
+    Parameters
+    ----------
+    camera : Camera
+        What to write.
+    path : str or Path
+        The file; replaced if it exists.
+    format : {"toml", "opencv", "ros"}, optional
+        Default by the suffix: .toml is simtest's own; .yml, .yaml, .xml and .json are OpenCV's. "ros" is a camera_info
+        file (.yml, .yaml).
+
+    Raises
+    ------
+    InputError
+        If format and suffix do not fit, the format cannot hold the camera, or the file cannot be written.
+    """
+    path = Path(path)
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
+    from simtest.runtime.files import write_atomically
+    from simtest.spec.camera_formats.opencv import opencv_text, ros_text
+
+    suffixes = {"toml": (".toml",), "opencv": OPENCV_SUFFIXES, "ros": (".yml", ".yaml")}
+    chosen = format or ("toml" if path.suffix.lower() == ".toml" else "opencv")
+    if chosen not in suffixes:
+        raise InputError(f"format = {shown(chosen)!r}: must be one of {', '.join(CAMERA_FORMATS)}")
+    if path.suffix.lower() not in suffixes[chosen]:
+        raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(suffixes[chosen])}")
+    if chosen == "toml":
+        text = camera_toml(camera)
+    else:
+        text = ros_text(camera) if chosen == "ros" else opencv_text(camera, path.suffix.lower())
+    try:
+        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{shown(path)}: cannot be written ({error.strerror})") from error
+
+
+def camera_toml(camera: Camera) -> str:
+    """Give a camera as the text of simtest's own TOML file."""
+    table = camera_table(camera)
+    inner: dict[str, dict[str, Any]] = {key: table.pop(key) for key in ("distortion", "view_mask") if key in table}
+    lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt"}
+    kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
+    lines = [f"# {kind}; pixel centres at integer + 0.5."]
+    lines += [f"{key} = {toml_value(value)}" for key, value in table.items()]
+    return "\n".join([*lines, "", toml_tables(inner)] if inner else [*lines, ""])

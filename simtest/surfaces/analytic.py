@@ -1,0 +1,221 @@
+"""Plane, sphere, cylinder and quadric patch: every quantity from its closed form, in float64.
+
+All live in a model frame whose origin is the anchor point, z the anchor's normal on the camera's side and x the
+first principal direction.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
+from simtest.surfaces.model import (
+    Array,
+    IntArray,
+    RayHits,
+    Shape,
+    SurfaceModel,
+    SurfacePoints,
+    TriangleMesh,
+    implicit_shape_operator,
+    pack_points,
+)
+
+PLANE_REACH = 1000.0
+"""Half-size of the rendered plane over the anchor's distance: beyond the view even at grazing tilt."""
+
+CYLINDER_REACH = 50.0
+"""Half-length of the rendered cylinder over the anchor's distance."""
+
+QUADRIC_REACH = 1.0
+"""Half-size of the rendered quadric patch over the anchor's distance."""
+
+QUADRIC_CELLS = 400
+"""Cells along one side of the quadric's mesh; about 2 px a cell at f = 406."""
+
+
+def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg: float) -> Array:
+    """Give model_from_camera, shape (4, 4), of a surface anchored on the optical axis.
+
+    The anchor is (0, 0, distance); its normal is (0, 0, -1) leaned by `tilt_deg` towards image direction
+    `azimuth_deg`; at tilt 0 the model's x axis is image direction `spin_deg`.
+    """
+    tilt, azimuth, spin = np.radians([tilt_deg, azimuth_deg, spin_deg])
+    x = np.array([np.cos(spin), np.sin(spin), 0.0])
+    z = np.array([0.0, 0.0, -1.0])
+    frame = np.stack([x, np.cross(z, x), z], axis=1)
+    lean = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    axis = np.cross(z, lean)
+    rotation = Rotation.from_rotvec(tilt * axis).as_matrix()
+    camera_from_model = np.eye(4)
+    camera_from_model[:3, :3] = rotation @ frame
+    camera_from_model[:3, 3] = [0.0, 0.0, distance_mm]
+    return np.asarray(np.linalg.inv(camera_from_model), dtype=np.float64)
+
+
+class _Analytic(SurfaceModel):
+    """An analytic surface placed in front of the camera."""
+
+    def __init__(self, spec: PlaneSurface | SphereSurface | CylinderSurface | QuadricSurface) -> None:
+        self.model_from_camera = placement(spec.distance_mm, spec.tilt_deg, spec.azimuth_deg, spec.spin_deg)
+        self.distance = spec.distance_mm
+
+
+class Plane(_Analytic):
+    """The plane z = 0."""
+
+    def shape(self) -> Shape:
+        """Give Mitsuba's rectangle, scaled beyond the view."""
+        reach = PLANE_REACH * self.distance
+        return Shape("plane", False, {"to_model": np.diag([reach, reach, 1.0, 1.0])}, None, "plane")
+
+    def clearance(self, points: Array) -> Array:
+        """Give z (see `SurfaceModel.clearance`)."""
+        return np.asarray(points[:, 2])
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Intersect rays with z = 0 (see `SurfaceModel.points`)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -origins[:, 2] / directions[:, 2]
+        distance = np.where((distance > 0) & np.isfinite(hits.distance), distance, np.nan)
+        normal = np.broadcast_to([0.0, 0.0, 1.0], directions.shape)
+        return pack_points(origins, directions, distance, normal, np.zeros((len(origins), 3, 3)))
+
+
+class _Round(_Analytic):
+    """A sphere or cylinder through the anchor, its centre on the far side or, seen from inside, on the near side."""
+
+    _across = np.ones(3)
+
+    def __init__(self, spec: SphereSurface | CylinderSurface) -> None:
+        super().__init__(spec)
+        self.radius = spec.radius_mm
+        self.inside = spec.side == "inside"
+        self.solid = not self.inside
+        self.centre = np.array([0.0, 0.0, self.radius if self.inside else -self.radius])
+
+    def clearance(self, points: Array) -> Array:
+        """Give the distance to the wall (see `SurfaceModel.clearance`)."""
+        outwards = np.linalg.norm((points - self.centre) * self._across, axis=1) - self.radius
+        return -outwards if self.inside else outwards
+
+    def _distance(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Root of |o + t d - centre|^2 = R^2: the near one from outside, the far one from inside."""
+        o = origins - self.centre
+        a = np.sum(directions**2, axis=1)
+        b = np.sum(o * directions, axis=1)
+        c = np.sum(o**2, axis=1) - self.radius**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(b**2 - a * c)
+            # The form without cancellation: for the near root b < 0, for the far one c < 0.
+            t = (root - b) / a if self.inside else c / (root - b)
+        return np.where((t > 0) & np.isfinite(hits.distance), t, np.nan)
+
+
+class Sphere(_Round):
+    """A sphere through the anchor."""
+
+    def shape(self) -> Shape:
+        """Give Mitsuba's sphere."""
+        to_model = np.diag([self.radius, self.radius, self.radius, 1.0])
+        to_model[:3, 3] = self.centre
+        return Shape("sphere", self.inside, {"to_model": to_model}, None, f"sphere {self.inside}")
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Intersect rays with the sphere; S = (I - N N^T)/R (see `SurfaceModel.points`)."""
+        distance = self._distance(origins, directions, hits)
+        normal = (origins + distance[:, None] * directions - self.centre) / self.radius
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        S = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / self.radius
+        return pack_points(origins, directions, distance, normal, S)
+
+
+class Cylinder(_Round):
+    """A cylinder through the anchor, its axis along y."""
+
+    _across = np.array([1.0, 0.0, 1.0])
+
+    def shape(self) -> Shape:
+        """Give Mitsuba's cylinder: unit radius about z from 0 to 1, turned to y."""
+        half = CYLINDER_REACH * self.distance
+        to_model = np.eye(4)
+        to_model[:3, 0] = [self.radius, 0, 0]
+        to_model[:3, 1] = [0, 0, -self.radius]
+        to_model[:3, 2] = [0, 2 * half, 0]
+        to_model[:3, 3] = self.centre - [0, half, 0]
+        return Shape("cylinder", self.inside, {"to_model": to_model}, None, f"cylinder {self.inside}")
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Intersect rays with the cylinder; S = (I - N N^T - y y^T)/R (see `SurfaceModel.points`)."""
+        across = self._across
+        distance = self._distance(origins * across, directions * across, hits)
+        normal = (origins + distance[:, None] * directions - self.centre) * across / self.radius
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        S = (np.diag(across) - normal[:, :, None] * normal[:, None, :]) / self.radius
+        return pack_points(origins, directions, distance, normal, S)
+
+
+class Quadric(_Analytic):
+    """The graph z = -(k1 x^2 + k2 y^2)/2; at the anchor its principal curvatures are k1 and k2."""
+
+    def __init__(self, spec: QuadricSurface) -> None:
+        super().__init__(spec)
+        self.curvatures = np.array([spec.k1_per_mm, spec.k2_per_mm, 0.0])
+
+    def shape(self) -> Shape:
+        """Give a grid mesh with the exact vertex normals."""
+        reach = QUADRIC_REACH * self.distance
+        side = np.linspace(-reach, reach, QUADRIC_CELLS + 1)
+        x, y = (grid.ravel() for grid in np.meshgrid(side, side))
+        k1, k2, _ = self.curvatures
+        vertices = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
+        normals = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        mesh = TriangleMesh(vertices, grid_faces(QUADRIC_CELLS, QUADRIC_CELLS), normals)
+        return Shape("mesh", False, {}, mesh, f"quadric {k1!r} {k2!r} {reach!r}")
+
+    def clearance(self, points: Array) -> Array:
+        """Give F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""
+        k = self.curvatures
+        value = points[:, 2] + np.sum(k * points**2, axis=1) / 2
+        return np.asarray(value / np.linalg.norm(k * points + [0.0, 0.0, 1.0], axis=1))
+
+    def vertex_shape_operators(self) -> Array:
+        """Give S at the grid's vertices (see `SurfaceModel.vertex_shape_operators`)."""
+        mesh = self.shape().mesh
+        assert mesh is not None
+        return self._shape_operator(mesh.vertices)[1]
+
+    def _shape_operator(self, points: Array) -> tuple[Array, Array]:
+        gradient = self.curvatures * points + [0.0, 0.0, 1.0]
+        return implicit_shape_operator(gradient, np.broadcast_to(np.diag(self.curvatures), (len(points), 3, 3)))
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Intersect rays with the quadric at the root next to the rendered hit (see `SurfaceModel.points`)."""
+        k = self.curvatures
+        a = np.sum(k * directions**2, axis=1) / 2
+        b = directions[:, 2] + np.sum(k * origins * directions, axis=1)
+        c = origins[:, 2] + np.sum(k * origins**2, axis=1) / 2
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            root = np.sqrt(b**2 - 4 * a * c)
+            q = -(b + np.copysign(root, b)) / 2
+            roots = np.stack([c / q, q / a])
+            gap = np.abs(roots - hits.distance)
+        gap = np.where(np.isfinite(gap), gap, np.inf)
+        distance = np.take_along_axis(roots, gap.argmin(axis=0)[None], axis=0)[0]
+        distance = np.where(np.isfinite(gap.min(axis=0)), distance, np.nan)
+        P = origins + distance[:, None] * directions
+        normal, S = self._shape_operator(P)
+        return pack_points(origins, directions, distance, normal, S)
+
+
+def grid_faces(columns: int, rows: int) -> IntArray:
+    """Triangulate a grid of (rows + 1) x (columns + 1) vertices stored row by row, counter-clockwise about +z.
+
+    Returns
+    -------
+    ndarray of int, shape (2 rows columns, 3)
+    """
+    row, column = np.divmod(np.arange(rows * columns, dtype=np.int64), columns)
+    corner = row * (columns + 1) + column
+    right, up = corner + 1, corner + columns + 1
+    return np.concatenate([np.stack([corner, right, up + 1], axis=1), np.stack([corner, up + 1, up], axis=1)])

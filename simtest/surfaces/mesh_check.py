@@ -1,0 +1,209 @@
+"""The verdict on a user's mesh: what is wrong with it, what was mended, and whether it is fine for highlights."""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simtest.surfaces.fineness import EDGES_PER_HALF_WIDTH, needed_edge
+from simtest.surfaces.mesh_file import other_unit, read_mesh
+from simtest.surfaces.mesh_surface import area_quantile, is_lumen
+from simtest.surfaces.model import Array, IntArray, principal_curvatures
+from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, edge_uses, examine
+from simtest.surfaces.subdivision import edge_lengths, shape_operators
+
+FINE_SHARE = 0.95
+"""Share of the surface that must be fine enough for a mesh to be called so."""
+
+MAX_CURVATURE_FACES = 2_000_000
+"""Above this many faces the curvature, and with it the fineness, is not looked at (about 15 s at the limit)."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What `check_mesh` found.
+
+    Parameters
+    ----------
+    file : str
+    vertices, faces : int
+        After the repairs.
+    extents_mm : tuple of float
+        Along x, y, z.
+    lumen : bool
+        Whether the camera belongs inside.
+    repairs : Repairs
+    condition : Condition
+    edge_median_mm, edge_p95_mm : float
+        Of the edges' lengths.
+    distance_mm, concentration : float
+        For which highlights.
+    curvature_median_per_mm, curvature_p95_per_mm : float or None
+        Of the larger absolute principal curvature, by area; None where the mesh is too large to look.
+    needed_edge_mm : float or None
+        Edge length with which all but 5 % of the surface is fine enough.
+    fine_share : float or None
+        Share of the surface that is fine enough as it is.
+    other_unit : str
+        Guess at another unit than mm, or empty.
+    """
+
+    file: str
+    vertices: int
+    faces: int
+    extents_mm: tuple[float, float, float]
+    lumen: bool
+    repairs: Repairs
+    condition: Condition
+    edge_median_mm: float
+    edge_p95_mm: float
+    distance_mm: float
+    concentration: float
+    curvature_median_per_mm: float | None
+    curvature_p95_per_mm: float | None
+    needed_edge_mm: float | None
+    fine_share: float | None
+    other_unit: str
+
+    @property
+    def fine(self) -> bool:
+        """Whether the mesh is fine enough as it is."""
+        return self.fine_share is not None and self.fine_share >= FINE_SHARE
+
+    @property
+    def problems(self) -> list[str]:
+        """What is found and not mended, worst first."""
+        found, problems = self.condition, []
+        if found.crossing_faces:
+            problems.append(f"{found.crossing_faces} faces cut through others: normals around them mean nothing")
+        if found.non_manifold_edges:
+            problems.append(f"{found.non_manifold_edges} edges belong to more than two faces: cannot be refined")
+        if self.other_unit:
+            problems.append(f"lengths are taken as mm; by its extent the file may be in {self.other_unit}")
+        return problems
+
+    @property
+    def usable(self) -> bool:
+        """Whether the verdict is good: fine enough, and nothing wrong that would spoil the truth."""
+        return self.fine and not self.problems
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give all numbers, for JSON."""
+        return {
+            **asdict(self),
+            "condition": self.condition.as_dict(),
+            "fine": self.fine,
+            "problems": self.problems,
+            "usable": self.usable,
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Say it in words, with numbers."""
+        found, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
+        yield f"file        {self.file}"
+        yield f"size        {self.vertices} vertices, {self.faces} faces, {size} mm"
+        yield f"taken for   {'a lumen, camera inside' if self.lumen else 'an organ, camera outside'}"
+        yield f"pieces      {found.pieces}"
+        if found.watertight:
+            yield "surface     watertight"
+        elif found.open_edges:
+            yield f"surface     open: {found.open_edges} edges at its rims"
+        if found.crossing_faces is None:
+            yield f"crossings   not looked for above {MAX_CROSSING_FACES} faces"
+        elif not found.crossing_faces:
+            yield "crossings   none"
+        for sentence in self.repairs.sentences(self.lumen):
+            yield f"repaired    {sentence}"
+        yield "normals     computed from the triangles; those of a file are not used"
+        yield f"edges       median {self.edge_median_mm:.3g} mm, 95th percentile {self.edge_p95_mm:.3g} mm"
+        for problem in self.problems:
+            yield f"problem     {problem}"
+        yield from self._fineness()
+
+    def _fineness(self) -> Iterator[str]:
+        if self.needed_edge_mm is None or self.fine_share is None:
+            yield f"highlights  not looked at above {MAX_CURVATURE_FACES} faces: decimate the mesh"
+            return
+        yield (
+            f"curvature   median {self.curvature_median_per_mm:.3g}, 95th percentile {self.curvature_p95_per_mm:.3g} "
+            "1/mm"
+        )
+        lobe = f"n = {self.concentration / 4:.3g} at {self.distance_mm:g} mm"
+        yield (
+            f"highlights  of {lobe}: {100 * self.fine_share:.1f} % of the surface has {EDGES_PER_HALF_WIDTH:g} edges "
+            "in a half-width"
+        )
+        if self.fine:
+            yield "verdict     fine enough" + ("; but see the problems above" if self.problems else "")
+        else:
+            yield f"verdict     too coarse: edges of {self.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
+
+
+def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind: str = "auto") -> Verdict:
+    """Check a mesh file.
+
+    Parameters
+    ----------
+    path : str or Path
+        PLY, OBJ, STL or VTK; lengths in mm.
+    distance_mm : float
+        Distance of camera and light from the surface, mm.
+    concentration : float
+        c of the lobe (`simtest.surfaces.fineness`).
+    kind : {"auto", "lumen", "organ"}
+        Which side the camera is on.
+
+    Returns
+    -------
+    Verdict
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is no mesh that can be used.
+    """
+    vertices, faces, repairs = read_mesh(path)
+    lumen = is_lumen(vertices, faces, kind)
+    lengths, extents = edge_lengths(vertices, faces), np.ptp(vertices, axis=0)
+    bends: tuple[float, float] | None = None
+    needed = share = None
+    if len(faces) <= MAX_CURVATURE_FACES:
+        k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
+        wanted = needed_edge(distance_mm, concentration, k_min, k_max)
+        needed = area_quantile(wanted, vertices, faces, 1 - FINE_SHARE)
+        share = _fine_share(wanted, vertices, faces)
+        larger = np.maximum(np.abs(k_min), np.abs(k_max))
+        bends = (area_quantile(larger, vertices, faces, 0.5), area_quantile(larger, vertices, faces, 0.95))
+    return Verdict(
+        file=str(path),
+        vertices=len(vertices),
+        faces=len(faces),
+        extents_mm=(float(extents[0]), float(extents[1]), float(extents[2])),
+        lumen=lumen,
+        repairs=repairs,
+        condition=examine(vertices, faces),
+        edge_median_mm=float(np.median(lengths)),
+        edge_p95_mm=float(np.quantile(lengths, 0.95)),
+        distance_mm=distance_mm,
+        concentration=concentration,
+        curvature_median_per_mm=bends[0] if bends else None,
+        curvature_p95_per_mm=bends[1] if bends else None,
+        needed_edge_mm=needed,
+        fine_share=share,
+        other_unit=other_unit(float(extents.max())),
+    )
+
+
+def _fine_share(wanted: Array, vertices: Array, faces: IntArray) -> float:
+    """Give the share of the area whose edges are at most as long as wanted there; `wanted` at the vertices."""
+    edges, _ = edge_uses(faces)
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    count = np.bincount(edges.ravel(), minlength=len(vertices))
+    mean = np.bincount(edges.ravel(), np.repeat(length, 2), len(vertices)) / count
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    # Unknown curvature counts as too coarse.
+    return float(weight[mean <= wanted].sum() / weight.sum())

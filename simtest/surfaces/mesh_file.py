@@ -1,0 +1,207 @@
+"""Reading a user's mesh file: PLY, OBJ, STL or VTK, with one-line errors for whatever is wrong with it."""
+
+import logging
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.surfaces.model import Array, IntArray
+from simtest.surfaces.repair import Repairs, repair
+
+__all__ = ["MESH_SUFFIXES", "read_mesh"]
+
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
+MIN_FACES = 4
+"""A tetrahedron is the smallest surface with an inside."""
+
+MAX_FACES = 5_000_000
+MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
+"""What `MAX_FACES` faces take at most as text, about; reading takes some ten times as much memory."""
+
+EXTENT_RANGE_MM = (1.0, 1e5)
+"""Largest extent that is plausible; a mesh in metres falls below it."""
+
+ORGAN_RANGE_MM = (60.0, 2000.0)
+"""Largest extent of a liver, a colon or a good piece of one: for a guess at another unit."""
+
+
+def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
+    """Read a triangle mesh and mend what is safely mended.
+
+    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons
+    are cut into triangles; the winding is made consistent within each piece, normals outward.
+
+    Parameters
+    ----------
+    path : str or Path
+        A PLY, OBJ, STL or VTK (PolyData, UnstructuredGrid) file; lengths in mm.
+
+    Returns
+    -------
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+    repairs : Repairs
+        What was mended.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or is no mesh that can be used; one line with the file, the value and what is allowed.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
+    _check_file(path, suffix)
+    try:
+        with _quiet():
+            vertices, faces = _load_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
+    except InputError:
+        raise
+    except Exception as error:
+        # The readers raise whatever their parser runs into; the file is at fault, not the program.
+        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_first_line(error)})") from error
+    _check_arrays(path, vertices, faces)
+    count = len(faces)
+    with _quiet():
+        vertices, faces, repairs = repair(vertices, faces, soup=suffix == ".stl")
+    if len(faces) < MIN_FACES:
+        raise InputError(f"{path}: {len(faces)} of {count} faces have an area; at least {MIN_FACES} needed")
+    return vertices, faces, repairs
+
+
+def other_unit(extent: float) -> str:
+    """Guess the unit of a mesh whose largest extent is hardly that of an organ in mm.
+
+    Parameters
+    ----------
+    extent : float
+        Largest extent, in the file's unit.
+
+    Returns
+    -------
+    str
+        Such as "metres, 214 mm"; empty where mm are as likely as anything.
+    """
+    low, high = ORGAN_RANGE_MM
+    if extent >= 10.0 and extent <= high:
+        return ""
+    for unit, factor in (("centimetres", 10.0), ("metres", 1e3), ("micrometres", 1e-3)):
+        if low <= factor * extent <= high:
+            return f"{unit}, {factor * extent:.3g} mm"
+    return ""
+
+
+def _check_file(path: Path, suffix: str) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder; a file is needed' if path.is_dir() else 'no such file'}")
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if size == 0:
+        raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
+    if size > MAX_BYTES[suffix]:
+        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
+    declared = 0
+    if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
+        declared = int(match[1])
+    elif suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
+        declared = count
+    if declared > MAX_FACES:  # before any memory is asked for
+        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed: decimate the mesh")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the mesh libraries: what they have to say ends up in our one line."""
+    disabled = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
+
+
+def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
+    import trimesh  # slow to import
+
+    options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+    loaded = trimesh.load(path, file_type=path.suffix[1:].lower(), process=False, **options)
+    if isinstance(loaded, trimesh.Scene):
+        parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
+        if not parts:
+            raise InputError(f"{path}: no faces; at least {MIN_FACES} triangles are needed")
+        loaded = trimesh.util.concatenate(parts)
+    vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
+    return vertices, np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
+
+
+def _load_vtk(path: Path) -> tuple[Array, IntArray]:
+    import pyvista  # slow to import
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+
+    shown, verbosity = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    vtkObject.GlobalWarningDisplayOff()
+    try:
+        data = pyvista.read(path)
+        if isinstance(data, pyvista.UnstructuredGrid):
+            _check_indices(path, np.asarray(data.cell_connectivity), data.n_points)
+            data = data.extract_surface(algorithm="dataset_surface")
+        if not isinstance(data, pyvista.PolyData):
+            raise InputError(f"{path}: a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
+        # VTK's filters trust the indices: check them first.
+        for cells in (data.GetPolys(), data.GetStrips()):
+            _check_indices(path, pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
+        data = data.triangulate()
+        faces = np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
+        return np.array(data.points, dtype=np.float64), faces
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+        vtkLogger.SetStderrVerbosity(verbosity)
+
+
+def _check_indices(path: Path, indices: IntArray, count: int) -> None:
+    if len(indices) and not (indices.min() >= 0 and indices.max() < count):
+        wrong = indices.max() if indices.max() >= count else indices.min()
+        raise InputError(f"{path}: a face names vertex {wrong}; allowed: 0 to {count - 1}")
+
+
+def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
+    if vertices.ndim != 2 or vertices.shape[-1] != 3 or not len(vertices):
+        raise InputError(f"{path}: no vertices; at least {MIN_FACES} are needed")
+    if not faces.size:
+        raise InputError(f"{path}: {len(vertices)} points and no faces; at least {MIN_FACES} triangles are needed")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(f"{path}: faces of {faces.shape[-1]} corners; triangles are needed")
+    if not MIN_FACES <= len(faces) <= MAX_FACES:
+        raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; allowed: {MIN_FACES} to {MAX_FACES}")
+    _check_indices(path, faces.ravel(), len(vertices))
+    if not np.isfinite(vertices).all():
+        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        place = ", ".join(f"{x:g}" for x in vertices[row])
+        raise InputError(f"{path}: vertex {row} is ({place}); finite coordinates are needed")
+    extent, (low, high) = float(np.ptp(vertices, axis=0).max()), EXTENT_RANGE_MM
+    if not low <= extent <= high:
+        unit = other_unit(extent)
+        guess = f"; if the file is in {unit}, scale it" if unit else ""
+        raise InputError(
+            f"{path}: largest extent {extent:g} mm; allowed: {low:g} to {high:g} mm (lengths are in mm{guess})"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return (lines[0] if lines else type(error).__name__)[:160]

@@ -1,0 +1,200 @@
+"""What is wrong with a user's triangles: what is safely mended, and what is found and left."""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from simtest.surfaces.model import Array, IntArray
+
+SLIVER = 1e-14
+"""Area over the squared extent below which a face has no direction: rounding decides it."""
+
+MAX_CROSSING_FACES = 1_000_000
+"""Above this many faces self-intersections are not looked for (about 5 s and 2 GB at the limit)."""
+
+
+@dataclass(frozen=True)
+class Repairs:
+    """What was mended, each a count.
+
+    Parameters
+    ----------
+    merged_vertices : int
+        Vertices at the place of another one; each triangle of an STL file has its own three, which counts 0.
+    repeated_faces, faces_without_area : int
+        Faces left out.
+    reversed_faces : int
+        Faces turned so that neighbours wind the same way.
+    turned_pieces : int
+        Whole pieces that were inside out.
+    """
+
+    merged_vertices: int = 0
+    repeated_faces: int = 0
+    faces_without_area: int = 0
+    reversed_faces: int = 0
+    turned_pieces: int = 0
+
+    def sentences(self, lumen: bool = False) -> Iterator[str]:
+        """Say each repair that was made; that a lumen's faces wind inward or outward is a matter of taste."""
+        if self.merged_vertices:
+            yield f"merged {_many(self.merged_vertices, 'repeated vertex', 'repeated vertices')}"
+        if self.faces_without_area:
+            yield f"left out {_many(self.faces_without_area, 'face without area', 'faces without area')}"
+        if self.repeated_faces:
+            yield f"left out {_many(self.repeated_faces, 'repeated face', 'repeated faces')}"
+        if self.reversed_faces:
+            yield f"reversed {_many(self.reversed_faces, 'face that winds', 'faces that wind')} against the neighbours"
+        if self.turned_pieces and not lumen:
+            yield f"turned {_many(self.turned_pieces, 'piece that was', 'pieces that were')} inside out"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is found in the mended mesh and left as it is.
+
+    Parameters
+    ----------
+    pieces : int
+        Connected pieces.
+    open_edges : int
+        Edges of one face; 0 for a watertight mesh.
+    non_manifold_edges : int
+        Edges of more than two faces.
+    crossing_faces : int or None
+        Faces that cut through another; None where it was not looked for.
+    """
+
+    pieces: int
+    open_edges: int
+    non_manifold_edges: int
+    crossing_faces: int | None
+
+    @property
+    def watertight(self) -> bool:
+        """Whether each edge belongs to two faces."""
+        return self.open_edges == 0 and self.non_manifold_edges == 0
+
+    def as_dict(self) -> dict[str, int | bool | None]:
+        """Give the fields, and whether the mesh is watertight."""
+        return {"watertight": self.watertight, **asdict(self)}
+
+
+def _many(count: int, one: str, more: str) -> str:
+    return f"{count} {one if count == 1 else more}"
+
+
+def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array, IntArray, Repairs]:
+    """Mend what can be mended without a guess at the shape.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+        Of either winding.
+    soup : bool
+        Whether the file's format gives each face its own vertices, so that merging them is no repair.
+
+    Returns
+    -------
+    vertices : ndarray, shape (V', 3)
+        Each used, none twice.
+    faces : ndarray of int, shape (F', 3)
+        Winding consistent within each piece, normals outward: positive volume about the piece's centroid.
+    repairs : Repairs
+    """
+    import trimesh  # slow to import
+
+    used = len(np.unique(faces))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    merged = 0 if soup else used - len(np.unique(mesh.faces))
+    before = len(mesh.faces)
+    # Relative to the extent: a sliver below rounding has no direction.
+    mesh.update_faces(mesh.area_faces > SLIVER * float(np.ptp(vertices, axis=0).max()) ** 2)
+    flat = before - len(mesh.faces)
+    before = len(mesh.faces)
+    mesh.update_faces(mesh.unique_faces())
+    repeated = before - len(mesh.faces)
+    mesh.remove_unreferenced_vertices()
+    points = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    triangles = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    if not len(triangles):
+        return points, triangles, Repairs(merged, repeated, flat)
+    triangles, against, turned = _outward(points, triangles)
+    return points, triangles, Repairs(merged, repeated, flat, against, turned)
+
+
+def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
+    """Make the winding consistent within each connected piece, and each piece's normals point outward.
+
+    Returns
+    -------
+    faces : ndarray of int, shape (F, 3)
+    against : int
+        Faces that wound against the majority of their piece.
+    turned : int
+        Pieces whose majority pointed inward.
+    """
+    import igl
+
+    oriented, piece = igl.bfs_orient(faces)
+    piece = np.asarray(piece).ravel()
+    count = int(piece.max()) + 1
+    corners = vertices[oriented]
+    # About each piece's own centroid, so that an open piece has a meaningful sign.
+    size = np.maximum(np.bincount(piece, minlength=count), 1)
+    middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
+    a, b, c = (corners[:, i] - middle[piece] for i in range(3))
+    volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
+    outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
+    # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
+    inward = np.bincount(piece, _follower(faces) != _follower(outward), count)
+    turned = inward > size / 2
+    against = np.where(turned, size - inward, inward).sum()
+    return np.ascontiguousarray(outward, dtype=np.int64), int(against), int(turned.sum())
+
+
+def _follower(faces: IntArray) -> IntArray:
+    """Give the corner that comes after the smallest one in each face, shape (F,)."""
+    after = (np.argmin(faces, axis=1) + 1) % 3
+    return faces[np.arange(len(faces)), after]
+
+
+def edge_uses(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Give the edges, shape (E, 2), smaller vertex first, and how many faces each belongs to, shape (E,)."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    span = int(faces.max()) + 1
+    codes, uses = np.unique(edges[:, 0] * span + edges[:, 1], return_counts=True)
+    return np.stack(np.divmod(codes, span), axis=1), uses
+
+
+def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
+    """Look a mended mesh over.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (V, 3)
+        mm.
+    faces : ndarray of int, shape (F, 3)
+        From `repair`.
+    crossings : bool
+        Whether to look for self-intersections too, which takes the longest.
+
+    Returns
+    -------
+    Condition
+    """
+    import igl
+    from igl import predicates
+
+    _, uses = edge_uses(faces)
+    # By faces that share a vertex: two pieces that touch in one vertex count as one.
+    pieces = int(np.max(igl.vertex_components(faces))) + 1
+    crossing = None
+    if crossings and len(faces) <= MAX_CROSSING_FACES:
+        found, pairs, _ = predicates.find_self_intersections(vertices, faces)
+        crossing = len(np.unique(pairs)) if found else 0
+    return Condition(pieces, int((uses == 1).sum()), int((uses > 2).sum()), crossing)

@@ -1,0 +1,184 @@
+"""A pedunculated polyp: a map of space that draws a mushroom out of the wall; every derivative by closed formula.
+
+With z the height over the polyp's foot along its axis a, x the vector across it, q = |x|^2 and h the polyp's height,
+
+    lift:     z' = z + h E(q) psi(z),   E = exp(-(tau + tau^2)/2), tau = q / (2 s^2),   psi = exp(-(z / 2h)^4)
+    stricture: x' = (1 - A g(z') w(q)) x,   g = exp(-((z' - 0.3 h) / 0.3 h)^4),   w = exp(-q^2 / l^4), l = 2.4 s
+
+The lift raises a bump with steep sides, the stricture narrows it at the height of the neck and leaves the head above.
+Each is invertible: d(z')/dz > 0, as h |psi'| < 0.77, and d(|x'|)/d|x| >= 1 - A > 0. So the wall cannot run through
+itself, whatever folds are at the polyp's place, and where a point came from can be told. Far from the polyp both are
+the identity to rounding. The surface there is no radius over the centreline: the head overhangs the neck.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.surfaces.jets import Jet, squared, times
+from simtest.surfaces.model import Array
+
+NECK_AT = 0.3
+NECK_REACH = 0.3
+"""Place and half length of the neck, as shares of the height."""
+
+ACROSS = 2.4
+"""Reach of the stricture across the axis, over the bump's width s."""
+
+LIFT_REACH = 2.0
+"""Height at which the lift has fallen to 1/e, over the polyp's height."""
+
+FAR = 40.0
+"""Where an exponent is beyond this its exponential is below rounding."""
+
+_STEPS = 80
+_PROFILE = np.linspace(0.01, 0.9999, 4000)
+"""Heights, as shares of the polyp's, at which its widths are looked up."""
+
+
+@dataclass(frozen=True)
+class Stalk:
+    """The map of one polyp.
+
+    Parameters
+    ----------
+    foot : ndarray, shape (3,)
+        Point of the wall under the polyp, mm.
+    axis : ndarray, shape (3,)
+        Unit vector into the lumen.
+    height, width, depth : float
+        h and s, mm, and A.
+    """
+
+    foot: Array
+    axis: Array
+    height: float
+    width: float
+    depth: float
+
+    @classmethod
+    def of_size(cls, foot: Array, axis: Array, height: float, head: float, neck: float) -> "Stalk":
+        """Make the polyp of a height, mm, and diameters of head and neck, mm, as they are on a flat wall."""
+        # The radius is s times a function of A and z / h alone, so A follows from the ratio of the two diameters.
+        narrow, wide = 0.0, 1.0
+        for _ in range(_STEPS):
+            depth = (narrow + wide) / 2
+            at_neck, at_head = _widths(depth)
+            if at_neck / at_head > neck / head:
+                narrow = depth
+            else:
+                wide = depth
+        return cls(foot, axis, height, head / 2 / _widths(narrow)[1], narrow)
+
+    def apply(self, p: Jet) -> Jet:
+        """Map a surface, shape (N, 3), mm, with its derivatives."""
+        near = np.flatnonzero(self.moves(p.f))
+        return p.with_rows(near, self._applied(p.rows(near))) if near.size else p
+
+    def moves(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Tell which points, shape (N, 3), mm, are so near that the map moves them by more than rounding."""
+        z, x = self._split(points)
+        # Of E and w, and of g and psi, the one named last reaches farther.
+        across, along = math.sqrt(FAR) * (ACROSS * self.width) ** 2, FAR**0.25 * LIFT_REACH * self.height
+        return np.asarray((np.einsum("ni,ni->n", x, x) < across) & (np.abs(z) < along))
+
+    def _applied(self, p: Jet) -> Jet:
+        from_foot = p + _constant(-self.foot, len(p.f))
+        z = from_foot.along(self.axis)
+        x = from_foot + times(z, _constant(-self.axis, len(p.f)))
+        q = squared(x)
+        raised = z + times(self._bump(q), self._fading(z))
+        share = times(self._neck(raised), self._reach(q))
+        narrowed = x + times(share, x)
+        return narrowed + times(raised, _constant(self.axis, len(p.f))) + _constant(self.foot, len(p.f))
+
+    def undo(self, points: Array) -> Array:
+        """Give where points, shape (N, 3), mm, come from, to rounding."""
+        z, x = self._split(points)
+        length = np.linalg.norm(x, axis=1)
+        g = self.depth * np.exp(-(((z / self.height - NECK_AT) / NECK_REACH) ** 4).clip(max=700))
+        across = self.width * ACROSS
+
+        def narrowed(r: Array) -> Array:
+            return r * (1 - g * np.exp(-((r / across) ** 4).clip(max=700)))
+
+        # x' is the shorter, by no more than A of it.
+        r = _bisect(narrowed, length, length, length / (1 - self.depth) + 1e-12)
+        bump = self._bump(_scalar(r * r)).f
+
+        def raised(low: Array) -> Array:
+            return low + bump * self._fading(_scalar(low)).f
+
+        source = _bisect(raised, z, z - self.height * bump, z)
+        moved = (length > 0) & (r > 0)
+        stretch = np.where(moved, r / np.where(moved, length, 1.0), 1.0)
+        return self.foot + source[:, None] * self.axis + stretch[:, None] * x
+
+    def _split(self, points: Array) -> tuple[Array, Array]:
+        """Give z and x of points."""
+        from_foot = points - self.foot
+        z = from_foot @ self.axis
+        return z, from_foot - z[:, None] * self.axis
+
+    def _bump(self, q: Jet) -> Jet:
+        """Give E."""
+        scale = 1 / (2 * self.width**2)
+        tau = q.f * scale
+        e, slope = np.exp(-(tau + tau**2) / 2), -(0.5 + tau) * scale
+        return q.chain(e, e * slope, e * (slope**2 - scale**2))
+
+    def _fading(self, z: Jet) -> Jet:
+        """Give h psi(z); the wall outside, z < 0, is lifted as well, which moves no wall through another."""
+        f, first, second = _quartic(z.f, LIFT_REACH * self.height)
+        h = self.height
+        return z.chain(h * f, h * first, h * second)
+
+    def _neck(self, z: Jet) -> Jet:
+        """Give -A g(z)."""
+        f, first, second = _quartic(z.f - NECK_AT * self.height, NECK_REACH * self.height)
+        return z.chain(-self.depth * f, -self.depth * first, -self.depth * second)
+
+    def _reach(self, q: Jet) -> Jet:
+        """Give w."""
+        scale = (self.width * ACROSS) ** 4
+        w, slope = np.exp(-(q.f**2) / scale), -2 * q.f / scale
+        return q.chain(w, w * slope, w * (slope**2 - 2 / scale))
+
+
+def _quartic(x: Array, reach: float) -> tuple[Array, Array, Array]:
+    """Give exp(-(x / reach)^4) and its first and second derivative."""
+    f, slope = np.exp(-((x / reach) ** 4)), -4 * x**3 / reach**4
+    return f, f * slope, f * (slope**2 - 12 * x**2 / reach**4)
+
+
+def _widths(depth: float) -> tuple[float, float]:
+    """Give the radii of neck and head on a flat wall over the width s."""
+    z = _PROFILE
+    tau = (np.sqrt(1 - 8 * np.log(z)) - 1) / 2
+    r = np.sqrt(2 * tau)
+    r *= 1 - depth * np.exp(-(((z - NECK_AT) / NECK_REACH) ** 4)) * np.exp(-((r / ACROSS) ** 4))
+    above = z > NECK_AT + NECK_REACH / 2
+    head = int(np.argmax(np.where(above, r, 0.0)))
+    return float(r[(z > NECK_AT / 3) & (z <= z[head])].min()), float(r[head])
+
+
+def _bisect(function: Callable[[Array], Array], target: Array, low: Array, high: Array) -> Array:
+    """Solve function(x) = target for a rising function between bounds, each of shape (N,)."""
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        below = function(middle) < target
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return (low + high) / 2
+
+
+def _constant(vector: Array, count: int) -> Jet:
+    zero = np.zeros((count, 3))
+    return Jet(np.broadcast_to(vector, (count, 3)), zero, zero, zero, zero, zero)
+
+
+def _scalar(values: Array) -> Jet:
+    zero = np.zeros_like(values)
+    return Jet(values, zero, zero, zero, zero, zero)

@@ -1,0 +1,331 @@
+"""A bent tube with haustral folds, the surface of a generated colon; every derivative by closed formula.
+
+P(u, v) = C(u) + r(u, v) rho(u, v), rho = cos v e1(u) + sin v e2, with C' = T = (sin psi, 0, cos psi),
+e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T' = psi' e1 and e1' = -psi' T,
+
+    P_u  = (1 - psi' r cos v) T + r_u rho
+    P_v  = r_v rho + r tau
+    P_uu = (-psi'' r cos v - 2 psi' r_u cos v) T + (1 - psi' r cos v) psi' (cos v rho - sin v tau) + r_uu rho
+    P_uv = (psi' r sin v - psi' r_v cos v) T + r_uv rho + r_u tau
+    P_vv = (r_vv - r) rho + 2 r_v tau
+
+P_u x P_v points into the lumen while 1 - psi' r cos v > 0. Pedunculated polyps are maps of space applied to P
+(simtest.surfaces.stalk); they keep the sense of P_u x P_v.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+from simtest.runtime.seeds import Stage, generator
+from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import Array
+from simtest.surfaces.recipe import ColonRecipe
+from simtest.surfaces.stalk import Stalk
+
+NEWTON_STEPS = 12
+NEWTON_TOLERANCE_MM = 1e-10
+MAX_SHIFT_MM = 3.0
+"""A solution farther from the mesh's hit than this is another part of the surface: no solution."""
+
+_PANEL_MM = 4.0
+_RELIEF_WAVES = 6
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+
+@dataclass(frozen=True)
+class _Fold:
+    """A fold d exp(-(u - place - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1))."""
+
+    place: float
+    centre: float
+    depth: float
+    width: float
+    slant: float
+    kappa: float
+
+
+class Tube:
+    """The surface of a recipe as a function of (u, v): u along the centreline, mm; v around it, rad.
+
+    Parameters
+    ----------
+    recipe : ColonRecipe
+
+    Raises
+    ------
+    InputError
+        If the folds close the lumen or the tube bends into itself.
+    """
+
+    def __init__(self, recipe: ColonRecipe) -> None:
+        self.recipe = recipe
+        # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
+        rng = generator(recipe.seed, "anatomy", "colon", 0, Stage.SWEEP)
+        self._phase, self._taenia_phase = rng.uniform(0, 2 * math.pi, size=2)
+        self._folds = (*self._draw_folds(rng), *self._polyps())
+        self._relief = self._draw_relief(rng)
+        self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
+        steps = self._integrate(self._knots[:-1], self._knots[1:])
+        self._knot_places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._stalks: tuple[Stalk, ...] = ()
+        self._check()
+        self._stalks = tuple(self._draw_stalks())
+
+    def _draw_folds(self, rng: np.random.Generator) -> tuple[_Fold, ...]:
+        recipe, spread, folds = self.recipe, self.recipe.irregularity, []
+        rings = max(1, round(recipe.length_mm / recipe.fold_spacing_mm))
+        pitch = recipe.length_mm / rings
+        for ring in range(rings):
+            for third in range(3):
+                depth, edge, place, turn = 1 + spread * rng.uniform(-1, 1, size=4)
+                slant = spread * recipe.fold_spacing_mm * rng.uniform(-0.5, 0.5)
+                kappa = recipe.fold_concentration * (1 + spread * rng.uniform(-1, 1))
+                # The taeniae are where r is largest, cos(3 (v - phase)) = 1; a fold lies between two of them.
+                centre = self._taenia_phase + math.pi / 3 + 2 * math.pi / 3 * third + 0.5 * (turn - 1)
+                depth *= recipe.fold_depth_mm
+                # The crest's radius of curvature along u is width^2 / depth.
+                width = math.sqrt(max(depth, 1e-6) * edge * recipe.fold_edge_mm)
+                folds.append(_Fold((ring + 0.5 + place - 1) * pitch, centre, depth, width, slant, kappa))
+        return tuple(folds)
+
+    def _polyps(self) -> Iterator[_Fold]:
+        """Give the sessile polyps: folds that are as wide around the tube as along it, and not slanted."""
+        for polyp in self.recipe.polyps:
+            if polyp.neck_mm is not None:
+                continue
+            width = polyp.width_mm / math.sqrt(8 * math.log(2))
+            kappa = (self.recipe.radius_mm / width) ** 2
+            yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
+
+    def _draw_stalks(self) -> Iterator[Stalk]:
+        """Give the pedunculated polyps, each on the wall as it is without any of them, towards the centreline."""
+        for polyp in self.recipe.polyps:
+            if polyp.neck_mm is not None:
+                u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
+                foot, axis = self.tangents(u, v)[0][0], -self.frame(u, v)[1][0]
+                yield Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
+
+    def _draw_relief(self, rng: np.random.Generator) -> tuple[tuple[float, int, float], ...]:
+        """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is whole, so that they close."""
+        recipe = self.recipe
+        if not recipe.relief_mm:
+            return ()
+        waves = []
+        for _ in range(_RELIEF_WAVES):
+            heading, phase = rng.uniform(0, 2 * math.pi, size=2)
+            number = 2 * math.pi / (recipe.relief_length_mm * rng.uniform(0.8, 1.25))
+            waves.append((number * math.cos(heading), round(recipe.radius_mm * number * math.sin(heading)), phase))
+        return tuple(waves)
+
+    def _check(self) -> None:
+        u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
+        r = self.radius(u.ravel(), v.ravel()).f
+        if r.min() < 0.1 * self.recipe.radius_mm:
+            raise InputError(
+                f"colon recipe: folds leave a radius of {r.min():.3g} mm; at least {0.1 * self.recipe.radius_mm:.3g} "
+                "is needed: lower fold_depth_mm or raise fold_spacing_mm"
+            )
+        bend = np.abs(self.heading(u.ravel())[1]) * r
+        if bend.max() > 0.9:
+            raise InputError(
+                f"colon recipe: the tube bends into itself (curvature times radius {bend.max():.3g}; at most 0.9 is "
+                "allowed): lower bend_deg or sway_deg or raise length_mm"
+            )
+
+    def heading(self, u: Array) -> tuple[Array, Array, Array]:
+        """Give psi, rad, and its first and second derivatives at u, mm, shape (N,)."""
+        rate = math.radians(self.recipe.bend_deg) / self.recipe.length_mm
+        sway, omega = math.radians(self.recipe.sway_deg), 2 * math.pi / self.recipe.sway_length_mm
+        sine, cosine = np.sin(omega * u + self._phase), np.cos(omega * u + self._phase)
+        return rate * u + sway * sine, rate + sway * omega * cosine, -sway * omega**2 * sine
+
+    def _integrate(self, start: Array, stop: Array) -> Array:
+        half = (stop - start) / 2
+        psi = self.heading(((start + stop) / 2)[:, None] + half[:, None] * _GAUSS_NODES)[0]
+        x, z = (half * (part(psi) @ _GAUSS_WEIGHTS) for part in (np.sin, np.cos))
+        return np.stack([x, np.zeros_like(x), z], axis=1)
+
+    def centreline(self, u: Array) -> Array:
+        """Give C(u), mm, shape (N, 3), by Gauss-Legendre quadrature from the nearest knot: exact to rounding."""
+        spacing = self._knots[1] - self._knots[0]
+        knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
+        return self._knot_places[knot] + self._integrate(self._knots[knot], u)
+
+    def slice_of(self, points: Array) -> tuple[Array, Array, Array]:
+        """Give (u, v) and the distance from the centreline, mm, of points, shape (N, 3), near the tube.
+
+        Of a point that a pedunculated polyp has moved, those of where it came from. u solves (x - C(u)) . T(u) = 0:
+        started at the nearest of a row of centreline points, then by Newton's method.
+        """
+        for stalk in reversed(self._stalks):
+            points = stalk.undo(points)
+        row = np.linspace(0, self.recipe.length_mm, 129)
+        gaps = points[:, None] - self.centreline(row)
+        u = row[np.argmin(np.einsum("nki,nki->nk", gaps, gaps), axis=1)]
+        for _ in range(20):
+            psi, bend, _ = self.heading(u)
+            s, c = np.sin(psi), np.cos(psi)
+            x, z = (points - self.centreline(u))[:, [0, 2]].T
+            slope = np.maximum(1 - bend * (x * c - z * s), 0.1)  # the tube keeps it positive
+            u = u + np.clip((x * s + z * c) / slope, -5.0, 5.0)
+        psi = self.heading(u)[0]
+        x, y, z = (points - self.centreline(u)).T
+        across = x * np.cos(psi) - z * np.sin(psi)
+        return u, np.arctan2(y, across), np.hypot(across, y)
+
+    def radius(self, u: Array, v: Array) -> Jet:
+        """Give r(u, v), mm, and its derivatives; u, v of shape (N,)."""
+        amplitude, angle = self.recipe.taenia_mm, 3 * (v - self._taenia_phase)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        zero = np.zeros_like(u)
+        f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
+        fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
+        for fold in self._folds:
+            sine, cosine = np.sin(v - fold.centre), np.cos(v - fold.centre)
+            x, w2 = u - fold.place - fold.slant * sine, fold.width**2
+            bump = fold.depth * np.exp(-(x**2) / (2 * w2) + fold.kappa * (cosine - 1))
+            # Derivatives of the exponent E; x_v = -slant cos.
+            eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
+            euv = fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
+            f -= bump
+            fu -= bump * eu
+            fv -= bump * ev
+            fuu -= bump * (eu * eu - 1 / w2)
+            fuv -= bump * (eu * ev + euv)
+            fvv -= bump * (ev * ev + evv)
+        for q, m, phase in self._relief:
+            angle = q * u + m * v + phase
+            sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
+            f += cosine
+            fu -= q * sine
+            fv -= m * sine
+            fuu -= q * q * cosine
+            fuv -= q * m * cosine
+            fvv -= m * m * cosine
+        return Jet(f, fu, fv, fuu, fuv, fvv)
+
+    def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Give T, rho and tau, three arrays of shape (N, 3)."""
+        psi = self.heading(u)[0]
+        s, c, zero = np.sin(psi), np.cos(psi), np.zeros_like(psi)
+        e1, e2 = np.stack([c, zero, -s], axis=1), np.array([0.0, 1.0, 0.0])
+        cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
+        return np.stack([s, zero, c], axis=1), cv * e1 + sv * e2, cv * e2 - sv * e1
+
+    def tangents(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Give P, mm, P_u and P_v, three arrays of shape (N, 3)."""
+        r, bend = self.radius(u, v), self.heading(u)[1]
+        T, rho, tau = self.frame(u, v)
+        along = (1 - bend * r.f * np.cos(v))[:, None]
+        position = self.centreline(u) + r.f[:, None] * rho
+        first, second = along * T + r.u[:, None] * rho, r.v[:, None] * rho + r.f[:, None] * tau
+        if not self._stalks:
+            return position, first, second
+        none = np.zeros_like(position)
+        moved = self._draw_out(Jet(position, first, second, none, none, none))
+        return moved.f, moved.u, moved.v
+
+    def jet(self, u: Array, v: Array) -> Jet:
+        """Give P, mm, and its derivatives by the formulas of this module's head; u, v of shape (N,)."""
+        r = self.radius(u, v)
+        _, bend, twist = self.heading(u)
+        cv, sv = np.cos(v), np.sin(v)
+        T, rho, tau = self.frame(u, v)
+
+        def combine(t: Array, radial: Array, around: Array) -> Array:
+            return t[:, None] * T + radial[:, None] * rho + around[:, None] * tau
+
+        along, zero = 1 - bend * r.f * cv, np.zeros_like(u)
+        wall = Jet(
+            f=self.centreline(u) + r.f[:, None] * rho,
+            u=combine(along, r.u, zero),
+            v=combine(zero, r.v, r.f),
+            uu=combine(-twist * r.f * cv - 2 * bend * r.u * cv, along * bend * cv + r.uu, -along * bend * sv),
+            uv=combine(bend * (r.f * sv - r.v * cv), r.uv, r.u),
+            vv=combine(zero, r.vv - r.f, 2 * r.v),
+        )
+        return self._draw_out(wall)
+
+    @property
+    def has_stalks(self) -> bool:
+        """Whether there are pedunculated polyps."""
+        return bool(self._stalks)
+
+    def drawn_out(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Tell which points, shape (N, 3), mm, are near enough to a pedunculated polyp to be moved by it."""
+        moved = np.zeros(len(points), dtype=bool)
+        for stalk in self._stalks:
+            moved |= stalk.moves(points)
+        return moved
+
+    def _draw_out(self, wall: Jet) -> Jet:
+        """Apply the pedunculated polyps."""
+        for stalk in self._stalks:
+            wall = stalk.apply(wall)
+        return wall
+
+    def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Give the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
+        p = self.jet(u, v)
+        normal = np.cross(p.u, p.v)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        J = np.stack([p.u, p.v], axis=2)
+        second = -np.stack([np.einsum("ni,ni->n", normal, d) for d in (p.uu, p.uv, p.uv, p.vv)], axis=1)
+        # dN(P_i) . P_j = -N . P_ij, so S = J G^-1 (-II) G^-1 J^T with G = J^T J.
+        dual = J @ np.linalg.inv(J.transpose(0, 2, 1) @ J)
+        return normal, dual @ second.reshape(-1, 2, 2) @ dual.transpose(0, 2, 1)
+
+    def solve(
+        self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
+    ) -> tuple[Array, Array, Array]:
+        """Solve P(u, v) = origin + t direction by Newton's method from a start close by.
+
+        Parameters
+        ----------
+        origins, directions : ndarray, shape (N, 3)
+            Rays, mm; unit directions.
+        distance, u, v : ndarray, shape (N,)
+            The start.
+
+        Returns
+        -------
+        distance, u, v : ndarray, shape (N,)
+            The solution; distance is NaN where there is none.
+        """
+        u, v, t = u.copy(), v.copy(), distance.copy()
+        found = np.zeros(len(u), dtype=bool)
+        active = np.flatnonzero(np.isfinite(distance))
+        for _ in range(NEWTON_STEPS):
+            p, pu, pv = self.tangents(u[active], v[active])
+            miss = p - origins[active] - t[active, None] * directions[active]
+            done = np.linalg.norm(miss, axis=1) < NEWTON_TOLERANCE_MM
+            found[active[done]] = True
+            active, pu, pv, miss = active[~done], pu[~done], pv[~done], miss[~done]
+            if not active.size:
+                break
+            du, dv, dt = _solve3(pu, pv, -directions[active], -miss)
+            # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
+            scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
+            u[active] += scale * du
+            v[active] += scale * dv
+            t[active] += scale * dt
+            active = active[np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM]
+        inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
+        return np.where(found & inside, t, np.nan), u, v
+
+
+def _solve3(a: Array, b: Array, c: Array, right: Array) -> tuple[Array, Array, Array]:
+    """Solve [a b c] x = right by Cramer's rule, all of shape (N, 3); a singular matrix gives inf or NaN."""
+    bc = np.cross(b, c)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / np.einsum("ni,ni->n", a, bc)
+        x = np.einsum("ni,ni->n", right, bc) * inverse
+        y = np.einsum("ni,ni->n", right, np.cross(c, a)) * inverse
+        z = np.einsum("ni,ni->n", right, np.cross(a, b)) * inverse
+    return x, y, z

@@ -1,0 +1,283 @@
+"""Depth maps of other data sets: reading them, their normals, and whether these are worth anything.
+
+16-bit PNG or TIFF with a scale, NPY, and EXR, as SimCol3D and C3VD have them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.reconstruction.image_io import MAX_PIXELS, read_raw
+from simtest.runtime.resources import shown
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+
+RADIUS_PX = 2
+"""Normals are of the plane through the points of so many pixels to each side."""
+
+JUMP_SHARE = 0.05
+"""A second difference above this share of the depth is an edge of a fold, where no plane fits."""
+
+FRONTAL_DEG, FRONTAL_SHARE = 1.0, 0.9
+"""Where nine tenths of the normals point so nearly back along the optical axis the map holds no slopes."""
+
+FLAT_SHARE = 0.5
+"""Where half of the neighbouring pixels have the very same depth it is a staircase."""
+
+WORST_ERROR_DEG = 1.0
+"""Most that the steps of the values may cost a normal: cone_axis is better than this on colons and livers."""
+
+WORST_TURN_DEG = 10.0
+"""Most that the normal may turn over the width of its own window, at nine tenths of the pixels."""
+
+
+@dataclass(frozen=True)
+class DepthVerdict:
+    """Whether a depth map's normals can serve as a reference for highlights.
+
+    Parameters
+    ----------
+    valid_share : float
+        Share of the pixels that have a normal.
+    frontal_share : float
+        Share of the normals within 1 deg of the direction back along the optical axis.
+    flat_share : float
+        Share of neighbouring pixels with the very same depth.
+    step_mm : float
+        Smallest step between values.
+    error_deg : float
+        What such steps cost a normal at the median depth, standard deviation.
+    turn_deg : float
+        Ninth decile of how far the normal turns over its own window.
+    problems : tuple of str
+        In words; empty where there are none.
+    """
+
+    valid_share: float
+    frontal_share: float
+    flat_share: float
+    step_mm: float
+    error_deg: float
+    turn_deg: float
+    problems: tuple[str, ...] = field(default=())
+
+
+def read_depth(path: Path, scale_mm: float | None = None) -> Array:
+    """Read a depth map.
+
+    Parameters
+    ----------
+    path : Path
+        PNG or TIFF of 8 or 16 bits or float, NPY, or EXR.
+    scale_mm : float, optional
+        mm of one step, for integers: they mean nothing without. For others a factor to mm, default 1.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        mm; NaN where the file holds none (0, negative or not finite).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of another kind, has several different channels, or an integer map has no scale.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise InputError(f"{shown(path)}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
+    if scale_mm is not None and not (math.isfinite(scale_mm) and scale_mm > 0):
+        raise InputError(f"--depth-scale {scale_mm:g}: must be a positive number of mm")
+    if suffix == ".npy":
+        values = _read_npy(path)
+    elif suffix == ".exr":
+        values = _read_exr(path)
+    else:
+        values = np.asarray(read_raw(path, "a depth map"))
+    if values.ndim == 3:
+        colours = values[:, :, :3]
+        if (colours != colours[:, :, :1]).any():
+            raise InputError(f"{shown(path)}: channels differ; a depth map has one, or equal ones")
+        values = values[:, :, 0]
+    if values.ndim != 2 or not values.size:
+        raise InputError(f"{shown(path)}: has shape {values.shape}; must be (H, W)")
+    if values.dtype.kind in "iu" and scale_mm is None:
+        raise InputError(f"{shown(path)}: holds integers; --depth-scale must say how many mm one step is")
+    depth = values.astype(float) * (1.0 if scale_mm is None else scale_mm)
+    depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+    if np.isnan(depth).all():
+        raise InputError(f"{shown(path)}: holds no positive depth")
+    return depth
+
+
+def _read_npy(path: Path) -> npt.NDArray[np.generic]:
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{shown(path)}: cannot be read ({str(error).splitlines()[0][:120]})") from None
+    if values.dtype.kind not in "iuf" or values.size > MAX_PIXELS:
+        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be up to {MAX_PIXELS} numbers")
+    return np.array(values)
+
+
+def _read_exr(path: Path) -> npt.NDArray[np.generic]:
+    # Imported here: the renderer's library reads EXR, and is slow to load.
+    from simtest.rendering.bitmap import read_bitmap
+
+    if not path.is_file():
+        raise InputError(f"{shown(path)}: no such file")
+    return read_bitmap(path)
+
+
+def depth_points(depth: Array, camera: Camera, kind: Literal["z", "distance"] = "z") -> Array:
+    """Give the surface points of a depth map, shape (H, W, 3), mm, camera frame.
+
+    Parameters
+    ----------
+    depth : ndarray, shape (H, W)
+        mm.
+    camera : Camera
+        Of the same size.
+    kind : {"z", "distance"}
+        Along the optical axis, or along the sightline.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise InputError(
+            f"depth map is {depth.shape[1]} x {depth.shape[0]} px: must be {camera.width} x {camera.height}, "
+            "the size of the camera's calibration"
+        )
+    rays = camera.unproject(camera.pixel_centres())
+    along = rays if kind == "distance" else rays / np.where(rays[..., 2:] > 0, rays[..., 2:], np.nan)
+    return np.asarray(depth[..., None] * along)
+
+
+def depth_normals(points: Array) -> Array:
+    """Give the normals of a map of points, shape (H, W, 3), unit, facing the camera; NaN where there is none.
+
+    The normal is across the two mean differences of the points of a window: exact on planes, through any lens.
+    """
+    window = np.arange(-RADIUS_PX, RADIUS_PX + 1, dtype=float)
+    slope, mean = window / (window**2).sum(), np.full(len(window), 1 / len(window))
+    known = np.asarray(np.isfinite(points).all(axis=-1))
+    values = np.where(known[..., None], points, 0.0)
+    along_x = cv2.sepFilter2D(values, cv2.CV_64F, slope, mean, borderType=cv2.BORDER_REPLICATE)
+    along_y = cv2.sepFilter2D(values, cv2.CV_64F, mean, slope, borderType=cv2.BORDER_REPLICATE)
+    normal = np.cross(along_x, along_y)
+    length = np.linalg.norm(normal, axis=-1)
+    sound = _whole(known & ~_jumps(values[..., 2], known)) & (length > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= length[..., None]
+    normal[np.einsum("hwi,hwi->hw", normal, values) > 0] *= -1
+    normal[~sound] = np.nan
+    return np.asarray(normal)
+
+
+def _jumps(depth: Array, known: Mask) -> Mask:
+    """Tell where the depth jumps."""
+    bend = np.zeros(depth.shape)
+    bend[:, 1:-1] = np.abs(depth[:, 2:] + depth[:, :-2] - 2 * depth[:, 1:-1])
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(depth[2:] + depth[:-2] - 2 * depth[1:-1]))
+    return np.asarray(known & (bend > JUMP_SHARE * np.abs(depth)))
+
+
+def _whole(known: Mask) -> Mask:
+    """Tell which pixels' windows hold nothing unknown, and do not leave the map."""
+    size = 2 * RADIUS_PX + 1
+    return cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
+
+
+def judge_depth(depth: Array, normals: Array, camera: Camera) -> DepthVerdict:
+    """Judge a depth map: whether its normals are degenerate, or too coarse for highlights.
+
+    Parameters
+    ----------
+    depth : ndarray, shape (H, W)
+        mm.
+    normals : ndarray, shape (H, W, 3)
+        See `depth_normals`.
+    camera : Camera
+        Calibration.
+
+    Returns
+    -------
+    DepthVerdict
+    """
+    sound = np.isfinite(normals).all(axis=-1)
+    share = float(sound.mean())
+    if not sound.any():
+        return DepthVerdict(0.0, math.nan, math.nan, math.nan, math.nan, math.nan, ("no pixel has a normal",))
+    frontal = float(np.mean(-normals[sound][:, 2] > math.cos(math.radians(FRONTAL_DEG))))
+    pairs = np.isfinite(depth[:, 1:]) & np.isfinite(depth[:, :-1])
+    flat = float(np.mean((depth[:, 1:] == depth[:, :-1])[pairs])) if pairs.any() else math.nan
+    values = np.unique(depth[np.isfinite(depth)])
+    step = float(np.median(np.diff(values))) if len(values) < depth.size / 50 and len(values) > 1 else 0.0
+    # Rounding to steps is noise of step / sqrt(12); over the window its slope has this share of it left.
+    side = 2 * RADIUS_PX + 1
+    left = step / math.sqrt(12) / math.sqrt(side * sum(k * k for k in range(-RADIUS_PX, RADIUS_PX + 1)))
+    error = math.degrees(math.atan(left * camera.fx / float(np.nanmedian(depth))))
+    turn = _turn_deg(normals)
+    problems = []
+    if frontal > FRONTAL_SHARE:
+        problems.append(f"degenerate: {100 * frontal:.0f} % of the normals point straight back along the optical axis")
+    elif flat > FLAT_SHARE:
+        problems.append(f"degenerate: {100 * flat:.0f} % of neighbouring pixels have the same depth, a staircase")
+    if error > WORST_ERROR_DEG:
+        problems.append(f"too coarse for highlights: steps of {step:.3g} mm cost a normal {error:.2g} deg")
+    if turn > WORST_TURN_DEG:
+        problems.append(f"too coarse for highlights: normals turn by {turn:.2g} deg over {side} px")
+    return DepthVerdict(share, frontal, flat, step, error, turn, tuple(problems))
+
+
+def _turn_deg(normals: Array) -> float:
+    """Give the ninth decile of the angle between normals a window apart, deg."""
+    side = 2 * RADIUS_PX + 1
+    cosine = np.einsum("hwi,hwi->hw", normals[:, side:], normals[:, :-side])
+    cosine = cosine[np.isfinite(cosine)]
+    return float(np.degrees(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else math.nan
+
+
+def sample(values: Array, points_px: Array) -> Array:
+    """Give a map's values, shape (H, W, ...), at pixel positions, shape (N, 2), by the four pixels around; or NaN."""
+    height, width = values.shape[:2]
+    places = np.asarray(points_px, dtype=float).reshape(-1, 2) - PIXEL_CENTRE
+    corner = np.clip(np.floor(places).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
+    fx, fy = np.clip(places - corner, 0, 1).T
+    x, y = corner.T
+    x1, y1 = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+    parts = ((x, y, (1 - fx) * (1 - fy)), (x1, y, fx * (1 - fy)), (x, y1, (1 - fx) * fy), (x1, y1, fx * fy))
+    shape = (-1, *([1] * (values.ndim - 2)))
+    return np.asarray(sum(weight.reshape(shape) * values[row, column] for column, row, weight in parts))
+
+
+def depths_at(
+    given: str, points_px: Sequence[Sequence[float] | None], size: tuple[int, int], scale_mm: float | None
+) -> list[float]:
+    """Give the depth at pixel positions: one number of mm for all, or a depth map's; NaN where there is none."""
+    try:
+        depth = float(given)
+    except ValueError:
+        values = read_depth(Path(given), scale_mm)
+        if values.shape != (size[1], size[0]):
+            raise InputError(
+                f"--depth {shown(given)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
+            ) from None
+        return [float(sample(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
+    if not (math.isfinite(depth) and depth > 0):
+        raise InputError(f"--depth {given}: must be a positive number of mm, or a depth map")
+    return [depth] * len(points_px)

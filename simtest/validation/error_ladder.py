@@ -1,0 +1,275 @@
+"""The error ladder: the error that is left when each stage's input is replaced by the exact one.
+
+Scenes have closed forms, so every stage's exact input is known: the frame without noise, the isophote as it runs
+between the pixels, the cone of the isophote, the normal itself. The light is at the camera.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import CIRCLE_POSE_ISOVALUE, CONE_AXIS_ISOVALUES, DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
+from simtest.errors import Failure
+from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Camera, CirclePose, Patch
+from simtest.geometry.circle_pose import circle_pose as pose_of_cone
+from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime.seeds import Stage, generator
+from simtest.validation import laws
+from simtest.validation.statistics import mean_interval
+
+Array = npt.NDArray[np.float64]
+
+DISTANCE_MM = 10.0
+EXPONENT = 50.0
+NOISE = 0.05
+REALISATIONS = 12
+CAMERA = Camera(406, 406, 406.0, 406.0, 203.0, 203.0)
+
+CONTOUR_POINTS = 240
+REACH_PX = 110.0
+"""Isophotes run nearer to the peak than this."""
+
+HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class ClosedScene:
+    """A plane, or a cylinder that is convex towards the camera, of a Phong lobe that is lit from the camera.
+
+    Parameters
+    ----------
+    name : str
+        For tables.
+    tilt_deg : float
+        Angle of the highlight from the optical axis.
+    kd : float
+        Distance over the cylinder's radius; 0: a plane.
+    """
+
+    name: str
+    tilt_deg: float
+    kd: float = 0.0
+
+    @property
+    def sightline(self) -> Array:
+        """To the brightest point, unit, shape (3,), camera frame."""
+        tilt = np.radians(self.tilt_deg)
+        return np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+
+    def _hit(self, sightlines: Array) -> tuple[Array, Array]:
+        """Give distance, mm, and cosine between normal and view along unit sightlines, shape (..., 3)."""
+        along = sightlines @ self.sightline
+        if not self.kd:
+            return DISTANCE_MM / along, along
+        radius = DISTANCE_MM / self.kd
+        # The cylinder runs along y, its axis lies behind the brightest point.
+        across = 1 - sightlines[..., 1] ** 2
+        reach = (DISTANCE_MM + radius) * along
+        under = reach**2 - across * ((DISTANCE_MM + radius) ** 2 - radius**2)
+        distance = (reach - np.sqrt(np.maximum(under, 0))) / across
+        cosine = np.sqrt(np.maximum(under, 0)) / radius
+        return np.where(under > 0, distance, np.inf), np.where(under > 0, cosine, 0.0)
+
+    def radiance(self, sightlines: Array) -> Array:
+        """Give the radiance along unit sightlines, shape (..., 3): cos(2 theta)^n over the squared distance."""
+        distance, cosine = self._hit(sightlines)
+        return np.asarray(np.maximum(2 * cosine**2 - 1, 0.0) ** EXPONENT / distance**2)
+
+    def normal(self) -> Array:
+        """Give the normal at the brightest point from the surface's own gradient, unit, shape (3,)."""
+        point = self._hit(self.sightline)[0] * self.sightline
+        if not self.kd:
+            return -self.sightline
+        out = point - (DISTANCE_MM + DISTANCE_MM / self.kd) * self.sightline
+        out[1] = 0.0
+        return np.asarray(out / np.linalg.norm(out))
+
+    def frame(self) -> npt.NDArray[np.float32]:
+        """Give the noise-free frame, its peak 1, shape (H, W)."""
+        columns, rows = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (CAMERA.width, CAMERA.height)))
+        value = self.radiance(CAMERA.unproject(np.stack([columns, rows], axis=-1)))
+        return np.asarray(value / self.radiance(self.sightline), dtype=np.float32)
+
+    def contour(self, isovalue: float) -> Array:
+        """Give points of the exact isophote, px, shape (N, 2): where the radiance is t times its peak."""
+        phase = np.linspace(0, 2 * np.pi, CONTOUR_POINTS, endpoint=False)
+        directions = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+        peak, level = CAMERA.project(self.sightline), isovalue * self.radiance(self.sightline)
+        low, high = np.zeros(CONTOUR_POINTS), np.full(CONTOUR_POINTS, REACH_PX)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            inside = self.radiance(CAMERA.unproject(peak + middle[:, None] * directions)) > level
+            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        return np.asarray(peak + low[:, None] * directions)
+
+    def cone(self, isovalue: float) -> Array:
+        """Give the exact cone: axis the sightline, half-axes those of the isophote in the principal sections."""
+        # A plane's isophote is a circle about its normal; on the cylinder both sections are of one curvature.
+        across, along = laws.isophote_half_width(isovalue, EXPONENT, np.array([self.kd, 0.0]))
+        y = np.array([0.0, 1.0, 0.0])
+        x = np.cross(y, self.sightline)
+        s = self.sightline
+        return np.asarray(np.outer(x, x) / across**2 + np.outer(y, y) / along**2 - np.outer(s, s))
+
+
+SCENES = (
+    ClosedScene("plane, 5° off the axis", 5.0),
+    ClosedScene("plane, 20° off the axis", 20.0),
+    ClosedScene("cylinder R = d, 10° off the axis", 10.0, 1.0),
+)
+
+
+@dataclass(frozen=True)
+class ExactPatch(Patch):
+    """A patch whose contours are not measured but given.
+
+    Parameters
+    ----------
+    scene : ClosedScene
+        Gives them.
+    """
+
+    scene: ClosedScene = SCENES[0]
+
+    def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
+        """Give the exact isophotes (see `Patch.crossings_of`)."""
+        return [self.scene.contour(t) for t in isovalues]
+
+    @classmethod
+    def of(cls, patch: Patch, scene: ClosedScene) -> "ExactPatch":
+        """Give a patch's pixels with the exact contours and peak of a scene."""
+        held = {field.name: getattr(patch, field.name) for field in fields(Patch) if field.init}
+        fresh = {"_level_sets": {}, "_cut_sets": {}, "peak_px": CAMERA.project(scene.sightline), "noise": None}
+        return cls(**(held | fresh), scene=scene)
+
+
+@dataclass(frozen=True)
+class _Ladder:
+    """An estimator with its last stage, which takes poses to candidates, shape (K, 3)."""
+
+    whole: Callable[[Patch, Camera], Estimate | Failure]
+    isovalues: tuple[float, ...]
+    last: Callable[[Sequence[CirclePose]], Array]
+
+
+def _mean_axis(poses: Sequence[CirclePose]) -> Array:
+    axis = np.sum([pose.axis for pose in poses], axis=0)
+    return np.asarray(-axis[None] / np.linalg.norm(axis))
+
+
+ESTIMATORS = {
+    "circle_pose": _Ladder(circle_pose, (CIRCLE_POSE_ISOVALUE,), lambda poses: poses[0].normals),
+    "cone_axis": _Ladder(cone_axis, CONE_AXIS_ISOVALUES, _mean_axis),
+}
+
+RUNGS = {
+    "as it is": f"noisy frames (sigma {NOISE:g}), smoothed by {DEFAULT_SMOOTHING_PX:g} px, the whole pipeline",
+    "no noise": "the frame replaced by the noise-free one, smoothed as before",
+    "no smoothing": "the smoothed frame replaced by the noise-free one as it is",
+    "exact contour": "the contour traced between pixels replaced by the exact isophote",
+    "exact cone": "the cone of the fitted ellipse replaced by the exact one; what is left is the model's",
+    "exact pose": "the pose's candidates replaced by the exact normal: nothing but rounding is left",
+}
+"""What is replaced at each rung, all that came before it included."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """The error at one rung.
+
+    Parameters
+    ----------
+    scene, estimator, name : str
+        Where.
+    errors_deg : ndarray, shape (n,)
+        Angle between the true normal and the better candidate; a realisation each, or one alone.
+    failures : int
+        Realisations without an answer, which are not among the errors.
+    """
+
+    scene: str
+    estimator: str
+    name: str
+    errors_deg: Array
+    failures: int = 0
+
+    @property
+    def mean_deg(self) -> float | None:
+        """Mean error; None where nothing answered."""
+        return float(self.errors_deg.mean()) if len(self.errors_deg) else None
+
+    @property
+    def interval_deg(self) -> tuple[float | None, float | None]:
+        """95 % interval of the mean (Student's t); None for one error alone."""
+        return mean_interval(self.errors_deg)
+
+
+def error_ladder(scenes: Sequence[ClosedScene] = SCENES, realisations: int = REALISATIONS, seed: int = 0) -> list[Rung]:
+    """Compute the ladder of each scene and estimator.
+
+    Parameters
+    ----------
+    scenes : sequence of ClosedScene
+        Which.
+    realisations : int
+        Noisy frames of the first rung.
+    seed : int
+        Of their noise.
+
+    Returns
+    -------
+    list of Rung
+        Scene by scene, estimator by estimator, in the order of `RUNGS`.
+    """
+    return [rung for scene in scenes for rung in _of_scene(scene, realisations, seed)]
+
+
+def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung]:
+    clean = scene.frame()
+    frames = []
+    for number in range(realisations):
+        rng = generator(seed, "error ladder", scene.name, number, Stage.SENSOR)
+        frames.append(clean + np.float32(NOISE) * rng.standard_normal(clean.shape, dtype=np.float32))
+    noisy = [_whole(frame, DEFAULT_SMOOTHING_PX)[0] for frame in frames]
+    smoothed, _ = _whole(clean, DEFAULT_SMOOTHING_PX)
+    sharp, patch = _whole(clean, 0.0)
+    exact = None if isinstance(patch, Failure) else ExactPatch.of(patch, scene)
+    for name, estimator in ESTIMATORS.items():
+        steps: tuple[list[Array | None], ...] = (
+            [found[name] for found in noisy], [smoothed[name]], [sharp[name]],
+            [None if exact is None else _candidates(estimator.whole(exact, CAMERA))],
+            [_of_cones(estimator, scene)], [scene.normal()[None]],
+        )  # fmt: skip
+        for rung, candidates in zip(RUNGS, steps, strict=True):
+            yield _rung(scene, name, rung, candidates)
+
+
+def _rung(scene: ClosedScene, estimator: str, name: str, found: Sequence[Array | None]) -> Rung:
+    errors = [float(angle_deg(candidates, -scene.sightline).min()) for candidates in found if candidates is not None]
+    return Rung(scene.name, estimator, name, np.array(errors), len(found) - len(errors))
+
+
+def _whole(frame: npt.NDArray[np.float32], smoothing_px: float) -> tuple[dict[str, Array | None], Patch | Failure]:
+    """Reconstruct a frame as a user would; gives the candidates by estimator, and the patch.
+
+    A frame without a peak is a fault of what is tested, and counts as one that nothing answers.
+    """
+    whole = (0, 0, CAMERA.width, CAMERA.height)
+    (spot,) = reconstruct(frame, CAMERA, list(ESTIMATORS), whole, smoothing_px)
+    return {name: _candidates(spot.estimates[name]) for name in ESTIMATORS}, spot.patch
+
+
+def _of_cones(estimator: _Ladder, scene: ClosedScene) -> Array | None:
+    poses = [pose_of_cone(scene.cone(t)) for t in estimator.isovalues]
+    sound = [pose for pose in poses if not isinstance(pose, Failure)]
+    return estimator.last(sound) if len(sound) == len(poses) else None
+
+
+def _candidates(result: Estimate | Failure) -> Array | None:
+    return None if isinstance(result, Failure) else result.candidates

@@ -1,0 +1,274 @@
+"""Comparison of reconstructed normals with a reference: a registered model, or a depth map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.runtime.resources import shown
+from simtest.spec.toml_input import read_toml
+from simtest.validation.depth_maps import (
+    DEPTH_SUFFIXES,
+    DepthVerdict,
+    depth_normals,
+    depth_points,
+    judge_depth,
+    read_depth,
+)
+from simtest.validation.depth_maps import sample as sample_map
+
+Array = npt.NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-3
+"""Most that R^T R may differ from the identity, entry by entry: poses are written with a few digits."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A mesh with a tree to cast rays on it.
+
+    Parameters
+    ----------
+    vertices, normals : ndarray, shape (V, 3)
+        Model frame; mm and unit.
+    faces : ndarray of int, shape (F, 3)
+    """
+
+    vertices: Array
+    normals: Array
+    faces: npt.NDArray[np.integer]
+
+    @cached_property
+    def _tree(self) -> tuple[Any, Array, npt.NDArray[np.int64]]:
+        import igl
+
+        vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces, dtype=np.int64)
+        tree = igl.AABB()
+        tree.init(vertices, faces)
+        return tree, vertices, faces
+
+    def cast(self, origin: Array, directions: Array) -> Array:
+        """Give the normals where rays from a point, shape (3,), along (N, 3), meet the mesh first, facing the rays.
+
+        NaN where none does, and for directions that are not finite.
+        """
+        tree, vertices, faces = self._tree
+        known = np.asarray(np.isfinite(directions).all(axis=1))
+        rays = np.ascontiguousarray(np.where(known[:, None], directions, 1.0))
+        origins = np.ascontiguousarray(np.broadcast_to(origin, rays.shape))
+        face, _, weights = tree.intersect_ray_first(vertices, faces, origins, rays)
+        hit = known & (face >= 0)
+        # What the tree gives for rays that miss is not set.
+        u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
+        corners = self.normals[faces[np.where(hit, face, 0)]]
+        normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal[np.einsum("ni,ni->n", normal, rays) > 0] *= -1
+        normal[~hit] = np.nan
+        return np.asarray(normal)
+
+
+@dataclass(frozen=True)
+class MeshReference:
+    """A model placed in the camera frame.
+
+    Parameters
+    ----------
+    model : Model
+        The mesh.
+    camera_from_model : ndarray, shape (4, 4)
+        Rigid.
+    source : str
+        The file.
+    """
+
+    model: Model
+    camera_from_model: Array
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def normals_at(self, pixels: Array, camera: Camera) -> Array:
+        """Give the model's normals where the sightlines of pixels, shape (N, 2), meet it first; NaN where none does."""
+        R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
+        return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
+
+
+@dataclass(frozen=True)
+class DepthReference:
+    """A depth map's normals.
+
+    Parameters
+    ----------
+    map : ndarray, shape (H, W, 3)
+        Unit normals, camera frame; NaN where there is none.
+    verdict : DepthVerdict
+        Whether they can serve.
+    source : str
+        The file.
+    """
+
+    map: Array
+    verdict: DepthVerdict
+    source: str
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong with it."""
+        return self.verdict.problems
+
+    def normals_at(self, pixels: Array, camera: Camera) -> Array:
+        """Give the normals at pixels, shape (N, 2); NaN where there is none."""
+        del camera
+        normal = sample_map(self.map, pixels)
+        return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+Reference = MeshReference | DepthReference
+
+
+def load_reference(
+    path: Path, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None,
+    depth_kind: Literal["z", "distance"] = "z",
+) -> Reference:  # fmt: skip
+    """Read a reference: a mesh with its pose, or a depth map, which is in the camera frame already.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or malformed, a mesh has no pose, a depth map has one, or sizes differ.
+    """
+    if path.suffix.lower() in DEPTH_SUFFIXES:
+        if pose is not None:
+            raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
+        depth = read_depth(path, depth_scale_mm)
+        points = depth_points(depth, camera, depth_kind)
+        normals = depth_normals(points)
+        return DepthReference(normals, judge_depth(points[..., 2], normals, camera), str(path))
+    if pose is None:
+        raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
+    from simtest.surfaces.mesh_surface import prepare
+
+    camera_from_model = read_pose(pose)
+    mesh = prepare(path, 0).mesh
+    return MeshReference(Model(mesh.vertices, mesh.normals, mesh.faces), camera_from_model, str(path))
+
+
+def read_pose(path: Path) -> Array:
+    """Read camera_from_model, shape (4, 4): lengths in mm.
+
+    Parameters
+    ----------
+    path : Path
+        TOML with ``matrix``, 4 x 4 or 3 x 4, or with ``rotation``, 3 x 3, and ``translation_mm``.
+
+    Raises
+    ------
+    InputError
+        If a key is missing or malformed, or the rotation is none.
+    """
+    data = read_toml(path)
+    where = shown(path)
+    allowed = {"matrix", "rotation", "translation_mm"}
+    if unknown := sorted(set(data) - allowed):
+        raise InputError(f"{where}: {unknown[0]}: unknown key; allowed: {', '.join(sorted(allowed))}")
+    pose = np.eye(4)
+    if "matrix" in data:
+        if len(data) > 1:
+            raise InputError(f"{where}: matrix excludes rotation and translation_mm; give one or the other")
+        matrix = _numbers(data, "matrix", ((4, 4), (3, 4)), where)
+        if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1]):
+            raise InputError(f"{where}: matrix: last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
+        pose[:3] = matrix[:3]
+    else:
+        pose[:3, :3] = _numbers(data, "rotation", ((3, 3),), where)
+        pose[:3, 3] = _numbers(data, "translation_mm", ((3,),), where)
+    R = pose[:3, :3]
+    off = float(np.abs(R.T @ R - np.eye(3)).max())
+    if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        what = "a mirror image" if off <= ROTATION_TOLERANCE else f"R^T R differs from the identity by {off:.2g}"
+        raise InputError(f"{where}: the pose's 3 x 3 part is no rotation ({what}); it must be one, lengths in mm")
+    # The digits of the file are a little off; the nearest rotation is meant.
+    u, _, vt = np.linalg.svd(R)
+    pose[:3, :3] = u @ vt
+    return pose
+
+
+def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]], where: str) -> Array:
+    if key not in data:
+        raise InputError(f"{where}: {key}: missing; a pose has matrix, or rotation and translation_mm")
+    try:
+        values = np.array(data[key], dtype=float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape not in shapes or not np.isfinite(values).all():
+        wanted = " or ".join(" x ".join(str(n) for n in shape) for shape in shapes)
+        raise InputError(f"{where}: {key} = {shown(str(data[key]), 60)}: must be {wanted} finite numbers")
+    return values
+
+
+def comparison(spots: Sequence[dict[str, Any]], camera: Camera, reference: Reference) -> dict[str, Any]:
+    """Compare the normals of specularities with a reference at their brightest points.
+
+    Each specularity gains ``reference``: the normal, and the angle of each estimator, deg: of the proposed normal, and
+    of the better candidate, as the article chooses by hand.
+
+    Parameters
+    ----------
+    spots : sequence of dict
+        As in normals.json; changed.
+    camera : Camera
+        Calibration.
+    reference : MeshReference or DepthReference
+
+    Returns
+    -------
+    dict
+        The file, what is wrong with it, how many sightlines miss it, and by estimator: n, mean_deg, std_deg, and the
+        same of the better candidates.
+    """
+    placed = [spot for spot in spots if spot["peak_px"] is not None]
+    peaks = np.array([spot["peak_px"] for spot in placed], dtype=float).reshape(-1, 2)
+    normals = reference.normals_at(peaks, camera) if placed else np.empty((0, 3))
+    errors: dict[str, list[tuple[float, float]]] = {}
+    missed = 0
+    for spot, normal in zip(placed, normals, strict=True):
+        if not np.isfinite(normal).all():
+            spot["reference"] = None
+            missed += 1
+            continue
+        own = {}
+        for name, result in spot["estimates"].items():
+            if result["status"] == "ok":
+                angles = [angle_deg(np.array(candidate), normal) for candidate in result["candidates"]]
+                own[name] = {"error_deg": angles[0], "error_oracle_deg": min(angles)}
+                errors.setdefault(name, []).append((angles[0], min(angles)))
+        spot["reference"] = {"normal": normal.tolist(), "errors": own}
+    return {
+        "source": reference.source,
+        "problems": list(reference.notes),
+        "compared": len(placed) - missed,
+        "missed": missed,
+        "estimators": {name: _summary(np.array(pairs)) for name, pairs in errors.items()},
+    }
+
+
+def angle_deg(first: Array, second: Array) -> float:
+    """Give the angle between two unit vectors, deg."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
+
+
+def _summary(pairs: Array) -> dict[str, Any]:
+    spread = pairs.std(axis=0, ddof=1) if len(pairs) > 1 else np.array([None, None])
+    return {
+        "n": len(pairs),
+        "mean_deg": float(pairs[:, 0].mean()),
+        "std_deg": None if spread[0] is None else float(spread[0]),
+        "mean_oracle_deg": float(pairs[:, 1].mean()),
+        "std_oracle_deg": None if spread[1] is None else float(spread[1]),
+    }

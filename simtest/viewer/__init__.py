@@ -1,6 +1,0 @@
-"""A scene in 3D: its surface coloured by curvature, camera, lights, true and estimated normals."""
-
-from simtest.viewer.content import Content, make_content
-from simtest.viewer.window import check_target, save_screenshot, show
-
-__all__ = ["Content", "check_target", "make_content", "save_screenshot", "show"]

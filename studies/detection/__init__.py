@@ -1,0 +1,1 @@
+"""Detection of specularities on rendered frames whose specular pixels are known, beside two other detectors."""

@@ -1,0 +1,267 @@
+"""Draws the nights and counts what the gate says of them."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from benchmarks.measuring import Figure
+from simtest.errors import SimtestError
+from simtest.nightly.canaries import run_canaries
+from simtest.nightly.canaries.randomness import noises
+from simtest.nightly.gate.contrasts import margin_of
+from simtest.nightly.gate.limits import Limits
+from simtest.nightly.gate.quantities import quantities
+from simtest.runtime.engines import make_engine
+from simtest.spec import Experiment
+from simtest.validation.runner import run_experiment
+from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
+from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
+from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_places, judge_many, raised
+
+FRESH_NIGHTS, PAIRED_NIGHTS, DETECTION_NIGHTS, CANARY_SEEDS = 1000, 200, 100, 100
+N = 10
+"""Realisations of each setting in a night."""
+
+RISE = 0.10
+MOST_ALARMS, LEAST_DETECTION = 0.01, 0.95
+CLEAR_MARGINS = 2.0
+"""A rise that is nowhere as many margins is hardly one, and has no detection to reach."""
+
+HARMLESS_CONTENT = {"paper": 10, "curvature": 4, "light_offset": 4, "compare": 4, "anatomy": 2}
+"""Realisations of each setting that are made again with harmless changes; of a night's: `HARMLESS_N`."""
+
+HARMLESS_N = 3
+TWO_PROCESSES = "two processes of half the threads"
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How often the gate raised the alarm.
+
+    Parameters
+    ----------
+    name : str
+        Of what was changed.
+    nights : int
+        How many were judged.
+    alarms : int
+        How many of them were called a regression.
+    about : str
+        What else is known.
+    """
+
+    name: str
+    nights: int
+    alarms: int
+    about: str = ""
+
+    @property
+    def share(self) -> float:
+        """Alarms over nights."""
+        return self.alarms / self.nights
+
+
+@dataclass(frozen=True)
+class Caught:
+    """What saw a planted fault.
+
+    Parameters
+    ----------
+    name : str
+        Of the fault.
+    canaries : tuple of str
+        Those that failed.
+    paired, fresh : Rate
+        Of nights of the same seeds, and of others.
+    stops : bool
+        Whether the night could not be run: exit 2, which is seen as well.
+    """
+
+    name: str
+    canaries: tuple[str, ...]
+    paired: Rate
+    fresh: Rate
+    stops: bool
+
+    @property
+    def share(self) -> float:
+        """Share of nights in which the fault is seen: canaries see it in each."""
+        return 1.0 if self.canaries else self.paired.share
+
+
+def bank_folder() -> Path:
+    """Give the bank's folder."""
+    return Path(os.environ.get("GATE_BANK") or Path(tempfile.gettempdir()) / "gate-bank")
+
+
+def _rate(name: str, draw: Draw, nights: int, first_seed: int = 0, about: str = "") -> Rate:
+    found = judge_many(draw, range(first_seed, first_seed + nights))
+    return Rate(name, nights, sum(night.regression for night in found), about or _family(found))
+
+
+def _family(found: list[Found]) -> str:
+    tests = [night.tests for night in found]
+    least = min(night.least for night in found)
+    return f"{min(tests)} to {max(tests)} tests a night, least corrected p-value {least:.2g}"
+
+
+def false_alarms(bank: pl.DataFrame, nights: int = FRESH_NIGHTS) -> list[Rate]:
+    """Judge nights of fresh seeds against others, where nothing has changed."""
+    source = Source.of(bank)
+    return [_rate(f"{n} fresh realisations a setting", Fresh(source, n), nights) for n in (N, 2)]
+
+
+def harmless(nights: int = PAIRED_NIGHTS) -> list[Rate]:
+    """Judge nights whose code rounds in another way against nights of the same seeds."""
+    before = _again(HARMLESS_CONTENT)
+    made = []
+    for name, mutations in {TWO_PROCESSES: (), **HARMLESS}.items():
+        after = _again(HARMLESS_CONTENT, mutations, workers=2 if name == TWO_PROCESSES else 1)
+        equal = equal_places(before, after) if before.height == after.height else None
+        draw = Paired(Source.of(before), Source.of(after), HARMLESS_N, equal)
+        places = after.select("experiment", "setting", "estimator").n_unique()
+        same = 0 if equal is None else equal.height
+        about = f"{same} of {places} places bit-equal; {_apart(before, after)}"
+        made.append(_rate(name, draw, nights, about=about))
+    return made
+
+
+def _apart(before: pl.DataFrame, after: pl.DataFrame) -> str:
+    """Say how far the errors of the same highlights are apart."""
+    keys = ("experiment", "setting", "realisation", "estimator", "true_id")
+    both = before.drop_nulls("error_deg").join(after.drop_nulls("error_deg"), on=keys, suffix="_2")
+    apart = (both["error_deg"] - both["error_deg_2"]).abs().drop_nulls().to_numpy()
+    return f"errors differ by up to {apart.max():.2g} deg"
+
+
+def _again(content: dict[str, int], mutations: tuple[Mutation, ...] = (), workers: int = 1) -> pl.DataFrame:
+    """Make realisations of the bank's experiments under mutations; these are in this process alone."""
+    return _made([experiment(name, count) for name, count in content.items()], mutations, workers)
+
+
+def _made(experiments: list[Experiment], mutations: tuple[Mutation, ...] = (), workers: int = 1) -> pl.DataFrame:
+    tables = []
+    with tempfile.TemporaryDirectory() as folder, planted(*mutations):
+        for each in experiments:
+            engine = make_engine("local", workers)
+            tables.append(run_experiment(each, Path(folder) / each.name, engine=engine).results)
+    return pl.concat([table.select(*COLUMNS, *EXTRA) for table in tables])
+
+
+EXTRA = ("noise_sigma", "normal_x", "normal_y", "normal_z")
+"""Columns beside the gate's that canaries of a night's rows look at."""
+
+
+def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate, Rate, bool]]:
+    """Judge nights in which one estimator's errors are 10 % larger: paired, and of fresh seeds; and tell if clearly."""
+    source = Source.of(bank)
+    made = []
+    for estimator in sorted(bank["estimator"].unique()):
+        after = Source(raised(bank, estimator, RISE), source.unit, source.setting)
+        own = bank.filter(pl.col("estimator") == estimator).group_by("experiment", "setting")
+        means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls().to_numpy()
+        margins = RISE * means / margin_of(quantities(Limits())["mean_deg"], means)
+        about = f"{(margins > 1).sum()} of {len(means)} settings, by {margins.max():.2g} margins at most"
+        made.append(
+            (
+                _rate(estimator, Paired(source, after, N), nights, about=about),
+                _rate(estimator, Fresh(source, N, after), nights),
+                bool(margins.max() >= CLEAR_MARGINS),
+            )
+        )
+    return made
+
+
+def proof_experiments(realisations: int = 2 * N) -> list[Experiment]:
+    """Give the experiments that faults are planted into: kinds of surface, a light beside the camera, the protocol."""
+    plain = {"camera.width": 320, "camera.height": 320}
+    groups = [
+        {"scene": "plane", "label": "plane", "isolated": False, "set": plain},
+        {"scene": "cylinder", "label": "cylinder", "isolated": False, "set": plain,
+         "sweep": [{"surface.radius_mm": [30.0, 5.0]}]},
+        {"scene": "sphere", "label": "sphere", "isolated": False, "set": plain},
+        {"scene": "saddle", "label": "saddle", "isolated": False, "set": plain},
+        {"scene": "plane", "label": "light aside", "isolated": False,
+         "set": {**plain, "rig.lights.0.offset_mm": 1.0, "rig.lights.0.azimuth_deg": 50.0}},
+        {"scene": "anatomy", "label": "colon", "realisations": realisations // 4,
+         "set": {"camera.width": 320, "camera.height": 240, "camera.fx": 160.0, "camera.fy": 160.0},
+         "pool": [{"surface.viewpoint": [1, 2, 3, 4]}]},
+    ]  # fmt: skip
+    estimators = ("circle_pose", "brightest_point", "cone_axis", "curved")
+    published = [{"scene": "published", "label": "published", "sweep": [{"paper.sigma": [0.02, 0.05]}]}]
+    return [
+        Experiment(name="rendered", realisations=realisations, estimators=estimators, groups=groups),
+        Experiment(name="protocol", realisations=realisations, estimators=("circle_pose",), groups=published),
+    ]
+
+
+def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS)) -> list[Caught]:
+    """Plant each fault, and ask canaries and gate; the first of the list is the code as it is."""
+    sound = _made(proof_experiments())
+    before = Source.of(sound)
+    made = []
+    for name, mutations in {"none": (), **{name: FAULTS[name] for name in names}}.items():
+        rows: pl.DataFrame | None = None
+        try:
+            rows = sound if name == "none" else _made(proof_experiments(), mutations)
+        except SimtestError as error:
+            stopped = f"the night stops: {error}"
+        with planted(*mutations):
+            canaries = run_canaries(rows)
+        failed = canaries.filter(~pl.col("passed").fill_null(False))
+        watch = tuple(f"{e} {q}" for e, q in failed.select("experiment", "quantity").iter_rows())
+        if rows is None:
+            both = (Rate(name, nights, nights, stopped),) * 2
+        else:
+            equal = equal_places(sound, rows) if rows.height == sound.height else None
+            after = Source.of(rows)
+            both = tuple(_rate(name, draw, nights) for draw in _draws(before, after, equal))
+        made.append(Caught(name, watch, *both, rows is None))
+    return made
+
+
+def _draws(before: Source, after: Source, equal: pl.DataFrame | None) -> tuple[Draw, Draw]:
+    return Paired(before, after, N, equal), Fresh(before, N, after)
+
+
+def noise_canaries(seeds: int = CANARY_SEEDS) -> tuple[Rate, Rate]:
+    """Ask the canaries that hold noise, with many seeds: of the code as it is, and with the noise seed reused."""
+    rates = []
+    for name in ("none", "noise seed reused"):
+        with planted(*FAULTS.get(name, ())):
+            failed = [any(not canary.passed for canary in noises(seed=seed)) for seed in range(seeds)]
+        rates.append(Rate(name, seeds, sum(failed)))
+    return rates[0], rates[1]
+
+
+def figures() -> list[Figure]:
+    """Give all figures beside their limits."""
+    bank = load_bank(bank_folder())
+    made = [Figure("realisations in the bank", frames_of(bank), 20_000, True, "")]
+    made += [_alarm(f"false alarms, {rate.name}", rate) for rate in (*false_alarms(bank), *harmless())]
+    for paired, fresh, clear in rises(bank):
+        name = f"errors of {paired.name} up by {RISE:.0%}"
+        made.append(_detection(f"{name}, same seeds", paired, LEAST_DETECTION if clear else None))
+        made.append(Figure(f"{name}, fresh seeds", fresh.share, unit="", about=fresh.about))
+    for caught in faults():
+        about = ", ".join(caught.canaries) or caught.paired.about
+        if caught.name == "none":
+            made.append(Figure("code as it is: canaries that fail", len(caught.canaries), 0, unit="", about=about))
+            made.append(_alarm("code as it is, gate, fresh seeds", caught.fresh))
+        else:
+            made.append(Figure(caught.name, caught.share, LEAST_DETECTION, True, "", about))
+    sound, reused = noise_canaries()
+    made.append(_alarm("canaries of noise, code as it is", sound))
+    made.append(_detection("canaries of noise, seed reused", reused))
+    return made
+
+
+def _alarm(name: str, rate: Rate) -> Figure:
+    return Figure(name, rate.share, MOST_ALARMS, unit="", about=f"{rate.alarms} of {rate.nights}; {rate.about}")
+
+
+def _detection(name: str, rate: Rate, least: float | None = LEAST_DETECTION) -> Figure:
+    return Figure(name, rate.share, least, True, "", f"{rate.alarms} of {rate.nights}; {rate.about}")
