@@ -37,7 +37,7 @@ RECIPE = {"relief_mm": 0.5, "relief_length_mm": 20.0}
 
 
 @dataclass(frozen=True)
-class Spot:
+class Observation:
     """A specularity: its peak, px, candidate normals by name, and the view's camera and camera_from_model."""
 
     peak: np.ndarray
@@ -47,7 +47,7 @@ class Spot:
     view: int
 
 
-def spots(recipe: Path) -> list[Spot]:
+def spots(recipe: Path) -> list[Observation]:
     """Give the specularities of the views that have the most, the brightest first, in equal parts."""
     estimators, session, views = load_estimators(ESTIMATORS), None, []
     for viewpoint in range(TRIED):
@@ -72,16 +72,18 @@ def spots(recipe: Path) -> list[Spot]:
                 if isinstance(result, Estimate):
                     normals[name] = result.candidates
             if len(normals) == 1 + len(ESTIMATORS):
-                made.append(Spot(truths[j].highlight.bp_px, normals, session.camera, camera_from_model, viewpoint))
+                made.append(
+                    Observation(truths[j].highlight.bp_px, normals, session.camera, camera_from_model, viewpoint)
+                )
         views.append(made)
     views.sort(key=len, reverse=True)
-    taken: list[Spot] = []
+    taken: list[Observation] = []
     for rank in range(max(len(made) for made in views)):
         taken += [made[rank] for made in views[:VIEWS] if rank < len(made)]
     return taken[:SPECULARITIES]
 
 
-def moved(spot: Spot, middle: np.ndarray, error: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+def moved(spot: Observation, middle: np.ndarray, error: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
     """Give camera_from_model with a registration error of a length, mm, and an angle, deg."""
     import cv2
 
@@ -95,7 +97,7 @@ def moved(spot: Spot, middle: np.ndarray, error: tuple[float, float], rng: np.ra
     return wrong @ spot.camera_from_model
 
 
-def study(found: list[Spot], model: Model, error: tuple[float, float]) -> dict[str, np.ndarray]:
+def study(found: list[Observation], model: Model, error: tuple[float, float]) -> dict[str, np.ndarray]:
     """Give the angles by name, deg: each draw is one registration of each view; the better candidate counts."""
     angles: dict[str, list[float]] = {}
     middle = model.vertices.mean(axis=0)

@@ -2,7 +2,16 @@
 
 from simtest.calibration.calibration import Calibration, CorrectedFrame
 from simtest.calibration.noise_model import NoiseModel
-from simtest.calibration.priors import Known
+from simtest.calibration.priors import NO_PRIORS, Priors
 from simtest.calibration.response import Response, srgb_decode, srgb_encode
 
-__all__ = ["Calibration", "CorrectedFrame", "Known", "NoiseModel", "Response", "srgb_decode", "srgb_encode"]
+__all__ = [
+    "NO_PRIORS",
+    "Calibration",
+    "CorrectedFrame",
+    "NoiseModel",
+    "Priors",
+    "Response",
+    "srgb_decode",
+    "srgb_encode",
+]

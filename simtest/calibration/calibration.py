@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration.noise_model import NoiseModel
-from simtest.calibration.priors import Known
+from simtest.calibration.priors import Priors
 from simtest.calibration.response import Response
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
@@ -67,7 +67,7 @@ class Calibration:
         What is known of the noise; white noise beyond it is estimated from each frame.
     saturation_level : float, optional
         Value, as encoded, at and above which a pixel is clipped; None: not known, no pixel counts as clipped.
-    known : Known
+    priors : Priors
         What is known of lights, distance and lobe: passed on to the estimators that ask for it.
 
     Raises
@@ -82,7 +82,7 @@ class Calibration:
     emission: AngularProfile = field(default_factory=AngularProfile)
     noise: NoiseModel = field(default_factory=NoiseModel)
     saturation_level: float | None = None
-    known: Known = field(default_factory=Known)
+    priors: Priors = field(default_factory=Priors)
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):

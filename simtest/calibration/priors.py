@@ -12,7 +12,7 @@ MAX_LIGHTS = 32
 
 
 @dataclass(frozen=True)
-class Known:
+class Priors:
     """What estimators may be told beside the picture and the camera; each part may be missing.
 
     Parameters
@@ -55,3 +55,7 @@ class Known:
     def lights(self) -> npt.NDArray[np.float64]:
         """Nominal places of the lights, shape (L, 3), camera frame, mm."""
         return np.array(self.lights_mm, dtype=float).reshape(-1, 3)
+
+
+NO_PRIORS = Priors()
+"""Nothing is known beside the picture and the camera."""

@@ -16,8 +16,8 @@ def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
     """
     from simtest import api
     from simtest.cli.progress import progress_bar
-    from simtest.dataset import write_frame
     from simtest.runtime.files import refuse_file
+    from simtest.simulation.labelled_frame import write_frame
     from simtest.spec import parse_settings
 
     refuse_file(out)

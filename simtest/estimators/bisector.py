@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import spot_flags
-from simtest.estimators.isophote_family import Spot, fit_spot
+from simtest.estimators.flags import isophote_flags
+from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
@@ -17,7 +17,6 @@ from simtest.geometry.vectors import tangent_basis
 
 Array = npt.NDArray[np.float64]
 
-NOTHING_KNOWN = Known()
 
 STEP = 1e-4
 """Step of the differences of the normal, rad, and as a share of the distance."""
@@ -26,7 +25,7 @@ STEP = 1e-4
 def bisector(
     patch: Patch,
     camera: Camera,
-    known: Known = NOTHING_KNOWN,
+    priors: Priors = NO_PRIORS,
     isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
 ) -> Estimate | Failure:
     """Bisect the directions to the light and to the camera at P = d s (theory.md section 3, item 1).
@@ -41,7 +40,7 @@ def bisector(
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Its lights and distance are needed.
     isovalues : sequence of float
         Each t in (0, 1).
@@ -54,27 +53,27 @@ def bisector(
         others are (`light_of_highlight`); where it cannot be told, the lights' mean place is used, flagged
         ``ambiguous_light``.
     """
-    if not known.lights_mm or known.distance_mm is None:
+    if not priors.lights_mm or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs the lights' places and a distance")
-    spot = fit_spot(patch, camera, isovalues)
+    spot = fit_isophote_family(patch, camera, isovalues)
     if isinstance(spot, Failure):
         return spot
-    lights, flags = known.lights, spot_flags(spot)
-    own = light_of_highlight(spot, known)
+    lights, flags = priors.lights, isophote_flags(spot)
+    own = light_of_highlight(spot, priors)
     order = [*lights] if own is None else [lights[own]]
     if own is None:
         # What is seen is then as a rule the lights' common lobe.
         order.insert(0, lights.mean(axis=0))
         flags = (*flags, "ambiguous_light")
-    candidates = np.array([_normal(spot, light, known.distance_mm)[0] for light in order])
-    normal, sightline = _normal(spot, order[0], known.distance_mm)
+    candidates = np.array([_normal(spot, light, priors.distance_mm)[0] for light in order])
+    normal, sightline = _normal(spot, order[0], priors.distance_mm)
     return Estimate(
         normal=normal,
         candidates=candidates,
         look_px=camera.project(sightline),
         axis_ratio=spot.axis_ratio,
         isophotes=spot.isophotes,
-        covariance=_covariance(spot, order[0], known, normal),
+        covariance=_covariance(spot, order[0], priors, normal),
         flags=flags,
     )
 
@@ -86,7 +85,7 @@ def bisect(position: Array, light: Array) -> Array:
     return np.asarray(both / np.linalg.norm(both))
 
 
-def _normal(spot: Spot, light: Array, distance: float, turned: Array | None = None) -> tuple[Array, Array]:
+def _normal(spot: IsophoteFamily, light: Array, distance: float, turned: Array | None = None) -> tuple[Array, Array]:
     """Give normal and sightline of the BP; `turned`, rad in the spot's basis, moves the measured sightline."""
     sightline = spot.peak_axis if turned is None else spot.peak_axis + turned @ spot.basis
     sightline = sightline / np.linalg.norm(sightline)
@@ -101,13 +100,13 @@ def _normal(spot: Spot, light: Array, distance: float, turned: Array | None = No
     return bisect(distance * sightline, light), sightline
 
 
-def _covariance(spot: Spot, light: Array, known: Known, normal: Array) -> Array | None:
+def _covariance(spot: IsophoteFamily, light: Array, priors: Priors, normal: Array) -> Array | None:
     """Give the covariance of the normal by noise and by the distance's uncertainty, shape (2, 2)."""
-    if spot.peak_covariance is None or known.distance_mm is None:
+    if spot.peak_covariance is None or priors.distance_mm is None:
         return None
     across = np.stack([vector[0] for vector in tangent_basis(normal[None])])
-    turned = [_normal(spot, light, known.distance_mm, STEP * unit)[0] for unit in np.eye(2)]
+    turned = [_normal(spot, light, priors.distance_mm, STEP * unit)[0] for unit in np.eye(2)]
     J = across @ (np.array(turned) - normal).T / STEP
-    farther, _ = _normal(spot, light, known.distance_mm * (1 + STEP))
-    by_distance = across @ (farther - normal) / (STEP * known.distance_mm) * known.distance_sd_mm
+    farther, _ = _normal(spot, light, priors.distance_mm * (1 + STEP))
+    by_distance = across @ (farther - normal) / (STEP * priors.distance_mm) * priors.distance_sd_mm
     return np.asarray(J @ spot.peak_covariance @ J.T + np.outer(by_distance, by_distance))

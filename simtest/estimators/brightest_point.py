@@ -1,18 +1,16 @@
 """`brightest_point`: the sightline through the peak carries the normal (theory.md section 3, item 1)."""
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import spot_flags
-from simtest.estimators.isophote_family import fit_spot
-from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.flags import isophote_flags
+from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 
-NOTHING_KNOWN = Known()
 
-
-def brightest_point(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> Estimate | Failure:
+def brightest_point(patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
     """Give the reversed sightline through the peak of the smoothed patch.
 
     Parameters
@@ -21,7 +19,7 @@ def brightest_point(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) 
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
 
     Returns
@@ -32,11 +30,11 @@ def brightest_point(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) 
     """
     normal = -camera.unproject(patch.peak_px)
     estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera))
-    return with_known_lights(estimate, known)
+    return add_light_offset_uncertainty(estimate, priors)
 
 
 def _flags(patch: Patch, camera: Camera) -> tuple[str, ...]:
-    spot = fit_spot(patch, camera, (HIGHLIGHT_ISOVALUE,))
+    spot = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
     if isinstance(spot, Failure):
         return ("partial_arc",) if spot.reason == Reason.NO_CLOSED_ISOPHOTE else ()
-    return spot_flags(spot)
+    return isophote_flags(spot)

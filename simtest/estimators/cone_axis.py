@@ -2,22 +2,20 @@
 
 from collections.abc import Sequence
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.flags import spot_flags
-from simtest.estimators.isophote_family import fit_spot
-from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.flags import isophote_flags
+from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
-
-NOTHING_KNOWN = Known()
 
 
 def cone_axis(
     patch: Patch,
     camera: Camera,
-    known: Known = NOTHING_KNOWN,
+    priors: Priors = NO_PRIORS,
     isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
 ) -> Estimate | Failure:
     """Average the cones' axes over several isovalues.
@@ -28,7 +26,7 @@ def cone_axis(
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
     isovalues : sequence of float
         Each t in (0, 1).
@@ -40,7 +38,7 @@ def cone_axis(
         ``missing_isovalues``; with fewer than 2 left it fails for the first one's reason. The covariance is that of
         the noise, and of the axis' drift with the isovalue where that is more than noise.
     """
-    spot = fit_spot(patch, camera, isovalues)
+    spot = fit_isophote_family(patch, camera, isovalues)
     if isinstance(spot, Failure):
         return spot
     estimate = Estimate(
@@ -50,6 +48,6 @@ def cone_axis(
         axis_ratio=spot.axis_ratio,
         isophotes=spot.isophotes,
         covariance=spot.axis_covariance,
-        flags=spot_flags(spot),
+        flags=isophote_flags(spot),
     )
-    return with_known_lights(estimate, known)
+    return add_light_offset_uncertainty(estimate, priors)

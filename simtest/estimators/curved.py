@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import STREAK_RATIO, spot_flags
-from simtest.estimators.isophote_family import Spot, fit_spot
-from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.flags import STREAK_RATIO, isophote_flags
+from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Camera, Patch
 
@@ -20,13 +20,11 @@ Array = npt.NDArray[np.float64]
 STREAK_GAIN = 0.1
 """Below this abs(1 + d k), or `STREAK_RATIO` where the lobe is not known, the spot is a streak."""
 
-NOTHING_KNOWN = Known()
-
 
 def curved(
     patch: Patch,
     camera: Camera,
-    known: Known = NOTHING_KNOWN,
+    priors: Priors = NO_PRIORS,
     isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
 ) -> Estimate | Failure:
     """Give normal and curvature of a surface lit from the camera's place.
@@ -43,7 +41,7 @@ def curved(
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Its `lobe_curvature` is used, and its lights as by `cone_axis`.
     isovalues : sequence of float
         Each t in (0, 1).
@@ -55,10 +53,10 @@ def curved(
         peak are not those of a lobe, and with ``streak`` where 1 + d k is near 0. Flags as of `cone_axis`, and
         ``round`` where the principal directions are not told from noise.
     """
-    spot = fit_spot(patch, camera, isovalues)
+    spot = fit_isophote_family(patch, camera, isovalues)
     if isinstance(spot, Failure):
         return spot
-    found = _curvature(spot, known.lobe_curvature)
+    found = _curvature(spot, priors.lobe_curvature)
     if isinstance(found, Failure):
         return found
     curvature, is_round = found
@@ -72,10 +70,10 @@ def curved(
         axis_ratio=curvature.axis_ratio,
         isophotes=spot.isophotes,
         covariance=covariance,
-        flags=(*spot_flags(spot), "round") if is_round else spot_flags(spot),
+        flags=(*isophote_flags(spot), "round") if is_round else isophote_flags(spot),
         curvature=curvature,
     )
-    return with_known_lights(estimate, known)
+    return add_light_offset_uncertainty(estimate, priors)
 
 
 def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
@@ -84,7 +82,7 @@ def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
     return np.asarray(stiffness / (1 + np.sqrt(1 + c * stiffness)))
 
 
-def _curvature(spot: Spot, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
+def _curvature(spot: IsophoteFamily, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
     """Give the curvature, and whether the spot is round within the noise."""
     values = np.asarray(np.linalg.eigvalsh(spot.moments), dtype=np.float64)
     if values[0] <= 0:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import BatchEstimator, Estimate, Estimator
 from simtest.geometry import Camera, Patch
@@ -13,12 +13,7 @@ from simtest.geometry import Camera, Patch
 UNIT_TOLERANCE = 1e-6
 
 
-NOTHING_KNOWN = Known()
-
-
-def run(
-    estimator: Estimator, patch: Patch | Failure, camera: Camera, known: Known = NOTHING_KNOWN
-) -> Estimate | Failure:
+def run(estimator: Estimator, patch: Patch | Failure, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
     """Run an estimator on a patch.
 
     Parameters
@@ -29,7 +24,7 @@ def run(
         A Failure is passed on.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Passed on to an estimator that has a parameter of that name.
 
     Returns
@@ -41,14 +36,14 @@ def run(
     if isinstance(patch, Failure):
         return patch
     try:
-        result = estimator(patch, camera, known=known) if _asks(estimator) else estimator(patch, camera)
+        result = estimator(patch, camera, priors=priors) if _asks(estimator) else estimator(patch, camera)
         return _checked(result, patch, camera)
     except Exception as error:
         return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
 
 
 def run_each(
-    estimator: Estimator, patches: Sequence[Patch | Failure], camera: Camera, known: Known = NOTHING_KNOWN
+    estimator: Estimator, patches: Sequence[Patch | Failure], camera: Camera, priors: Priors = NO_PRIORS
 ) -> list[Estimate | Failure]:
     """Run an estimator on several patches: all at once where it has a way of its own (`each`), else one by one.
 
@@ -65,12 +60,12 @@ def run_each(
             ]
         except Exception:
             pass
-    return [run(estimator, patch, camera, known) for patch in patches]
+    return [run(estimator, patch, camera, priors) for patch in patches]
 
 
-def one_by_one(estimator: Estimator, known: Known = NOTHING_KNOWN) -> BatchEstimator:
+def one_by_one(estimator: Estimator, priors: Priors = NO_PRIORS) -> BatchEstimator:
     """Give an estimator that takes several patches, each run as by `run`."""
-    return lambda patches, camera: [run(estimator, patch, camera, known) for patch in patches]
+    return lambda patches, camera: [run(estimator, patch, camera, priors) for patch in patches]
 
 
 def _checked(result: object, patch: Patch, camera: Camera) -> Estimate | Failure:
@@ -85,7 +80,7 @@ def _checked(result: object, patch: Patch, camera: Camera) -> Estimate | Failure
 def _asks(estimator: Estimator) -> bool:
     """Tell whether an estimator has a parameter `known`; one whose parameters cannot be told has none."""
     try:
-        return "known" in inspect.signature(estimator).parameters
+        return "priors" in inspect.signature(estimator).parameters
     except (TypeError, ValueError):
         return False
 

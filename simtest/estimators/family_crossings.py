@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from simtest.estimators.peak_value import Top
+from simtest.estimators.peak_value import PeakValue
 from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
 from simtest.estimators.protocol import FittedIsophote
 from simtest.geometry import Camera, Patch
@@ -23,7 +23,7 @@ STEP_PX = 0.1
 
 
 @dataclass(frozen=True)
-class SpotCrossings:
+class FamilyCrossings:
     """The points of K isophotes, N in all, one isophote's after the other's.
 
     Parameters
@@ -82,7 +82,7 @@ class SpotCrossings:
         a, b, c = self.conics.T[:3]
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
 
-    def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, Top] | None = None) -> Rows:
+    def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, PeakValue] | None = None) -> Rows:
         """Give what the noise's standard deviation in each raw pixel moves quantities by; the noise must be known.
 
         Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what

@@ -1,13 +1,13 @@
 """Warnings that hang on the isophotes of a highlight."""
 
 from simtest.errors import Reason
-from simtest.estimators.isophote_family import Spot
+from simtest.estimators.isophote_family import IsophoteFamily
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
 
 
-def spot_flags(spot: Spot) -> tuple[str, ...]:
+def isophote_flags(spot: IsophoteFamily) -> tuple[str, ...]:
     """Give the flags of a highlight's isophotes.
 
     ``missing_isovalues``: some isovalues gave no ellipse. ``partial_arc``: some isophotes run into the border of the

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.family_crossings import SpotCrossings
-from simtest.estimators.peak_value import Top, fit_top
+from simtest.estimators.family_crossings import FamilyCrossings
+from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
 from simtest.estimators.protocol import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
@@ -48,7 +48,7 @@ NOISE_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
-class Spot:
+class IsophoteFamily:
     """The fitted isophotes of one highlight.
 
     Parameters
@@ -88,8 +88,8 @@ class Spot:
         return np.concatenate(tangent_basis(-self.axis[None]))
 
     @cached_property
-    def _crossings(self) -> SpotCrossings:
-        return SpotCrossings(self.patch, self.camera, self.isophotes, np.concatenate([self.basis, self.axis[None]]))
+    def _crossings(self) -> FamilyCrossings:
+        return FamilyCrossings(self.patch, self.camera, self.isophotes, np.concatenate([self.basis, self.axis[None]]))
 
     @cached_property
     def levels(self) -> Array:
@@ -100,8 +100,8 @@ class Spot:
         return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._top.value))
 
     @cached_property
-    def _top(self) -> Top:
-        return fit_top(self.patch)
+    def _top(self) -> PeakValue:
+        return fit_peak_value(self.patch)
 
     @cached_property
     def _level_weights(self) -> Array:
@@ -295,7 +295,7 @@ class Spot:
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 
 
-def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot | Failure:
+def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
     """Fit the isophotes of one highlight.
 
     Parameters
@@ -327,7 +327,7 @@ def fit_spot(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Spot |
         if len(poses) < least:
             return failures[0]
         failures = failed
-    return Spot(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+    return IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures))
 
 
 def _with_poses(

@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
-from simtest.estimators.isophote_family import Spot
+from simtest.calibration import Priors
+from simtest.estimators.isophote_family import IsophoteFamily
 
 Array = npt.NDArray[np.float64]
 
@@ -15,7 +15,7 @@ CLEAR = 2.0
 """The next best light must fit this many times worse."""
 
 
-def light_of_highlight(spot: Spot, known: Known) -> int | None:
+def light_of_highlight(spot: IsophoteFamily, priors: Priors) -> int | None:
     """Tell which light made a highlight; None where that cannot be told.
 
     The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
@@ -24,9 +24,9 @@ def light_of_highlight(spot: Spot, known: Known) -> int | None:
 
     Parameters
     ----------
-    spot : Spot
+    spot : IsophoteFamily
         The highlight; its patch names the frame's others, of which the nearest are taken, one a light.
-    known : Known
+    priors : Priors
         Its lights are used.
 
     Returns
@@ -34,15 +34,15 @@ def light_of_highlight(spot: Spot, known: Known) -> int | None:
     int or None
         Index of the light.
     """
-    if len(known.lights_mm) == 1:
+    if len(priors.lights_mm) == 1:
         return 0
-    others = _other_peaks(spot)[: len(known.lights_mm) - 1]
+    others = _other_peaks(spot)[: len(priors.lights_mm) - 1]
     values, vectors = np.linalg.eigh(spot.moments)
     if not len(others) or values[0] <= 0:
         return None
     M = vectors @ np.diag(np.sqrt(values[0] / values)) @ vectors.T
     seen = others @ M
-    places = known.lights @ spot.basis.T
+    places = priors.lights @ spot.basis.T
     misfits = np.array([_misfit(seen, np.delete(places, i, axis=0) - place) for i, place in enumerate(places)])
     first, second = np.argsort(misfits, kind="stable")[:2]
     clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
@@ -78,7 +78,7 @@ def _misfit(seen: Array, offsets: Array) -> float:
     return best
 
 
-def _other_peaks(spot: Spot) -> Array:
+def _other_peaks(spot: IsophoteFamily) -> Array:
     """Give where the nearest other highlights lie from the own one, tangents in the basis, shape (K, 2)."""
     others = np.array(spot.patch.others_px).reshape(-1, 2)
     gaps = np.linalg.norm(others - spot.patch.peak_px, axis=1)

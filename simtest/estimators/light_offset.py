@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import Priors
 from simtest.estimators.bisector import bisect
 from simtest.estimators.protocol import Estimate
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
@@ -23,33 +23,33 @@ NEGLIGIBLE = 0.1
 """Of the stated variance: a smaller square of the error is left out."""
 
 
-def with_known_lights(estimate: Estimate, known: Known) -> Estimate:
+def add_light_offset_uncertainty(estimate: Estimate, priors: Priors) -> Estimate:
     """Say how far a light beside the camera may have moved a normal that was taken as the reverse of a sightline.
 
     Parameters
     ----------
     estimate : Estimate
         Its normal is the reverse of the highlight's sightline.
-    known : Known
+    priors : Priors
         Its lights and distance are used.
 
     Returns
     -------
     Estimate
-        As it was where no light is known, or all are at the camera. Else with the flag ``light_aside``; its covariance
+        As it was where no light is known, or all are at the camera. Else with the flag ``light_offset``; its covariance
         holds, where a distance is known, the mean square over the lights of half their angle at the surface point,
         and is None where it is not: the error may then be anything.
     """
-    if not known.lights_mm:
+    if not priors.lights_mm:
         return estimate
-    across = known.lights @ np.stack([basis[0] for basis in tangent_basis(estimate.normal[None])]).T
+    across = priors.lights @ np.stack([basis[0] for basis in tangent_basis(estimate.normal[None])]).T
     if np.linalg.norm(across, axis=1).max() < AT_CAMERA_MM:
         return estimate
-    flagged = replace(estimate, flags=(*estimate.flags, "light_aside"))
-    if known.distance_mm is None:
+    flagged = replace(estimate, flags=(*estimate.flags, "light_offset"))
+    if priors.distance_mm is None:
         return replace(flagged, covariance=None)
-    position = -known.distance_mm * estimate.normal
-    moved = np.array([tangent_coordinates(estimate.normal, bisect(position, light)) for light in known.lights])
+    position = -priors.distance_mm * estimate.normal
+    moved = np.array([tangent_coordinates(estimate.normal, bisect(position, light)) for light in priors.lights])
     squares = moved.T @ moved / len(moved)
     if estimate.covariance is None:
         return flagged

@@ -25,7 +25,7 @@ MIN_PIXELS = 12
 
 
 @dataclass(frozen=True)
-class Top:
+class PeakValue:
     """The peak value of a lobe and how it moves with the patch's pixels.
 
     Parameters
@@ -43,7 +43,7 @@ class Top:
     weights: Array
 
 
-def fit_top(patch: Patch) -> Top:
+def fit_peak_value(patch: Patch) -> PeakValue:
     """Fit a paraboloid to the logarithm of a patch above t = 0.8 and give its apex.
 
     Where pixels there are clipped, the ring around them down to t = 0.5 is fitted. The peak's own pixel stands in where
@@ -51,7 +51,7 @@ def fit_top(patch: Patch) -> Top:
     """
     column, row = patch.peak_pixel
     own = np.array([row * patch.values.shape[1] + column])
-    fallback = Top(patch.peak_value, own, np.array([1 / patch.peak_value]))
+    fallback = PeakValue(patch.peak_value, own, np.array([1 / patch.peak_value]))
     inside = _region(patch)
     pixels = np.flatnonzero(inside)
     values = patch.values.ravel()[pixels].astype(float)
@@ -76,7 +76,7 @@ def fit_top(patch: Patch) -> Top:
     if u * u + v * v > 1:
         return fallback
     # At the apex the value does not move with the place.
-    return Top(value, pixels, (inverse @ apex) @ design / values)
+    return PeakValue(value, pixels, (inverse @ apex) @ design / values)
 
 
 def _centred(places: npt.NDArray[np.intp]) -> Array:

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.flags import spot_flags
+from simtest.estimators.flags import isophote_flags
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
-from simtest.estimators.isophote_family import Spot, fit_spot
-from simtest.estimators.light_offset import with_known_lights
+from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.protocol import Estimate, FittedIsophote
@@ -63,10 +63,7 @@ class HighlightPixels:
         return HighlightPixels(self.rays[::step], self.observed[::step], clipped, noise)
 
 
-NOTHING_KNOWN = Known()
-
-
-def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> Estimate | Failure:
+def photometric(patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
     """Fit a quadric patch seen by a camera with its own light, started from `cone_axis`.
 
     N = -s with s the sightline of the BP; beside it the shape d S, the lobe's scale and, with the shape all but
@@ -83,7 +80,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Its lights are used, to say where they are beside the camera (`simtest.estimators.light_offset`).
 
     Returns
@@ -91,7 +88,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     Estimate or Failure
         One candidate with its covariance; it looks at the fitted BP. Flags as of `cone_axis`, and ``misfit``.
     """
-    spot = fit_spot(patch, camera, CONE_AXIS_ISOVALUES)
+    spot = fit_isophote_family(patch, camera, CONE_AXIS_ISOVALUES)
     if isinstance(spot, Failure):
         return spot
     pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in spot.isophotes))
@@ -103,7 +100,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
     e, f, s = fitted.model.frame
     covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
     ratio = _axis_ratio(fitted.model)
-    flags, excess = spot_flags(spot), spot.drift_excess
+    flags, excess = isophote_flags(spot), spot.drift_excess
     if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
         excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
         flags = (*flags, "misfit")
@@ -117,7 +114,7 @@ def photometric(patch: Patch, camera: Camera, known: Known = NOTHING_KNOWN) -> E
         covariance=covariance,
         flags=flags,
     )
-    return with_known_lights(estimate, known)
+    return add_light_offset_uncertainty(estimate, priors)
 
 
 def photometric_plane(patch: Patch, camera: Camera, start_isovalue: float = START_ISOVALUE) -> Estimate | Failure:
@@ -205,12 +202,12 @@ def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> Highlig
     sound = np.isfinite(rays).all(axis=1)
     values = patch.values if patch.raw is None else patch.raw
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
-    known = patch.noise
-    noise = known[rows, columns][sound].astype(float) if isinstance(known, np.ndarray) else known
+    stated = patch.noise
+    noise = stated[rows, columns][sound].astype(float) if isinstance(stated, np.ndarray) else stated
     return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise)
 
 
-def _quadric(spot: Spot, rays: Array) -> ColocatedQuadric:
+def _quadric(spot: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     """Start from the middle isophote: its larger half-axis as on a plane gives n, the smaller one then gives K."""
     isophote = spot.isophotes[len(spot.isophotes) // 2]
     s = spot.axis

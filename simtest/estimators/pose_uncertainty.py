@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
-from simtest.estimators.isophote_family import Spot
+from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.protocol import FittedIsophote
 from simtest.geometry import Camera, Patch
 from simtest.geometry.pose_region import PoseRegion
@@ -35,7 +35,7 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
     pose = isophote.pose()
     if patch.noise is None or isinstance(pose, Failure):
         return None
-    spot = Spot(patch, camera, (isophote,), (pose,), ())
+    spot = IsophoteFamily(patch, camera, (isophote,), (pose,), ())
     try:
         return _region(spot)
     except np.linalg.LinAlgError:
@@ -43,7 +43,7 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
         return None
 
 
-def _region(spot: Spot) -> PoseRegion | None:
+def _region(spot: IsophoteFamily) -> PoseRegion | None:
     conic, noise = spot.conic(0), spot.conic_covariance(0)
     shrink = np.append(np.zeros(2), -spot.widening()[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)

@@ -150,7 +150,7 @@ Estimator = Callable[..., Estimate | Failure]
 
 One with an attribute `each`, a `BatchEstimator` that gives the same of each patch, is asked for all highlights of a
 frame at once (`answers_each`). One that has a parameter `known` is also given what is known beside the picture, as
-`simtest.calibration.Known`, by that name.
+`simtest.calibration.Priors`, by that name.
 
 Other packages register theirs under the entry-point group ``simtest.estimators``.
 """

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
@@ -61,7 +61,7 @@ class RankedHypotheses:
 
 
 def rank_by_motion(
-    first: Estimate, second: Estimate, second_from_first: npt.ArrayLike, known: Known, gain_sd: float = GAIN_SD
+    first: Estimate, second: Estimate, second_from_first: npt.ArrayLike, priors: Priors, gain_sd: float = GAIN_SD
 ) -> RankedHypotheses | Failure:
     """Rank the first picture's curvature hypotheses by where the highlight is in a second picture.
 
@@ -76,7 +76,7 @@ def rank_by_motion(
         Of the same highlight, of any estimator for a light at the camera.
     second_from_first : array_like, shape (4, 4)
         The camera's motion: from the first camera's frame to the second one's, mm.
-    known : Known
+    priors : Priors
         Its distance is that of the first picture; needed.
     gain_sd : float
         Relative standard deviation of the first picture's abs(1 + d k), > 0.
@@ -92,14 +92,14 @@ def rank_by_motion(
         If the motion is no rigid one.
     """
     R, t = _motion(second_from_first)
-    if first.curvature is None or first.curvature.hypotheses is None or known.distance_mm is None:
+    if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")
     place = -R.T @ t
     seen = R.T @ second.normal
     hypotheses, distances, predictions = first.curvature.hypotheses, [], []
-    spread = np.array([1.0, 1.0, known.distance_sd_mm / known.distance_mm, gain_sd, gain_sd])
+    spread = np.array([1.0, 1.0, priors.distance_sd_mm / priors.distance_mm, gain_sd, gain_sd])
     for gains in hypotheses:
-        values = np.array([0.0, 0.0, known.distance_mm, *gains])
+        values = np.array([0.0, 0.0, priors.distance_mm, *gains])
         predicted = _predicted(first, values, place)
         if predicted is None:
             distances.append(np.inf)

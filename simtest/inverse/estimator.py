@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Known
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisect
 from simtest.estimators.cone_axis import cone_axis
@@ -20,7 +20,6 @@ from simtest.inverse.patch_renderer import PatchRenderer
 
 Array = npt.NDArray[np.float64]
 
-NOTHING_KNOWN = Known()
 
 STEP = 1e-5
 """Step of the differences of the normal, rad, and as a share of the distance."""
@@ -35,7 +34,7 @@ ROUNDING = 1e-7
 def inverse_rendering(
     patch: Patch,
     camera: Camera,
-    known: Known = NOTHING_KNOWN,
+    priors: Priors = NO_PRIORS,
     path_depth: int = 2,
     base: bool = True,
     exponent: bool = False,
@@ -57,7 +56,7 @@ def inverse_rendering(
         Region of interest.
     camera : Camera
         Calibration.
-    known : Known
+    priors : Priors
         Lights and distance, and the lobe's curvature, from which the exponent follows.
     path_depth : int
         2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself, twice as wide as
@@ -89,7 +88,7 @@ def inverse_rendering(
     if isinstance(pixels, Failure):
         return pixels
     renderer = PatchRenderer(pixels.rays, path_depth, PATHS, variant)
-    model = _start(start, patch, known, renderer, (exponent, base))
+    model = _start(start, patch, priors, renderer, (exponent, base))
     fitted = _fitted(model, pixels)
     if fitted is None:
         return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
@@ -101,21 +100,21 @@ def inverse_rendering(
         look_px=camera.project(found.sightline),
         axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
         isophotes=start.isophotes,
-        covariance=_covariance(fitted, known),
+        covariance=_covariance(fitted, priors),
         flags=start.flags,
-        curvature=_curvature(found, known),
+        curvature=_curvature(found, priors),
     )
 
 
 def _start(
-    start: Estimate, patch: Patch, known: Known, renderer: PatchRenderer, opened: tuple[bool, bool]
+    start: Estimate, patch: Patch, priors: Priors, renderer: PatchRenderer, opened: tuple[bool, bool]
 ) -> RenderedQuadric:
     """Start from the middle isophote: its half-axes give K where n is known, else n as on a surface that is flat once.
 
     On the plane across s at unit distance the isophote is w^T Q w = 1, and -2 ln t Q = c M^2 + 2 M.
     """
     s = -start.normal
-    distance, light, lights = _lit(known)
+    distance, light, lights = _lit(priors)
     normal = bisect(distance * s, light)
     basis = np.stack([vector[0] for vector in tangent_basis(normal[None])])
     frame = np.concatenate([basis - np.outer(basis @ s, s), s[None]])
@@ -123,7 +122,7 @@ def _start(
     cone = frame @ isophote.cone @ frame.T
     values, vectors = np.linalg.eigh(cone[:2, :2] / -cone[2, 2])
     stiffness = -2 * np.log(isophote.isovalue) * values
-    lobe = known.lobe_curvature
+    lobe = priors.lobe_curvature
     if lobe is None:
         # m = 1 along the longer axis.
         lobe = max(float(stiffness[0]) - 2, 1.0)
@@ -142,34 +141,34 @@ def _fitted(start: RenderedQuadric, pixels: HighlightPixels) -> LobeFit[Rendered
     return min(fits, key=lambda fit: fit.chi2, default=None)
 
 
-def _lit(known: Known) -> tuple[float, Array, Array]:
+def _lit(priors: Priors) -> tuple[float, Array, Array]:
     """Give distance, the highlight's light and all lights; the camera's place and 1 mm where they are not known."""
-    if not known.lights_mm or known.distance_mm is None:
+    if not priors.lights_mm or priors.distance_mm is None:
         return 1.0, np.zeros(3), np.zeros((1, 3))
-    return known.distance_mm, known.lights.mean(axis=0), known.lights
+    return priors.distance_mm, priors.lights.mean(axis=0), priors.lights
 
 
-def _covariance(fitted: LobeFit[RenderedQuadric], known: Known) -> Array:
+def _covariance(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Array:
     """Give the covariance of the normal in its tangent basis, shape (2, 2)."""
     model = fitted.model
     across = np.stack([vector[0] for vector in tangent_basis(model.normal[None])])
     steps = [model.moved(np.append(STEP * unit, np.zeros(len(fitted.covariance) - 2))).normal for unit in np.eye(2)]
     J = across @ (np.array(steps) - model.normal).T / STEP
     by_distance = np.zeros(2)
-    if known.distance_sd_mm > 0 and known.distance_mm is not None:
+    if priors.distance_sd_mm > 0 and priors.distance_mm is not None:
         farther = bisect(model.distance * (1 + STEP) * model.sightline, model.light)
-        by_distance = across @ (farther - model.normal) / (STEP * model.distance) * known.distance_sd_mm
+        by_distance = across @ (farther - model.normal) / (STEP * model.distance) * priors.distance_sd_mm
     return np.asarray(J @ fitted.covariance[:2, :2] @ J.T + np.outer(by_distance, by_distance))
 
 
-def _curvature(model: RenderedQuadric, known: Known) -> EstimatedCurvature:
+def _curvature(model: RenderedQuadric, priors: Priors) -> EstimatedCurvature:
     values, vectors = np.linalg.eigh(model.shape)
     gains = 1 + values
     order = np.argsort(np.abs(gains), kind="stable")
     gains, directions = gains[order], vectors.T[order] @ model.basis
     hypotheses = None
-    if known.lobe_curvature is not None:
-        c = known.lobe_curvature
+    if priors.lobe_curvature is not None:
+        c = priors.lobe_curvature
         listed = sign_hypotheses(c * gains**2 + 2 * gains, c)
         # The fitted signs first: they were what the fit started from.
         hypotheses = listed[np.argsort(np.sum((listed - gains) ** 2, axis=1) > 1e-6, kind="stable")]

@@ -179,7 +179,7 @@ def run_estimators(
     patches = [
         _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
     ]
-    made = {name: run_each(each, patches, calibration.camera, calibration.known) for name, each in estimators.items()}
+    made = {name: run_each(each, patches, calibration.camera, calibration.priors) for name, each in estimators.items()}
     return [
         Specularity(region, patch, {name: _flagged(results[i], patch, limited) for name, results in made.items()})
         for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))

@@ -115,7 +115,7 @@ def completed(calibration: Calibration, encoding: str | None) -> Calibration:
 
 def default_estimators(calibration: Calibration) -> tuple[str, ...]:
     """Give the estimators that the calibration tells enough for."""
-    known = calibration.known
+    known = calibration.priors
     lights = len(known.lights) > 0 and known.distance_mm is not None
     return (*DEFAULT_ESTIMATORS, *(("bisector",) if lights else ()))
 

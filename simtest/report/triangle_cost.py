@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     from matplotlib.figure import Figure
 
-DATA = Path(__file__).with_name("fineness.json")
+DATA = Path(__file__).with_name("triangle_cost.json")
 
 SHADINGS = {
     "flat": ("#D55E00", "flat triangles"),

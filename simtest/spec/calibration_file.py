@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, Known, NoiseModel, Response
+from simtest.calibration import Calibration, NoiseModel, Priors, Response
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.falloff import CosineProfile, Profile
 from simtest.spec.ranges import Coordinate, Millimetres
@@ -69,11 +69,11 @@ class CalibrationSpec(Spec):
     rig: RigCalibration = RigCalibration()
     surface: SurfaceCalibration = SurfaceCalibration()
 
-    def known(self) -> Known:
+    def priors(self) -> Priors:
         """Give what estimators are told of lights, distance and lobe."""
         exponent = self.surface.phong_exponent
         lobe = None if exponent is None else PhongReflectance(exponent=exponent).lobe_curvature
-        return Known(self.rig.lights_mm, self.rig.distance_mm, self.rig.distance_sd_mm, lobe)
+        return Priors(self.rig.lights_mm, self.rig.distance_mm, self.rig.distance_sd_mm, lobe)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -107,4 +107,4 @@ def load_calibration(path: str | Path) -> Calibration:
     sensor = spec.sensor
     noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
     falloff = (spec.vignetting.model(), spec.emission.model())
-    return Calibration(camera, response, *falloff, noise, sensor.saturation_level, spec.known())
+    return Calibration(camera, response, *falloff, noise, sensor.saturation_level, spec.priors())

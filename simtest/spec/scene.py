@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, Known, NoiseModel, Response
+from simtest.calibration import Calibration, NoiseModel, Priors, Response
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import CameraSpec
@@ -82,17 +82,17 @@ class Scene(Spec):
             emission=emission.model() if emission else AngularProfile(),
             noise=NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response),
             saturation_level=1.0 if sensor.clips else None,
-            known=self._known(distance_mm),
+            priors=self._priors(distance_mm),
         )
 
-    def _known(self, distance_mm: float | None) -> Known:
+    def _priors(self, distance_mm: float | None) -> Priors:
         told = self.known.distance_mm
         if self.known.distance_error is not None and distance_mm is not None:
             told = distance_mm * (1 + self.known.distance_error)
         lobe = None
         if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
             lobe = self.reflectance.lobe_curvature
-        return Known(
+        return Priors(
             tuple(light.place_mm for light in self.rig.lights) if self.known.lights else (),
             told,
             0.0 if told is None else told * self.known.distance_sd,

@@ -91,7 +91,7 @@ def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: TrueHighlight, 
     if _reverses_sightline(scene, estimate):
         return float(np.degrees(laws.bisector_angle(highlight.position, light)))
     # Which light a highlight is ascribed to, and which distance a rig of several was told, is another matter.
-    told = scene.calibration(highlight.distance).known.distance_mm
+    told = scene.calibration(highlight.distance).priors.distance_mm
     if told is None or len(scene.rig.lights) > 1:
         return None
     return float(np.degrees(laws.bisector_residual(highlight.position, light, told / highlight.distance - 1)))

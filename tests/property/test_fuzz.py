@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.calibration import Known
+from simtest.calibration import Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisector
 from simtest.estimators.brightest_point import brightest_point
@@ -23,7 +23,7 @@ ESTIMATORS = {
     "photometric": photometric,
     "photometric_plane": photometric_plane,
 }
-KNOWN = Known(((1.0, 0.0, 0.0), (-1.0, 0.5, 0.0)), 10.0, 1.0, 200.0)
+KNOWN = Priors(((1.0, 0.0, 0.0), (-1.0, 0.5, 0.0)), 10.0, 1.0, 200.0)
 FISHEYE = Camera(48, 40, 30.0, 30.0, 24.0, 20.0, distortion=KannalaBrandt(0.01, 0.0, 0.0, 0.0))
 CAMERAS = (Camera(48, 40, 60.0, 60.0, 24.0, 20.0), FISHEYE)
 KINDS = 8
@@ -137,7 +137,7 @@ def check_contour(rng):
 def check_patch(rng):
     made, camera = patch(rng), CAMERAS[rng.integers(2)]
     name = list(ESTIMATORS)[rng.integers(len(ESTIMATORS))]
-    result = run(ESTIMATORS[name], made, camera, KNOWN if rng.random() < 0.5 else Known())
+    result = run(ESTIMATORS[name], made, camera, KNOWN if rng.random() < 0.5 else Priors())
     if isinstance(result, Failure):
         # `run` turns what an estimator raises, and numbers that are none, into these: ours must do neither.
         assert result.reason not in (Reason.ESTIMATOR_ERROR,), (name, result)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from simtest.calibration import Calibration, Known
+from simtest.calibration import Calibration, Priors
 from simtest.detection import estimate_noise
 from simtest.errors import Failure, Reason
 from simtest.estimators.brightest_point import brightest_point
@@ -208,9 +208,9 @@ def test_touching_highlights_are_left_out_or_flagged(see, apart_mm):
     # They are not isolated.
     assert not reconstruct(frame, told, ALL)
     merged = found(frame, told, ALL)
-    assert all("light_aside" in e.flags and e.covariance is None for e in merged.values())
+    assert all("light_offset" in e.flags and e.covariance is None for e in merged.values())
     # Where the rig is not known either, the fit of one lobe to two is found out.
-    unknown = found(frame, replace(told, known=Known()), ALL)
+    unknown = found(frame, replace(told, priors=Priors()), ALL)
     assert "misfit" in unknown["photometric"].flags
     if apart_mm > 2.5:
         assert "not_elliptic" in unknown["cone_axis"].flags
@@ -242,15 +242,15 @@ def test_a_light_beside_the_camera_is_told_by_the_rig_alone(see):
     seen = see(surface=surface("plane", tilt_deg=10.0), sensor={"noise_sigma": 0.02},
                rig={"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]})  # fmt: skip
     truth, frame = seen.truths[0].highlight, seen.frame(0)
-    blind = found(frame, replace(seen.calibration, known=Known()), HALVES)
+    blind = found(frame, replace(seen.calibration, priors=Priors()), HALVES)
     near = found(frame, seen.calibration, HALVES)
-    lights = seen.calibration.known.lights_mm
-    told = found(frame, replace(seen.calibration, known=Known(lights, truth.distance)), HALVES)
+    lights = seen.calibration.priors.lights_mm
+    told = found(frame, replace(seen.calibration, priors=Priors(lights, truth.distance)), HALVES)
     for key in HALVES:
-        assert not {"misfit", "not_elliptic", "light_aside"} & set(blind[key].flags)
+        assert not {"misfit", "not_elliptic", "light_offset"} & set(blind[key].flags)
         assert mahalanobis2(blind[key], truth.normal) > 100
         assert near[key].covariance is None
-        assert "light_aside" in told[key].flags
+        assert "light_offset" in told[key].flags
         assert mahalanobis2(told[key], truth.normal) < 5.99
         # Not by being vague: the stated error is the one that is made.
         assert np.degrees(np.sqrt(np.trace(told[key].covariance))) < 1.2 * error(told[key], truth)

@@ -10,7 +10,6 @@ import pytest
 import simtest
 from simtest.api import reconstruct_picture
 from simtest.calibration import NoiseModel
-from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators.execution_guard import run
@@ -19,6 +18,7 @@ from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.rendering import Session
 from simtest.rendering.frames import TrueHighlight
 from simtest.report import write_report
+from simtest.simulation.labelled_frame import write_frame
 from simtest.simulation.rendered_view import view
 from simtest.simulation.true_highlights import judge
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict

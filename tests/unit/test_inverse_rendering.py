@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Known
+from simtest.calibration import Calibration, Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
@@ -25,7 +25,7 @@ from simtest.validation.metrics import curvature_errors, mahalanobis2
 pytestmark = pytest.mark.render
 
 D, N = 10.0, 50.0
-LOBE = Known(lobe_curvature=4 * N)
+LOBE = Priors(lobe_curvature=4 * N)
 
 SURFACES = {
     "plane": {"type": "plane", "tilt_deg": 10.0, "azimuth_deg": 40.0},
@@ -59,9 +59,9 @@ def frame_of(radiance, sigma, seed=0):
     return (clean + sigma * from_integer(seed).standard_normal(clean.shape)).astype(np.float32)
 
 
-def answers(session, frame, known=LOBE, **estimators):
-    named = {name: lambda p, c, e=e: run(e, p, c, known) for name, e in estimators.items()}
-    (found,) = reconstruct(frame, Calibration(session.camera, known=known), named, isolated=False)
+def answers(session, frame, priors=LOBE, **estimators):
+    named = {name: lambda p, c, e=e: run(e, p, c, priors) for name, e in estimators.items()}
+    (found,) = reconstruct(frame, Calibration(session.camera, priors=priors), named, isolated=False)
     return found.estimates
 
 
@@ -175,20 +175,20 @@ def test_a_known_light_beside_the_camera(render):
     more = {"rig": {"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]}}
     session, radiance, highlight = render(SURFACES["cylinder"], **more)
     lights = tuple(map(tuple, session.scene.rig.true_mm().tolist()))
-    known = Known(lights, highlight.distance, 0.0, 4 * N)
-    found = answers(session, frame_of(radiance, 0.02), known, inverse=inverse_rendering)["inverse"]
+    priors = Priors(lights, highlight.distance, 0.0, 4 * N)
+    found = answers(session, frame_of(radiance, 0.02), priors, inverse=inverse_rendering)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 0.02
     assert curvature_errors(found, highlight)["gain_error"] < 0.01
-    unaware = answers(session, frame_of(radiance, 0.02), replace(known, lights_mm=()), inverse=inverse_rendering)
+    unaware = answers(session, frame_of(radiance, 0.02), replace(priors, lights_mm=()), inverse=inverse_rendering)
     assert 2 < angle_deg(unaware["inverse"].normal, highlight.normal) < 4
-    vague = answers(session, frame_of(radiance, 0.02), replace(known, distance_sd_mm=1.0), inverse=inverse_rendering)
+    vague = answers(session, frame_of(radiance, 0.02), replace(priors, distance_sd_mm=1.0), inverse=inverse_rendering)
     assert np.trace(vague["inverse"].covariance) > 100 * np.trace(found.covariance)
 
 
 def test_the_exponent_is_found_without_noise(render):
     session, radiance, highlight = render(SURFACES["saddle"])
     opened = partial(inverse_rendering, base=False, exponent=True)
-    found = answers(session, frame_of(radiance, 0.0), Known(), inverse=opened)["inverse"]
+    found = answers(session, frame_of(radiance, 0.0), Priors(), inverse=opened)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 1e-3
     gains = np.sort(np.abs(1 + np.array([highlight.kd_min, highlight.kd_max])))
     assert found.axis_ratio == pytest.approx(gains[0] / gains[1], rel=5e-3)

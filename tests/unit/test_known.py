@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Known
+from simtest.calibration import Calibration, Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisect, bisector
@@ -14,8 +14,8 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
 from simtest.estimators.execution_guard import run
-from simtest.estimators.isophote_family import fit_spot
-from simtest.estimators.peak_value import fit_top
+from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
@@ -50,28 +50,28 @@ def lobe(sigma=0.0, widths=(14.0, 9.0), seed=0, smoothing=2.0):
 )
 def test_what_is_known_is_checked(values, said):
     with pytest.raises(InputError, match=said):
-        Known(**values)
+        Priors(**values)
 
 
 def test_estimators_that_ask_are_told_and_others_run_as_before():
     told = []
 
-    def asks(patch, camera, known):
-        told.append(known)
+    def asks(patch, camera, priors):
+        told.append(priors)
         return Failure(Reason.NO_PEAK)
 
     def does_not(patch, camera, other=3):
         told.append(other)
         return Failure(Reason.NO_PEAK)
 
-    known = Known(distance_mm=7.0)
+    priors = Priors(distance_mm=7.0)
     for estimator in (asks, does_not, partial(does_not, other=4)):
-        run(estimator, lobe(), CAMERA, known)
-    assert told == [known, 3, 4]
+        run(estimator, lobe(), CAMERA, priors)
+    assert told == [priors, 3, 4]
     reconstruct(np.zeros((160, 200), np.float32), CAMERA, {"asks": asks}, roi=(0, 0, 50, 50))
-    reconstruct(_frame(), Calibration(CAMERA, known=known), {"asks": asks}, roi=(60, 40, 80, 80))
-    reconstruct(_frame(), Calibration(CAMERA, known=known), {"asks": asks})
-    assert told[3:] == [known, known]
+    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"asks": asks}, roi=(60, 40, 80, 80))
+    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"asks": asks})
+    assert told[3:] == [priors, priors]
 
 
 def _frame():
@@ -86,7 +86,7 @@ def test_a_calibration_file_says_it(tmp_path):
         "[rig]\nlights_mm = [[4.0, 0.0, 0.0], [-4.0, 0.0, 1.0]]\ndistance_mm = 40.0\ndistance_sd_mm = 8.0\n"
         "[surface]\nphong_exponent = 50.0\n"
     )
-    assert load_calibration(path).known == Known(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), 40.0, 8.0, 200.0)
+    assert load_calibration(path).priors == Priors(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), 40.0, 8.0, 200.0)
     path.write_text(path.read_text().replace("distance_mm = 40.0", ""))
     with pytest.raises(InputError, match="distance_sd_mm"):
         load_calibration(path)
@@ -95,22 +95,22 @@ def test_a_calibration_file_says_it(tmp_path):
 def test_a_scene_says_it():
     surface = {"type": "plane"}
     scene = scene_from_dict({"surface": surface, "known": {"distance_error": -0.2, "distance_sd": 0.1}})
-    known = scene.calibration(10.0).known
-    assert (known.distance_mm, known.distance_sd_mm) == (pytest.approx(8.0), pytest.approx(0.8))
-    assert (known.lights_mm, known.lobe_curvature) == (((0.0, 0.0, 0.0),), 200.0)
+    priors = scene.calibration(10.0).priors
+    assert (priors.distance_mm, priors.distance_sd_mm) == (pytest.approx(8.0), pytest.approx(0.8))
+    assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), 200.0)
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
-    assert silent.calibration(10.0).known == Known()
+    assert silent.calibration(10.0).priors == Priors()
     with pytest.raises(InputError, match="exclude each other"):
         scene_from_dict({"surface": surface, "known": {"distance_mm": 5.0, "distance_error": 0.0}})
 
 
 def test_without_a_rig_or_a_distance_the_bisector_says_so():
-    for known in (Known(), Known(distance_mm=5.0), Known(((0.0, 0.0, 0.0),))):
-        result = bisector(lobe(), CAMERA, known)
+    for priors in (Priors(), Priors(distance_mm=5.0), Priors(((0.0, 0.0, 0.0),))):
+        result = bisector(lobe(), CAMERA, priors)
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
-    light_at_camera = bisector(lobe(), CAMERA, Known(((0.0, 0.0, 0.0),), 10.0))
-    axis = fit_spot(lobe(), CAMERA, ISOVALUES).peak_axis
+    light_at_camera = bisector(lobe(), CAMERA, Priors(((0.0, 0.0, 0.0),), 10.0))
+    axis = fit_isophote_family(lobe(), CAMERA, ISOVALUES).peak_axis
     np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
 
 
@@ -126,11 +126,11 @@ def test_the_bisector_halves_the_angle():
 
 
 def test_moments_of_a_gaussian_are_those_before_smoothing():
-    spot = fit_spot(lobe(), CAMERA, ISOVALUES)
+    spot = fit_isophote_family(lobe(), CAMERA, ISOVALUES)
     raw = np.sqrt(np.linalg.eigvalsh(spot.moments)) * 200
     # Tangents about an axis that lies 1 deg off the optical one.
     np.testing.assert_allclose(raw, [9.0, 14.0], rtol=2e-3)
-    unsmoothed = fit_spot(replace(lobe(), smoothing_px=0.0), CAMERA, ISOVALUES)
+    unsmoothed = fit_isophote_family(replace(lobe(), smoothing_px=0.0), CAMERA, ISOVALUES)
     assert np.sqrt(np.linalg.eigvalsh(unsmoothed.moments)[0]) * 200 > 9.0 * 1.02
 
 
@@ -150,12 +150,12 @@ def test_crossings_move_as_their_sensitivities_say():
 def test_the_covariance_is_that_of_realisations():
     """Mean axis, drift and moments over 200 frames against their stated covariance; chi-square of each variance."""
     count, sigma = 200, 0.02
-    made, basis = [], fit_spot(lobe(), CAMERA, ISOVALUES)
+    made, basis = [], fit_isophote_family(lobe(), CAMERA, ISOVALUES)
     for seed in range(count):
-        spot = fit_spot(lobe(sigma, seed=seed), CAMERA, ISOVALUES)
+        spot = fit_isophote_family(lobe(sigma, seed=seed), CAMERA, ISOVALUES)
         m = spot.moments
         made.append([*(basis.basis @ spot.axis), *(basis.basis @ (spot.drift @ spot.basis)), m[0, 0], m[0, 1], m[1, 1]])
-    one = fit_spot(lobe(sigma, seed=1), CAMERA, ISOVALUES)
+    one = fit_isophote_family(lobe(sigma, seed=1), CAMERA, ISOVALUES)
     stated = np.concatenate([np.diag(one.axes_covariance), np.diag(one.moments_covariance)])
     # Variances of 200 draws lie within 30 % with more than 99.7 % each; top and peak pixel are not quite linear.
     np.testing.assert_allclose(np.var(made, axis=0, ddof=1), stated, rtol=0.3)
@@ -165,7 +165,7 @@ def test_the_top_is_not_the_highest_pixel():
     tops, peaks = [], []
     for seed in range(20):
         patch = lobe(0.05, widths=(40.0, 30.0), seed=seed)
-        tops.append(fit_top(patch).value)
+        tops.append(fit_peak_value(patch).value)
         peaks.append(patch.peak_value)
     true = float(lobe(widths=(40.0, 30.0)).peak_value)
     assert abs(np.mean(tops) - true) < 0.25 * (np.mean(peaks) - true)
@@ -175,9 +175,9 @@ def test_a_clipped_top_is_found_from_the_ring_around_it():
     whole = lobe(widths=(24.0, 18.0))
     values = np.minimum(whole.values, 0.7 * whole.peak_value)
     clipped = replace(whole, values=values, saturated=values == values.max(), peak_value=float(values.max()))
-    assert fit_top(clipped).value == pytest.approx(whole.peak_value, rel=0.01)
+    assert fit_peak_value(clipped).value == pytest.approx(whole.peak_value, rel=0.01)
     # Negative control: taken as it is, the top is 30 % too low.
-    assert fit_top(replace(clipped, saturated=None)).value < 0.8 * whole.peak_value
+    assert fit_peak_value(replace(clipped, saturated=None)).value < 0.8 * whole.peak_value
 
 
 @pytest.mark.parametrize("m", [0.2, 1.0, 4.0])
@@ -189,7 +189,7 @@ def test_gains_invert_the_stiffness(m):
 
 
 def test_curvature_with_and_without_a_known_lobe():
-    without, with_lobe = curved(lobe(), CAMERA), curved(lobe(), CAMERA, Known(lobe_curvature=200.0))
+    without, with_lobe = curved(lobe(), CAMERA), curved(lobe(), CAMERA, Priors(lobe_curvature=200.0))
     assert isinstance(without, Estimate)
     assert isinstance(with_lobe, Estimate)
     assert without.curvature.hypotheses is None

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_spot
+from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_isophote_family
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
 
@@ -32,7 +32,7 @@ def lopsided(cubic, widths=(7.0, 7.0), base=0.0, smoothing=2.0, sigma=0.0, seed=
 
 def errors_px(patch):
     """How far mean axis, peak of the smoothed lobe, and axis at the peak lie from the true one, px."""
-    spot, true = fit_spot(patch, CAMERA, ISOVALUES), CAMERA.unproject(PLACE)
+    spot, true = fit_isophote_family(patch, CAMERA, ISOVALUES), CAMERA.unproject(PLACE)
     places = np.array([pose.axis for pose in spot.poses])
     smoothed = weights_at_zero(spot.levels) @ places
     axes = (spot.axis, smoothed / np.linalg.norm(smoothed), spot.peak_axis)
@@ -63,7 +63,7 @@ def test_on_a_base_the_axis_runs_with_the_area():
 
 
 def test_weights_sum_to_one_and_leave_a_common_axis():
-    spot = fit_spot(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
+    spot = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
     weights = weights_of_axes(spot._crossings.conics, spot._crossings.isovalues, spot._px2, 2.0)
     assert weights.sum() == pytest.approx(1)
     assert angle_deg(spot.peak_axis, spot.axis) < 0.01 * PIXEL_DEG
@@ -72,10 +72,10 @@ def test_weights_sum_to_one_and_leave_a_common_axis():
 
 
 def test_what_a_drift_adds_and_where_it_adds_nothing():
-    plain = fit_spot(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
+    plain = fit_isophote_family(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
     assert not plain.drift_is_real
     np.testing.assert_array_equal(plain.axis_covariance, plain.axes_covariance[:2, :2])
-    spot = fit_spot(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
+    spot = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
     assert spot.drift_is_real
     added = spot.axis_covariance - spot.axes_covariance[:2, :2]
     along = spot.drift / np.linalg.norm(spot.drift)
@@ -92,11 +92,11 @@ def test_noise_alone_drifts_as_often_as_is_said():
     """Shares of 150 lobes without a drift beyond both limits, at a level of 1 % together; a control with a drift."""
     count = 150
     chi2 = [
-        fit_spot(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=seed), CAMERA, ISOVALUES)._drift_chi2
+        fit_isophote_family(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=seed), CAMERA, ISOVALUES)._drift_chi2
         for seed in range(count)
     ]
     for limit, share in ((DRIFT_CHI2, 0.001), (SUSPECT_CHI2, 0.2)):
         beyond = int(np.count_nonzero(np.array(chi2) > limit))
         low, high = stats.binom.ppf([0.0025, 0.9975], count, share)
         assert low <= beyond <= high, (limit, beyond)
-    assert fit_spot(lopsided((0.02, 0.0, 0.0), sigma=0.005), CAMERA, ISOVALUES)._drift_chi2 > DRIFT_CHI2
+    assert fit_isophote_family(lopsided((0.02, 0.0, 0.0), sigma=0.005), CAMERA, ISOVALUES)._drift_chi2 > DRIFT_CHI2

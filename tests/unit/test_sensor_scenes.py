@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from simtest.api import reconstruct_picture, render
-from simtest.dataset import write_frame
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.simulation.labelled_frame import write_frame
 from simtest.simulation.rendered_view import view
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
