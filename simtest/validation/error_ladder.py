@@ -16,7 +16,7 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, CirclePose, Patch
-from simtest.geometry.circle_pose import circle_pose as pose_of_cone
+from simtest.geometry.circle_from_cone import circle_pose as pose_of_cone
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.seeds import Stage, generator
@@ -145,7 +145,7 @@ class ExactPatch(Patch):
     def of(cls, patch: Patch, scene: ClosedScene) -> "ExactPatch":
         """Give a patch's pixels with the exact contours and peak of a scene."""
         held = {field.name: getattr(patch, field.name) for field in fields(Patch) if field.init}
-        fresh = {"_level_sets": {}, "_cut_sets": {}, "peak_px": CAMERA.project(scene.sightline), "noise": None}
+        fresh = {"peak_px": CAMERA.project(scene.sightline), "noise": None}
         return cls(**(held | fresh), scene=scene)
 
 
