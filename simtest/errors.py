@@ -34,6 +34,7 @@ class Reason(StrEnum):
     NOT_CONVERGED = "not_converged"
     STREAK = "streak"
     NOT_KNOWN = "not_known"
+    NO_ESTIMATE = "no_estimate"
     ESTIMATOR_ERROR = "estimator_error"
 
 

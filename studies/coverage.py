@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.measuring import Figure, print_figures
-from simtest.calibration import Calibration, Priors
+from simtest.calibration import Calibration, Priors, exactly
 from simtest.errors import Failure
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
@@ -49,12 +49,12 @@ def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list
     judged: dict[str, list[Judged]] = {name: [] for name in ("cone_axis", "curved", "photometric", "bisector")}
     for patch, calibration, truth in _highlights(highlights, ()):
         for name, estimator in (("cone_axis", cone_axis), ("curved", curved), ("photometric", photometric)):
-            judged[name].append((estimator(patch, calibration.camera, calibration.priors), truth))
+            judged[name].append((estimator.estimate(patch, calibration.camera, calibration.priors), truth))
         _say_so_far(judged)
     light = {"offset_mm": ASIDE_MM, "azimuth_deg": 45.0}
     for patch, calibration, truth in _highlights(aside, (light,)):
-        priors = Priors(calibration.priors.lights_mm, truth.distance, 0.0)
-        judged["bisector"].append((bisector(patch, calibration.camera, priors), truth))
+        priors = Priors(calibration.priors.lights_mm, exactly(truth.distance))
+        judged["bisector"].append((bisector.estimate(patch, calibration.camera, priors), truth))
         _say_so_far(judged)
     return [figure for name, results in judged.items() for figure in _figures(name, results)]
 

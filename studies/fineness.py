@@ -133,7 +133,7 @@ def look(patch: Patches, edge: float, width: float, rng: np.random.Generator) ->
         cosine = -np.einsum("ni,ni->n", normal, directions) / np.linalg.norm(normal, axis=1)
         image = np.where(face >= 0, np.maximum(2 * cosine**2 - 1, 0) ** EXPONENT / distance**2, 0.0)
         cut = Patch.cut(image.reshape(PIXELS, PIXELS), (0, 0, PIXELS, PIXELS))
-        found = cut if isinstance(cut, Failure) else cone_axis(cut, camera)
+        found = cut if isinstance(cut, Failure) else cone_axis.estimate(cut, camera)
         if isinstance(found, Failure):
             answers[name] = (np.nan, np.nan)
         else:

@@ -1,17 +1,30 @@
-"""What is known of a camera beside its geometry, and how a frame is undone with it."""
+"""What is known of a camera beside its geometry, and beside a picture: response, falloff, noise, priors.
+
+`calibration` undoes response and falloff; `frame` is a frame on that way, as detectors and estimators see it; `priors`
+holds what is known of lights, distance and lobe, with its uncertainty.
+"""
 
 from simtest.calibration.calibration import Calibration, CorrectedFrame
+from simtest.calibration.frame import Frame
+from simtest.calibration.noise_estimate import estimate_noise
 from simtest.calibration.noise_model import NoiseModel
-from simtest.calibration.priors import NO_PRIORS, Priors
+from simtest.calibration.priors import NO_PRIORS, Distribution, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.calibration.response import Response, srgb_decode, srgb_encode
 
 __all__ = [
     "NO_PRIORS",
     "Calibration",
     "CorrectedFrame",
+    "Distribution",
+    "Frame",
+    "LogUniform",
     "NoiseModel",
+    "Normal",
     "Priors",
     "Response",
+    "Uniform",
+    "estimate_noise",
+    "exactly",
     "srgb_decode",
     "srgb_encode",
 ]

@@ -1,36 +1,33 @@
-"""What is known of a camera, and the frame that it gives once response, vignetting and emission are undone."""
+"""A camera with what is known of it, and the correction of its frames: response, vignetting and emission undone."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration.noise_model import NoiseModel
-from simtest.calibration.priors import Priors
+from simtest.calibration.priors import NO_PRIORS, Priors
 from simtest.calibration.response import Response
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
+from simtest.geometry.arrays import Array, Image, Mask
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number
 
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
-
 MIN_FALLOFF = 0.05
-"""Where less of the light is left, as a share of the frame's most, the correction stays at this: the rest is noise."""
+"""The correction divides by at least this share of the frame's largest falloff: below it there is little but noise."""
 
 
 @dataclass(frozen=True)
 class CorrectedFrame:
-    """A frame with everything undone that the calibration knows.
+    """A frame in linear light, the calibration's falloff undone.
 
     Parameters
     ----------
     intensity : ndarray of float32, shape (H, W)
         Mean of the channels' linear values, over the known falloff.
     linear : ndarray of float32, shape (H, W)
-        The same before that division: here white noise is still white.
+        The same before that division, where white noise is still white.
     gain : ndarray of float32, shape (H, W), optional
         Intensity over linear; None where nothing is divided.
     saturated : ndarray of bool, shape (H, W), optional
@@ -38,7 +35,7 @@ class CorrectedFrame:
     limited : ndarray of bool, shape (H, W), optional
         Where too little light is left for the whole correction; None where nothing is divided.
     channels : int
-        How many were averaged.
+        Number of averaged channels.
     """
 
     intensity: Image
@@ -51,24 +48,24 @@ class CorrectedFrame:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera with what is known of its response, its lens, its light and its noise.
+    """A camera with what is known of its response, lens, light and noise.
 
     Parameters
     ----------
     camera : Camera
         Geometry.
     response : Response, optional
-        How light became values; None: not stated.
+        From light to values; None: not stated.
     vignetting : AngularProfile
-        Share of the light that the lens passes, over the angle between sightline and optical axis.
+        Share of the light that the lens transmits, over the angle between sightline and optical axis.
     emission : AngularProfile
         Emission of a light at the camera that shines along the optical axis, over the same angle.
     noise : NoiseModel
-        What is known of the noise; white noise beyond it is estimated from each frame.
+        Of the known noise; white noise beyond it is estimated from each frame.
     saturation_level : float, optional
-        Value, as encoded, at and above which a pixel is clipped; None: not known, no pixel counts as clipped.
+        Encoded value at and above which a pixel is clipped; None: not known, and no pixel counts as clipped.
     priors : Priors
-        What is known of lights, distance and lobe: passed on to the estimators that ask for it.
+        Of lights, distance and lobe; passed on to the estimators.
 
     Raises
     ------
@@ -82,7 +79,7 @@ class Calibration:
     emission: AngularProfile = field(default_factory=AngularProfile)
     noise: NoiseModel = field(default_factory=NoiseModel)
     saturation_level: float | None = None
-    priors: Priors = field(default_factory=Priors)
+    priors: Priors = NO_PRIORS
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):
@@ -96,7 +93,7 @@ class Calibration:
             check_number("saturation_level", self.saturation_level, above=0)
 
     @cached_property
-    def falloff(self) -> npt.NDArray[np.float64] | None:
+    def falloff(self) -> Array | None:
         """Vignetting times emission at each pixel's centre, shape (H, W); None where both are uniform."""
         if self.vignetting.is_uniform and self.emission.is_uniform:
             return None
@@ -114,26 +111,29 @@ class Calibration:
         -------
         CorrectedFrame
         """
+        # clipped pixels, while the values are as encoded
         saturated = None
         if self.saturation_level is not None:
             brightest = values if values.ndim == 2 else values.max(axis=2)
             saturated = np.asarray(brightest >= np.float32(self.saturation_level))
+        # linear light
         if self.response is not None and self.response.kind != "linear":
             values = self.response.decode(values).astype(np.float32)
         channels = 1 if values.ndim == 2 else values.shape[2]
         linear = values if values.ndim == 2 else values.mean(axis=2, dtype=np.float32)
+        # falloff
         falloff = self.falloff
         if falloff is None:
             return CorrectedFrame(linear, linear, saturated=saturated, channels=channels)
         least = MIN_FALLOFF * float(falloff.max())
         if least <= 0:
-            # No light can reach this frame: nothing is corrected, and all of it is marked.
+            # No light reaches this frame: nothing is corrected, and every pixel is marked.
             return CorrectedFrame(linear, linear, None, saturated, np.ones(linear.shape, dtype=bool), channels)
         gain = (1 / np.maximum(falloff, least)).astype(np.float32)
         return CorrectedFrame(linear * gain, linear, gain, saturated, falloff < least, channels)
 
 
-def falloff_map(camera: Camera, profile: AngularProfile) -> npt.NDArray[np.float64]:
-    """Give a profile about the optical axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
+def falloff_map(camera: Camera, profile: AngularProfile) -> Array:
+    """Evaluate a profile about the optical axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
     x, y, cosine = np.moveaxis(camera.unproject(camera.pixel_centres()), -1, 0)
     return np.where(np.isfinite(cosine), profile.at(cosine, np.hypot(x, y)), 0.0)

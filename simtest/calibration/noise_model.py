@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from simtest.calibration.response import Response
 from simtest.errors import InputError
+from simtest.geometry.arrays import Array
 from simtest.geometry.checks import check_integer, check_kind, check_number
 
 MAX_BITS = 32
@@ -25,14 +26,14 @@ class NoiseModel:
     read_noise : float
         Standard deviation, electrons; needs `full_well`.
     bits : int, optional
-        Of the values; default: not quantised.
+        Of a value; default: not quantised.
     response : Response
-        The curve before quantisation: it sets the light between two values.
+        The curve before quantisation: it sets the step of light between two values.
 
     Raises
     ------
     InputError
-        If a number is not finite or out of range, the response is none, or read noise has no full well.
+        If a number is not finite or out of range, the response is no `Response`, or read noise has no full well.
     """
 
     sigma: float = 0.0
@@ -57,29 +58,29 @@ class NoiseModel:
         """Whether there is no noise at any level."""
         return self.sigma == 0 and self.full_well is None and self.bits is None
 
-    def at(self, level: npt.ArrayLike, channels: int = 1) -> npt.NDArray[np.float64]:
-        """Give the standard deviation at a level.
+    def at(self, level: npt.ArrayLike, channels: int = 1) -> Array:
+        """Return the standard deviation at a level.
 
         Parameters
         ----------
         level : array_like, shape (...)
             Linear light without noise, share of full scale.
         channels : int
-            How many channels of that mean level are averaged; their noise is independent.
+            Number of averaged channels, of that mean level and independent noise.
 
         Returns
         -------
         ndarray, shape (...)
-            sqrt((sigma^2 + level/full_well + (read_noise/full_well)^2 + step^2/12) / channels), with step the light
-            between two neighbouring values.
+            sqrt((sigma^2 + level/full_well + (read_noise/full_well)^2 + step^2/12) / channels), where step is the light
+            between neighbouring values.
         """
         x = np.asarray(level, dtype=float)
         if self.full_well is None and self.bits is None:
             return np.full(x.shape, self.sigma / np.sqrt(channels))
         variance = np.full(x.shape, self.sigma**2)
-        if self.full_well is not None:
+        if self.full_well is not None:  # shot and read noise
             variance = variance + np.maximum(x, 0) / self.full_well + (self.read_noise / self.full_well) ** 2
-        if self.bits is not None:
+        if self.bits is not None:  # quantisation
             half = 0.5 / (2**self.bits - 1)
             value = self.response.encode(np.clip(x, 0, 1))
             above, below = (self.response.decode(np.clip(value + d, 0, 1)) for d in (half, -half))

@@ -1,4 +1,4 @@
-"""The response of a camera: how light, a share of full scale, becomes a value, a share of the largest one."""
+"""The response of a camera: from light, a share of full scale, to a value, a share of the largest one."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeVar
@@ -13,12 +13,12 @@ Array = TypeVar("Array", npt.NDArray[np.float32], npt.NDArray[np.float64])
 
 
 def srgb_encode(linear: Array) -> Array:
-    """Give the sRGB-encoded values of linear ones in [0, 1] (IEC 61966-2-1); the type of the array is kept."""
+    """Return the sRGB-encoded values of linear ones in [0, 1] (IEC 61966-2-1), in the array's type."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def srgb_decode(encoded: Array) -> Array:
-    """Give the linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1); the type of the array is kept."""
+    """Return the linear values of sRGB-encoded ones in [0, 1] (IEC 61966-2-1), in the array's type."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
@@ -54,7 +54,7 @@ class Response:
             check_table(self.light, self.value)
 
     def encode(self, light: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Give the values of light, any shape; light outside [0, 1] is clipped, unless the curve is linear."""
+        """Return the values of light, any shape; light outside [0, 1] is clipped, unless the curve is linear."""
         x = np.asarray(light, dtype=float)
         if self.kind == "linear":
             return x
@@ -64,7 +64,7 @@ class Response:
         return srgb_encode(x) if self.kind == "srgb" else np.asarray(np.interp(x, self.light, self.value))
 
     def decode(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Give the light of values, any shape: the inverse of `encode`."""
+        """Return the light of values, any shape: the inverse of `encode`."""
         y = np.asarray(values, dtype=float)
         if self.kind == "linear":
             return y

@@ -1,11 +1,19 @@
-"""Where the isolated specularities are in a frame; decided from the frame alone."""
+"""Detection of isolated specularities, from the frame alone.
 
-from simtest.detection.noise import estimate_noise
+`detector` declares what a detector is and finds it by name. Two are built in: `peaks` (with `regions` and `shape`)
+takes peaks of the mean of the channels; `colour` (with `light_split`, `blobs` and `view_mask`) goes by the tissue's
+colour.
+"""
+
+from simtest.calibration import estimate_noise
+from simtest.detection.detector import Detection, Detector, load_detector
 from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
 from simtest.detection.shape import PeakShape, flat_pixels, peak_shape
 
 __all__ = [
     "Component",
+    "Detection",
+    "Detector",
     "PeakShape",
     "Region",
     "contrast",
@@ -13,5 +21,6 @@ __all__ = [
     "estimate_noise",
     "flat_pixels",
     "half_height_component",
+    "load_detector",
     "peak_shape",
 ]

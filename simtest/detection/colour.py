@@ -1,32 +1,32 @@
-"""Specularities of a colour frame: which pixels, which highlights, and which of these are isolated."""
+"""`colour`: highlights of a colour frame by the tissue's own colour, and which of them are isolated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
 from simtest.detection.blobs import MIN_AREA_PX, Highlight, highlights_of
+from simtest.detection.detector import Detection
 from simtest.detection.light_split import SplitLight, split_light
-
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+from simtest.detection.view_mask import View, find_view
+from simtest.geometry import Camera, Image, Mask
 
 NOISE_FACTOR = 4.0
-"""Specular light of a pixel is more than noise above so many standard deviations."""
+"""Specular light above so many standard deviations is more than noise."""
 
 FAINT_RATIO = 0.6
-"""Least specular light over the tissue's where a highlight is looked for; its pixels are those above
+"""Highlights are searched for where the specular light is this share of the tissue's; their pixels are those above
 `SPECULAR_DIFFUSE_RATIO`."""
 
 LEAST_SPECULAR = 0.01
-"""Share of full scale that specular light must have: two steps of an 8-bit sRGB picture at mid tones."""
+"""Least specular light, share of full scale: two steps of an 8-bit sRGB picture at mid tones."""
 
 
 @dataclass(frozen=True)
 class ColourDetection:
-    """What a colour frame shows.
+    """Light and highlights of a colour frame.
 
     Parameters
     ----------
@@ -51,8 +51,9 @@ class ColourDetection:
 def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> ColourDetection:
     """Find the highlights of a colour frame.
 
-    Pixels: the specular light is at least the tissue's, at least 10 % of the highlight's peak, and more than noise.
-    Both parts come from the tissue's own colour around each pixel (`split_light`), so no threshold is one for all.
+    In a highlight's pixels the specular light is at least the tissue's, at least 10 % of the highlight's peak, and more
+    than noise. Both parts follow from the tissue's own colour around each pixel (`split_light`), so there is no global
+    threshold.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
 
 
 def _above_own_peak(above: Mask, specular: Image) -> Mask:
-    """Leave out specks, and pixels far below their highlight's own peak."""
+    """Remove specks, and pixels far below their highlight's own peak."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
     if count < 2:
         return above
@@ -90,3 +91,48 @@ def _above_own_peak(above: Mask, specular: Image) -> Mask:
     mask = np.zeros(above.shape, dtype=bool)
     mask[rows[kept], columns[kept]] = True
     return mask
+
+
+@dataclass(frozen=True)
+class ColourFrameDetection(Detection):
+    """The highlights of a colour frame; its `frame` holds the specular light alone.
+
+    Parameters
+    ----------
+    highlights : tuple of Highlight
+        That of each region.
+    view : View
+        The part of the picture that shows tissue.
+    colour : ColourDetection
+        All that was detected.
+    """
+
+    highlights: tuple[Highlight, ...]
+    view: View
+    colour: ColourDetection
+
+
+@dataclass(frozen=True)
+class ColourDetector:
+    """Highlights by the tissue's own colour (`detect_colour`).
+
+    Where the camera has no view mask the view is found in the picture. Estimators see the specular light alone.
+
+    Parameters
+    ----------
+    isolated : bool
+        Leave out highlights of the other kinds.
+    """
+
+    isolated: bool = True
+
+    def detect(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> ColourFrameDetection:
+        """Find the highlights of a frame of three channels (see `simtest.detection.Detector`)."""
+        view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
+        found = detect_colour(frame.channels, frame.clipped, view.seen)
+        highlights = tuple(found.isolated if self.isolated else found.highlights)
+        specular = replace(frame, seen=view.seen, light=found.light.specular)
+        return ColourFrameDetection(tuple(h.region for h in highlights), specular, highlights, view, found)
+
+
+colour = ColourDetector()

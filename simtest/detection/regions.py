@@ -8,44 +8,41 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
-
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+from simtest.geometry import Image, Mask
 
 EXPANSION = 2.0
-"""Region of interest over the highlight's size at half height; a Gaussian spot at t = 0.1 is 1.8 times that size."""
+"""Region of interest over the highlight's size at half height; a Gaussian at t = 0.1 is 1.8 times that size."""
 
 MARGIN_PX = 8
 MIN_AREA_PX = 12
-"""Fewer pixels above half height give no ellipse."""
+"""Fewer pixels above half height determine no ellipse."""
 
 MAX_PEAKS = 2000
-"""The brightest local maxima that are looked at."""
+"""Only so many local maxima, the brightest, are examined."""
 
 NOISE_FREE_SHARE = 1e-3
-"""Contrast that is asked for where the noise is 0, as a share of the frame's maximum."""
-
+"""Least contrast where the noise is 0, as a share of the frame's maximum."""
 
 _AROUND = np.ones((3, 3), dtype=bool)
 
 
 @dataclass(frozen=True)
 class Region:
-    """A detected specularity.
+    """The region of interest of a specularity.
 
     Parameters
     ----------
     box : tuple of int
-        Region of interest: column, row, width, height, px.
+        Column, row, width, height, px.
     peak : tuple of int
         Column and row of the brightest smoothed pixel.
-    contrast : float
-        Peak above its surroundings, frame units.
+    contrast : float or None
+        Peak above its surroundings, frame units; None for a region that was given, not detected.
     """
 
     box: tuple[int, int, int, int]
     peak: tuple[int, int]
-    contrast: float
+    contrast: float | None
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: M
     smoothed : ndarray of float32, shape (H, W)
         Smoothed intensities.
     noise : float, or ndarray of float32, shape (H, W)
-        Standard deviation of the unsmoothed frame's noise, frame units; in each pixel, where it differs.
+        Standard deviation of the unsmoothed frame's noise, frame units; an array where it differs between pixels.
     isolated : bool
         Leave out those whose isophote at t = 0.5 reaches the frame's border, or that of the view.
     seen : ndarray of bool, shape (H, W), optional
@@ -95,6 +92,7 @@ def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: M
         return []
     least = NOISE_FREE_SHARE * float(image.max())
     threshold = np.broadcast_to(np.maximum(HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise), least), image.shape)
+    # candidates: local maxima, the brightest first; each takes the pixels above half its height
     taken = np.zeros(image.shape, dtype=bool)
     regions = []
     for row, column in _local_maxima(image, threshold):
@@ -105,6 +103,7 @@ def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: M
             continue
         mask, x, y = found.mask, found.x, found.y
         taken[y : y + mask.shape[0], x : x + mask.shape[1]] |= mask
+        # reject: open, too low or too small
         if isolated and not found.closed:
             continue
         height_above = contrast(image, found, float(image[row, column]), seen)
@@ -114,12 +113,12 @@ def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: M
 
 
 def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tuple[int, int]]:
-    """Give rows and columns of the local maxima above their threshold, the brightest first."""
+    """Return rows and columns of the local maxima above their threshold, the brightest first."""
     highest = cv2.dilate(image, np.ones((3, 3), np.uint8))
     maxima = (image >= highest) & (image > threshold.astype(np.float32))
     rows, columns = np.nonzero(maxima)
     if len(rows) > MAX_PEAKS:
-        # The pixels of one clipped plateau must not crowd out the other peaks.
+        # One pixel for each plateau: clipped ones must not crowd out the other peaks.
         labels, _ = ndimage.label(maxima, np.ones((3, 3)))
         _, first = np.unique(labels[rows, columns], return_index=True)
         rows, columns = rows[first], columns[first]
@@ -128,7 +127,7 @@ def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tup
 
 
 def half_height_component(image: Image, row: int, column: int, seen: Mask | None = None) -> Component | None:
-    """Give the connected pixels above half of a peak's value, or None where they hold a higher peak.
+    """Return the connected pixels above half of a peak's value, or None where they hold a higher peak.
 
     Parameters
     ----------
@@ -145,6 +144,7 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
     """
     peak = float(image[row, column])
     rows, columns = image.shape
+    # the window grows until the component no longer touches its sides
     half = 8
     while True:
         y0, y1 = max(row - half, 0), min(row + half + 1, rows)
@@ -163,7 +163,7 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
 
 
 def contrast(image: Image, component: Component, peak: float, seen: Mask | None = None) -> float:
-    """Give a peak's height above the median of its surroundings: the region of interest outside the component.
+    """Return a peak's height above the median of its surroundings: the region of interest outside the component.
 
     Parameters
     ----------
@@ -193,6 +193,7 @@ def contrast(image: Image, component: Component, peak: float, seen: Mask | None 
 
 
 def _expanded_box(component: Component, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """Return the region of interest around a component, inside the frame."""
     mask, x, y = component.mask, component.x, component.y
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     grow_x = int((columns[-1] - columns[0] + 1) * (EXPANSION - 1) / 2) + MARGIN_PX

@@ -1,4 +1,4 @@
-"""The part of a picture that the endoscope shows: round, or with cut corners; found in the picture itself."""
+"""The endoscope's view in a picture, round or with cut corners, found in the picture itself."""
 
 from dataclasses import dataclass
 
@@ -7,36 +7,32 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.geometry import ViewMask
+from simtest.geometry import Array, Image, Mask, ViewMask
 from simtest.runtime.seeds import from_integer
 
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
-Points = npt.NDArray[np.float64]
-
 WORKING_PX = 480
-"""Longer side that the border is looked for at."""
+"""Longer side of the picture in which the border is searched."""
 
 DARK = 0.1
-"""Encoded value below which the corners outside of a view lie: black level, noise and stray light."""
+"""Corners outside of a view lie below this encoded value: black level, noise and stray light."""
 
 TRIPLES = 300
-"""Circles that are tried through three points of the border."""
+"""Circles through three points of the border that are tried."""
 
 INLIER_SHARE = 0.6
-"""Least share of the border that lies on the circle; the rest may be cut straight by the picture or be dark tissue."""
+"""Least share of the border on the circle; the rest may be cut straight by the picture, or dark tissue."""
 
 TOLERANCE = 0.006
-"""What counts as on the border's curve, as a share of the working picture's longer side."""
+"""Distance within which a point lies on the curve, as a share of the working picture's longer side."""
 
 MAX_CORNERS = 10
-"""Eight cut by the border, and one or two where noise cuts a corner in two."""
+"""Eight where four corners are cut, and one or two where noise splits a corner."""
 
 SIDE_PX = 1.5
-"""How far the lit part may be from straight sides, px of the working picture."""
+"""Largest distance of the lit part from straight sides, px of the working picture."""
 
 UNFILLED, FILLED = 0.01, 0.6
-"""Most of the picture that may be dark inside the sides; least that lies inside them."""
+"""Largest share of the picture that may be dark inside the sides, and least share that lies inside them."""
 
 MARGIN = 0.012
 """Width of the rim that belongs to the border, as a share of the picture's longer side: bright edges, stray light."""
@@ -44,12 +40,12 @@ MARGIN = 0.012
 
 @dataclass(frozen=True)
 class View:
-    """What of a picture shows tissue.
+    """The part of a picture that shows tissue.
 
     Parameters
     ----------
     seen : ndarray of bool, shape (H, W), or None
-        Inside the border, its bright rim taken off; None where the whole picture is seen.
+        Inside the border, without its bright rim; None where the whole picture is seen.
     circle : ViewMask or None
         The border, where it is round.
     """
@@ -75,6 +71,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         The whole picture where fewer than two of its corners are dark, or the dark part's border is neither round nor a
         polygon of few corners: an organ before a dark background has no such border.
     """
+    # candidates: the lit part of a small picture, and its border
     height, width = picture.shape[:2]
     scale = min(1.0, WORKING_PX / max(height, width))
     size = (max(round(width * scale), 8), max(round(height * scale), 8))
@@ -89,7 +86,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     ratio = np.array([width / size[0], height / size[1]])
     hull = cv2.convexHull(np.argwhere(inside)[:, ::-1].astype(np.int32).reshape(-1, 1, 2))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
-    # Cut corners lie on a circle too, within a pixel or two: straight sides are looked for first.
+    # Cut corners also lie on a circle, within a pixel or two, so straight sides are tried first.
     polygon = _is_polygon(inside, filled, hull)
     circle = None if polygon else _circle(border, tolerance)
     if circle is None and not polygon:
@@ -103,14 +100,14 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         found = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
     else:
         found = None
-    # The distance transform does not count the picture's own edges: there is no rim along them.
+    # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
     depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
     return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), found)
 
 
 def _inside(brightness: Image) -> Mask | None:
-    """Give the lit part of a small picture, its dark surroundings taken off; None where the corners are lit."""
+    """Return the lit part of a small picture without its dark surroundings; None where the corners are lit."""
     smooth = cv2.blur(brightness, (3, 3))
     corner = max(2, round(0.02 * max(smooth.shape)))
     ends = (np.s_[:corner], np.s_[-corner:])
@@ -129,8 +126,8 @@ def _inside(brightness: Image) -> Mask | None:
     return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
 
 
-def _border(inside: Mask) -> Points:
-    """Give the border's points inside the picture, shape (N, 2), integer-centred."""
+def _border(inside: Mask) -> Array:
+    """Return the border's points inside the picture, shape (N, 2), integer-centred."""
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     points = max(contours, key=len)[:, 0].astype(float)
     height, width = inside.shape
@@ -138,9 +135,10 @@ def _border(inside: Mask) -> Points:
     return np.asarray(points[clear])
 
 
-def _circle(points: Points, tolerance: float) -> tuple[float, float, float] | None:
-    """Fit a circle to the share of points that lie on one; gives centre and radius, or None."""
+def _circle(points: Array, tolerance: float) -> tuple[float, float, float] | None:
+    """Fit a circle to the share of points that lie on one; return centre and radius, or None."""
     rng = from_integer(0)
+    # candidates: circles through three points
     a, b, c = points[rng.integers(0, len(points), (3, TRIPLES))]
     A = 2 * np.stack([b - a, c - a], axis=1)
     rhs = np.stack([(b**2 - a**2).sum(axis=1), (c**2 - a**2).sum(axis=1)], axis=1)
@@ -151,17 +149,18 @@ def _circle(points: Points, tolerance: float) -> tuple[float, float, float] | No
     counts = (gaps <= tolerance).sum(axis=1)
     if not len(counts) or counts.max() < INLIER_SHARE * len(points):
         return None
+    # refine: least squares over the points on the best one
     on = points[gaps[int(counts.argmax())] <= tolerance]
     solution, *_ = np.linalg.lstsq(np.column_stack([2 * on, np.ones(len(on))]), (on**2).sum(axis=1), rcond=None)
     x, y, level = (float(v) for v in solution)
     radius = float(np.sqrt(level + x * x + y * y))
-    # A flat arc has its centre anywhere: a view's border turns around the picture.
+    # reject flat arcs, whose centre may lie anywhere: a view's border surrounds the picture
     spread = np.ptp(on, axis=0)
     return (x, y, radius) if radius <= 1.2 * float(np.hypot(*spread)) else None
 
 
 def _is_polygon(inside: Mask, filled: Mask, hull: npt.NDArray[np.int32]) -> bool:
-    """Tell whether the lit part is a convex polygon of few corners that fills most of the picture."""
+    """Return whether the lit part is a convex polygon of few corners that fills most of the picture."""
     if np.count_nonzero(filled & ~inside) > UNFILLED * filled.size or np.count_nonzero(filled) < FILLED * filled.size:
         return False
     return len(cv2.approxPolyDP(hull, SIDE_PX, True)) <= MAX_CORNERS

@@ -1,6 +1,28 @@
-"""Estimators of the surface normal at a highlight; they see a frame and its calibration, never the truth."""
+"""Estimators of the surface normal at a highlight; they see a frame and its calibration, never the truth.
 
-from simtest.estimators.protocol import Estimate, EstimatedCurvature, Estimator, FittedIsophote
-from simtest.estimators.registry import available, load_estimators
+`protocol` declares what an estimator is and returns, `registry` finds it by name, `dispatch` runs it. Each estimator is
+a file of its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bisector`, `photometric`. They share
+`isophote_fit` (ellipses) and `isophote_family` (the isophotes of one highlight together, extrapolated to its peak).
+"""
 
-__all__ = ["Estimate", "EstimatedCurvature", "Estimator", "FittedIsophote", "available", "load_estimators"]
+from simtest.estimators.isophote_fit import FittedIsophote
+from simtest.estimators.protocol import (
+    AnyEstimator,
+    BatchEstimator,
+    Estimate,
+    EstimatedCurvature,
+    Estimator,
+    FrameEstimator,
+)
+from simtest.estimators.registry import load_estimators
+
+__all__ = [
+    "AnyEstimator",
+    "BatchEstimator",
+    "Estimate",
+    "EstimatedCurvature",
+    "Estimator",
+    "FittedIsophote",
+    "FrameEstimator",
+    "load_estimators",
+]

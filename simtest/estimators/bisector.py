@@ -1,34 +1,26 @@
-"""`bisector`: with the light's place known, the normal bisects the directions to light and camera."""
+"""`bisector`: with the light's position known, the normal bisects the directions to light and camera."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from simtest.calibration import NO_PRIORS, Priors
+from simtest.calibration import NO_PRIORS, Distribution, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.flags import isophote_flags
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import tangent_basis
-
-Array = npt.NDArray[np.float64]
-
+from simtest.geometry import Array, Camera, Patch
+from simtest.geometry.vectors import basis_across
 
 STEP = 1e-4
 """Step of the differences of the normal, rad, and as a share of the distance."""
 
 
-def bisector(
-    patch: Patch,
-    camera: Camera,
-    priors: Priors = NO_PRIORS,
-    isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
-) -> Estimate | Failure:
-    """Bisect the directions to the light and to the camera at P = d s (theory.md section 3, item 1).
+@dataclass(frozen=True)
+class Bisector:
+    """The bisector of the directions to the light and to the camera at P = d s (theory.md section 3, item 1).
 
     s is the sightline of the BP: the cones' axis followed to t -> 1, less the shift of the radiance's peak by the
     falloff with the distance from the light. That falloff has the slope g = -2 grad log|L - P|, so the peak lies g/H
@@ -36,77 +28,78 @@ def bisector(
 
     Parameters
     ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    priors : Priors
-        Its lights and distance are needed.
-    isovalues : sequence of float
+    isovalues : tuple of float
         Each t in (0, 1).
-
-    Returns
-    -------
-    Estimate or Failure
-        A candidate for each light that may have made the highlight, the proposed one first. Fails as `cone_axis` does,
-        and with ``not_known`` without lights or distance. With several lights the highlight's own is told by where the
-        others are (`light_of_highlight`); where it cannot be told, the lights' mean place is used, flagged
-        ``ambiguous_light``.
     """
-    if not priors.lights_mm or priors.distance_mm is None:
-        return Failure(Reason.NOT_KNOWN, "needs the lights' places and a distance")
-    spot = fit_isophote_family(patch, camera, isovalues)
-    if isinstance(spot, Failure):
-        return spot
-    lights, flags = priors.lights, isophote_flags(spot)
-    own = light_of_highlight(spot, priors)
-    order = [*lights] if own is None else [lights[own]]
-    if own is None:
-        # What is seen is then as a rule the lights' common lobe.
-        order.insert(0, lights.mean(axis=0))
-        flags = (*flags, "ambiguous_light")
-    candidates = np.array([_normal(spot, light, priors.distance_mm)[0] for light in order])
-    normal, sightline = _normal(spot, order[0], priors.distance_mm)
-    return Estimate(
-        normal=normal,
-        candidates=candidates,
-        look_px=camera.project(sightline),
-        axis_ratio=spot.axis_ratio,
-        isophotes=spot.isophotes,
-        covariance=_covariance(spot, order[0], priors, normal),
-        flags=flags,
-    )
+
+    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+        """Estimate the normal (see `simtest.estimators.Estimator`); lights and distance must be known.
+
+        The candidates are those of the lights that may have made the highlight, the proposed one first. With several
+        lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
+        lights' mean position is used, flagged ``ambiguous_light``. Fails as `cone_axis` does, and with ``not_known``
+        without lights or distance.
+        """
+        if not priors.lights_mm or priors.distance_mm is None:
+            return Failure(Reason.NOT_KNOWN, "needs the lights' places and a distance")
+        family = fit_isophote_family(patch, camera, self.isovalues)
+        if isinstance(family, Failure):
+            return family
+        lights, distance, flags = priors.lights, priors.distance_mm, isophote_flags(family)
+        own = light_of_highlight(family, priors)
+        order = [*lights] if own is None else [lights[own]]
+        if own is None:
+            # What is seen is then usually the lights' common lobe.
+            order.insert(0, lights.mean(axis=0))
+            flags = (*flags, "ambiguous_light")
+        candidates = np.array([_normal(family, light, distance.mean)[0] for light in order])
+        normal, sightline = _normal(family, order[0], distance.mean)
+        return Estimate(
+            normal=normal,
+            candidates=candidates,
+            look_px=camera.project(sightline),
+            axis_ratio=family.axis_ratio,
+            isophotes=family.isophotes,
+            covariance=_covariance(family, order[0], distance, normal),
+            flags=flags,
+        )
+
+
+bisector = Bisector()
 
 
 def bisect(position: Array, light: Array) -> Array:
-    """Give the unit vector that bisects the directions from a point to the light and to the camera, shape (3,)."""
+    """Return the unit vector that bisects the directions from a point to the light and to the camera, shape (3,)."""
     to_light, to_camera = light - position, -position
     both = to_light / np.linalg.norm(to_light) + to_camera / np.linalg.norm(to_camera)
     return np.asarray(both / np.linalg.norm(both))
 
 
-def _normal(spot: IsophoteFamily, light: Array, distance: float, turned: Array | None = None) -> tuple[Array, Array]:
-    """Give normal and sightline of the BP; `turned`, rad in the spot's basis, moves the measured sightline."""
-    sightline = spot.peak_axis if turned is None else spot.peak_axis + turned @ spot.basis
+def _normal(family: IsophoteFamily, light: Array, distance: float, turn: Array | None = None) -> tuple[Array, Array]:
+    """Return normal and sightline of the BP; `turn`, rad in the family's basis, moves the measured sightline."""
+    sightline = family.peak_axis if turn is None else family.peak_axis + turn @ family.basis
     sightline = sightline / np.linalg.norm(sightline)
     position = distance * sightline
     normal = bisect(position, light)
-    # How the surface point moves with the image's tangent: along the plane across the normal.
-    steps = distance * (spot.basis - np.outer(spot.basis @ normal / (normal @ sightline), sightline))
+    # The surface point moves with the image's tangent along the plane perpendicular to the normal.
+    steps = distance * (family.basis - np.outer(family.basis @ normal / (normal @ sightline), sightline))
     to_light = light - position
+    # the falloff's slope shifts the peak by g/H
     slope = 2 * steps @ to_light / (to_light @ to_light)
-    sightline = sightline - (spot.moments @ slope) @ spot.basis
+    sightline = sightline - (family.moments @ slope) @ family.basis
     sightline /= np.linalg.norm(sightline)
     return bisect(distance * sightline, light), sightline
 
 
-def _covariance(spot: IsophoteFamily, light: Array, priors: Priors, normal: Array) -> Array | None:
-    """Give the covariance of the normal by noise and by the distance's uncertainty, shape (2, 2)."""
-    if spot.peak_covariance is None or priors.distance_mm is None:
+def _covariance(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Array | None:
+    """Return the covariance of the normal by noise and by the distance's uncertainty, shape (2, 2)."""
+    if family.peak_covariance is None:
         return None
-    across = np.stack([vector[0] for vector in tangent_basis(normal[None])])
-    turned = [_normal(spot, light, priors.distance_mm, STEP * unit)[0] for unit in np.eye(2)]
+    across = basis_across(normal)
+    turned = [_normal(family, light, distance.mean, STEP * unit)[0] for unit in np.eye(2)]
     J = across @ (np.array(turned) - normal).T / STEP
-    farther, _ = _normal(spot, light, priors.distance_mm * (1 + STEP))
-    by_distance = across @ (farther - normal) / (STEP * priors.distance_mm) * priors.distance_sd_mm
-    return np.asarray(J @ spot.peak_covariance @ J.T + np.outer(by_distance, by_distance))
+    farther, _ = _normal(family, light, distance.mean * (1 + STEP))
+    by_distance = across @ (farther - normal) / (STEP * distance.mean) * distance.sd
+    return np.asarray(J @ family.peak_covariance @ J.T + np.outer(by_distance, by_distance))

@@ -4,28 +4,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
+from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
 from simtest.estimators.pose_uncertainty import pose_region
-from simtest.estimators.protocol import Estimate, FittedIsophote, answers_each, fit_isophote_of_each
-from simtest.geometry import Camera, CirclePoses, Patch
-from simtest.geometry import circle_poses as poses_of_cones
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_poses
 
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
-"""Low ones: the circles' projected centres part with the square of the isophote's size."""
+"""Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""
 
 CLEAR_MARGIN = 3.0
-"""Where the isovalue's own choice is as clear as this, in standard deviations, others are not asked."""
+"""Where the isovalue's own choice is as clear as this, in standard deviations, no others are used."""
 
 AMBIGUOUS_MARGIN = 2.0
 
 MIN_SEPARATION = 0.35
-"""A circle's peak lies at one centre, not half-way: less of the centres' distance between the gaps is no choice."""
+"""A circle's peak lies at one centre, not half-way: below this share of the centres' distance the lead is no choice."""
+
+LEAST_SMOOTHING_PX = 0.5
+"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
 
 
 @dataclass(frozen=True)
@@ -60,75 +60,70 @@ class _Choice:
         )
 
 
-def _each(patches: Sequence[Patch | Failure], camera: Camera) -> list[Estimate | Failure]:
-    """Give `circle_pose` of several patches."""
-    return [
-        made if isinstance(patch, Failure) else _with_region(made, patch, camera)
-        for patch, made in zip(patches, circle_poses(patches, camera), strict=True)
-    ]
+@dataclass(frozen=True)
+class CirclePoseEstimator:
+    """The normal of a plane from one isophote, taken as the image of a circle.
 
-
-@answers_each(_each)
-def circle_pose(patch: Patch, camera: Camera, isovalue: float = CIRCLE_POSE_ISOVALUE) -> Estimate | Failure:
-    """Reconstruct the normal of a plane from one isophote taken as the image of a circle.
-
-    The article leaves the choice between N+ and N- to a person. Both make the same angle with the cone's axis, so
-    the one is proposed whose projected circle centre (along C'^-1 N) is nearer to the sub-pixel peak. Where that is not
-    clear at the isovalue, lower ones are asked as well; the pose stays that of the isovalue.
+    The article leaves the choice between N+ and N- to a person. Both make the same angle with the cone's axis, so the
+    one is proposed whose projected circle centre (along C'^-1 N) is nearer to the sub-pixel peak. Where that is not
+    clear at the isovalue, lower ones are used as well; the pose stays that of the isovalue.
 
     Parameters
     ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
     isovalue : float
         t in (0, 1).
-
-    Returns
-    -------
-    Estimate or Failure
-        Two candidates; it looks at the projected circle centre. `choice_margin` is the difference of the two distances
-        over its standard deviation, where the noise is known. Flags: ``ambiguous`` where that is below 2,
-        ``near_degenerate`` where the peak is nearer to the middle than to either centre, or noise hides the centres'
-        distance: as a rule the light is at the camera, and the two-fold model does not apply. `region` holds the
-        normals that the isophote's noise leaves: about both candidates, which near the branch point are one region.
+    with_region : bool
+        Whether estimates state a region; it takes longer than all else together.
     """
-    return _with_region(circle_poses([patch], camera, isovalue)[0], patch, camera)
+
+    isovalue: float = CIRCLE_POSE_ISOVALUE
+    with_region: bool = True
+
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+        """Estimate the normal (see `simtest.estimators.Estimator`); priors are not used.
+
+        The estimate has two candidates and looks at the projected circle centre. `choice_margin` is the difference of
+        the two distances over its standard deviation, where the noise is known. Flags: ``ambiguous`` where that is
+        below 2; ``near_degenerate`` where the peak is nearer to the middle than to either centre, or noise hides the
+        centres' distance: usually the light is at the camera, and the two-fold model does not apply. `region` holds the
+        normals that the isophote's noise allows: about both candidates, which near the branch point are one region.
+        """
+        return self.estimate_batch([patch], camera, priors)[0]
+
+    def estimate_batch(
+        self, patches: Sequence[Patch], camera: Camera, priors: Priors = NO_PRIORS
+    ) -> list[Estimate | Failure]:
+        """Estimate several normals at once, many times faster than one by one where regions are left out."""
+        fitted = fit_isophote_of_each(patches, camera, self.isovalue)
+        pairs = zip(patches, fitted, strict=True)
+        pending = [(patch, isophote) for patch, isophote in pairs if not isinstance(isophote, Failure)]
+        posed = zip(pending, _pose(pending, camera), strict=True)
+        made = (self._stated(result, patch, camera) for (patch, _), result in posed)
+        return [isophote if isinstance(isophote, Failure) else next(made) for isophote in fitted]
+
+    def _stated(self, result: Estimate | Failure, patch: Patch, camera: Camera) -> Estimate | Failure:
+        """Add the region, where it is wanted."""
+        if isinstance(result, Failure) or not self.with_region:
+            return result
+        return replace(result, region=pose_region(patch, camera, result.isophotes[0]))
 
 
-def circle_poses(
-    patches: Sequence[Patch | Failure], camera: Camera, isovalue: float = CIRCLE_POSE_ISOVALUE
-) -> list[Estimate | Failure]:
-    """Give `circle_pose` of several patches at once, many times faster than one by one; a Failure stays one.
-
-    Without regions: each takes longer than all else together.
-    """
-    fitted = fit_isophote_of_each(patches, camera, isovalue)
-    pending = [
-        (patch, isophote)
-        for patch, isophote in zip(patches, fitted, strict=True)
-        if not (isinstance(patch, Failure) or isinstance(isophote, Failure))
-    ]
-    posed = iter(_pose(pending, camera))
-    return [isophote if isinstance(isophote, Failure) else next(posed) for isophote in fitted]
-
-
-def _with_region(made: Estimate | Failure, patch: Patch, camera: Camera) -> Estimate | Failure:
-    if isinstance(made, Failure):
-        return made
-    return replace(made, region=pose_region(patch, camera, made.isophotes[0]))
+circle_pose = CirclePoseEstimator()
 
 
 def _pose(fitted: Sequence[tuple[Patch, FittedIsophote]], camera: Camera) -> list[Estimate | Failure]:
+    """Return the estimates of fitted isophotes, without regions."""
     if not fitted:
         return []
+    # candidates: the two poses of each cone, and where they project their circle's centre
     poses = _poses([isophote for _, isophote in fitted])
     looks = camera.project(poses.centres)
     patches = [patch for patch, _ in fitted]
+    # choice: the centre nearer to the peak
     noise = _peak_deviation(patches, [isophote for _, isophote in fitted], poses, camera)
     choice = _choose(patches, looks, noise)
     choice = _pooled(choice, patches, poses, camera, noise)
+    # the chosen candidate first
     order = np.where(choice.lead >= 0, 0, 1)[:, None] ^ np.array([[0, 1]])
     normals = np.take_along_axis(poses.normals, order[:, :, None], axis=1)
     looks = np.take_along_axis(looks, order[:, :, None], axis=1)
@@ -146,7 +141,7 @@ def _pose(fitted: Sequence[tuple[Patch, FittedIsophote]], camera: Camera) -> lis
 
 
 def _poses(isophotes: Sequence[FittedIsophote]) -> CirclePoses:
-    return poses_of_cones(np.array([i.cone for i in isophotes]), np.array([i.sightline for i in isophotes]))
+    return circle_poses(np.array([i.cone for i in isophotes]), np.array([i.sightline for i in isophotes]))
 
 
 def _choose(patches: Sequence[Patch], looks: Array, deviation: Array) -> _Choice:
@@ -157,7 +152,7 @@ def _choose(patches: Sequence[Patch], looks: Array, deviation: Array) -> _Choice
 
 
 def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camera: Camera, deviation: Array) -> _Choice:
-    """Ask lower isovalues one by one until the choice is clear; leads are averaged, as their noise is the peak's."""
+    """Add lower isovalues one by one until the choice is clear; leads are averaged, since their noise is the peak's."""
     lead, apart, count = choice.lead.copy(), choice.apart.copy(), np.ones(len(patches))
     for isovalue in POOLED_ISOVALUES:
         asked = np.flatnonzero(~(choice.margin >= CLEAR_MARGIN))
@@ -167,13 +162,15 @@ def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camer
         sound = [(i, found) for i, found in zip(asked.tolist(), fitted, strict=True) if not isinstance(found, Failure)]
         if not sound:
             continue
+        # candidates at this isovalue, in the order of the isovalue's own
         own = _poses([found for _, found in sound])
-        here = np.array([i for i, _ in sound])
+        here = np.array([i for i, _ in sound])  # indices among all highlights
         # The candidate that continues N+ is the nearer one of the two.
         nearness = np.einsum("nkj,nj->nk", own.normals, poses.normals[here, 0])
         order = np.where(nearness[:, 0] >= nearness[:, 1], 0, 1)[:, None] ^ np.array([[0, 1]])
         looks = np.take_along_axis(camera.project(own.centres), order[:, :, None], axis=1)
         lower = _choose([patches[i] for i in here.tolist()], looks, deviation[here])
+        # pool what is usable
         usable = np.isfinite(lower.lead) & np.array([k not in own.failures for k in range(len(here))])
         here = here[usable]
         lead[here] += lower.lead[usable]
@@ -186,10 +183,10 @@ def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camer
 def _peak_deviation(
     patches: Sequence[Patch], isophotes: Sequence[FittedIsophote], poses: CirclePoses, camera: Camera
 ) -> Array:
-    """Give the standard deviation of the lead, px, shape (N,): twice that of the peak along the line of the centres.
+    """Return the standard deviation of the lead, px, shape (N,): twice that of the peak along the line of the centres.
 
-    The slope of noise sigma that was smoothed by s has the variance sigma^2 / (8 pi s^4); over the lobe's second
-    derivative at its peak, I0 (-2 ln t) / r^2, r the isophote's radius along the line, it is the peak's shift.
+    Noise sigma, smoothed by s, has a slope of variance sigma^2 / (8 pi s^4). That slope over the lobe's second
+    derivative at its peak, I0 (-2 ln t) / r^2, r the isophote's radius along the line, is the peak's shift.
     """
     known = np.array([p.noise if isinstance(p.noise, float) else _at_peak(p) for p in patches])
     smoothing = np.array([max(p.smoothing_px, LEAST_SMOOTHING_PX) for p in patches])
@@ -200,12 +197,8 @@ def _peak_deviation(
     return np.asarray(2 * known / (np.sqrt(8 * np.pi) * smoothing**2) * radius**2 / (height * level))
 
 
-LEAST_SMOOTHING_PX = 0.5
-"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
-
-
 def _at_peak(patch: Patch) -> float:
-    """Give the noise at a patch's peak; NaN where it is not known."""
+    """Return the noise at a patch's peak; NaN where it is not known."""
     if patch.noise is None:
         return float("nan")
     column, row = patch.peak_pixel

@@ -1,10 +1,9 @@
 """`curved`: the isophotes' centre carries the normal, their shape the curvature (theory.md section 3)."""
 
 import itertools
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
@@ -13,85 +12,84 @@ from simtest.estimators.flags import STREAK_RATIO, isophote_flags
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.geometry import Camera, Patch
-
-Array = npt.NDArray[np.float64]
+from simtest.geometry import Array, Camera, Patch
 
 STREAK_GAIN = 0.1
-"""Below this abs(1 + d k), or `STREAK_RATIO` where the lobe is not known, the spot is a streak."""
+"""A highlight with an abs(1 + d k) below this is a streak; where the lobe is not known `STREAK_RATIO` decides."""
+
+ROUND_SHARE = 3.0
+"""Squared difference of the moments over its noise: -ln 0.05, which 5 % of round highlights exceed."""
 
 
-def curved(
-    patch: Patch,
-    camera: Camera,
-    priors: Priors = NO_PRIORS,
-    isovalues: Sequence[float] = CONE_AXIS_ISOVALUES,
-) -> Estimate | Failure:
-    """Give normal and curvature of a surface lit from the camera's place.
+@dataclass(frozen=True)
+class Curved:
+    """Normal and curvature of a surface lit from the camera's position.
 
     The normal is the cones' mean axis as in `cone_axis`, followed to t -> 1 where the axis drifts by more than the
     noise explains. The lobe's second moments at the peak, 1/H, give the rest: with m = 1 + d k and c the curvature of
-    the lobe, H = c m^2 + 2 m along each principal direction; the directions are those of the isophotes' mean moments,
-    whose noise is a quarter of that. Where c is not known, m is known up to scale, and the 2 m
-    of the falloff is neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
+    the lobe, H = c m^2 + 2 m along each principal direction. The directions are those of the isophotes' mean moments,
+    which have a quarter of the noise. Where c is not known, m is known up to scale and the 2 m of the falloff is
+    neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
+
+    Of the priors, the lobe's curvature is used, and the lights as by `cone_axis`.
 
     Parameters
     ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    priors : Priors
-        Its `lobe_curvature` is used, and its lights as by `cone_axis`.
-    isovalues : sequence of float
+    isovalues : tuple of float
         Each t in (0, 1).
-
-    Returns
-    -------
-    Estimate or Failure
-        One candidate, with `curvature`. Fails as `cone_axis` does; with ``degenerate_conic`` where the moments at the
-        peak are not those of a lobe, and with ``streak`` where 1 + d k is near 0. Flags as of `cone_axis`, and
-        ``round`` where the principal directions are not told from noise.
     """
-    spot = fit_isophote_family(patch, camera, isovalues)
-    if isinstance(spot, Failure):
-        return spot
-    found = _curvature(spot, priors.lobe_curvature)
-    if isinstance(found, Failure):
-        return found
-    curvature, is_round = found
-    axis, covariance = spot.axis, spot.axis_covariance
-    if spot.drift_is_real:
-        axis, covariance = spot.peak_axis, spot.peak_covariance
-    estimate = Estimate(
-        normal=-axis,
-        candidates=-axis[None],
-        look_px=camera.project(axis),
-        axis_ratio=curvature.axis_ratio,
-        isophotes=spot.isophotes,
-        covariance=covariance,
-        flags=(*isophote_flags(spot), "round") if is_round else isophote_flags(spot),
-        curvature=curvature,
-    )
-    return add_light_offset_uncertainty(estimate, priors)
+
+    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+        """Estimate normal and curvature (see `simtest.estimators.Estimator`).
+
+        The estimate has one candidate, the flags of `cone_axis`, and ``round`` where noise hides the principal
+        directions. Fails as `cone_axis` does; with ``degenerate_conic`` where the moments at the peak are not those of
+        a lobe, and with ``streak`` where 1 + d k is near 0.
+        """
+        family = fit_isophote_family(patch, camera, self.isovalues)
+        if isinstance(family, Failure):
+            return family
+        found = _curvature(family, None if priors.lobe_curvature is None else priors.lobe_curvature.mean)
+        if isinstance(found, Failure):
+            return found
+        curvature, is_round = found
+        axis, covariance = family.axis, family.axis_covariance
+        if family.drift_is_real:
+            axis, covariance = family.peak_axis, family.peak_covariance
+        estimate = Estimate(
+            normal=-axis,
+            candidates=-axis[None],
+            look_px=camera.project(axis),
+            axis_ratio=curvature.axis_ratio,
+            isophotes=family.isophotes,
+            covariance=covariance,
+            flags=(*isophote_flags(family), "round") if is_round else isophote_flags(family),
+            curvature=curvature,
+        )
+        return add_light_offset_uncertainty(estimate, priors)
+
+
+curved = Curved()
 
 
 def gain_of_stiffness(stiffness: Array, lobe_curvature: float) -> Array:
-    """Give the positive 1 + d k of H = c m^2 + 2 m; the negative one is -2/c less it."""
+    """Solve H = c m^2 + 2 m for the positive m = 1 + d k; the negative solution is -2/c less it."""
     c = lobe_curvature
     return np.asarray(stiffness / (1 + np.sqrt(1 + c * stiffness)))
 
 
-def _curvature(spot: IsophoteFamily, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
-    """Give the curvature, and whether the spot is round within the noise."""
-    values = np.asarray(np.linalg.eigvalsh(spot.moments), dtype=np.float64)
+def _curvature(family: IsophoteFamily, lobe: float | None) -> tuple[EstimatedCurvature, bool] | Failure:
+    """Return the curvature, and whether the highlight is round within the noise."""
+    values = np.asarray(np.linalg.eigvalsh(family.moments), dtype=np.float64)
     if values[0] <= 0:
         return Failure(Reason.DEGENERATE_CONIC, f"moments at the peak {values[0]:.3g}, {values[1]:.3g} rad^2")
-    shrunk, is_round = _without_noise(values, spot.moments_covariance)
+    shrunk, is_round = _without_noise(values, family.moments_covariance)
     # The longer axis lies along the smaller gain. Following the moments to t -> 1 would turn it by noise alone.
     stiffness = 1 / shrunk[::-1]
-    vectors = np.linalg.eigh(spot.mean_moments)[1]
-    directions = vectors.T[::-1] @ spot.basis
+    vectors = np.linalg.eigh(family.mean_moments)[1]
+    directions = vectors.T[::-1] @ family.basis
     if lobe is None:
         ratio = float(np.sqrt(stiffness[0] / stiffness[1]))
         hypotheses, smallest, least = None, ratio, STREAK_RATIO
@@ -106,11 +104,11 @@ def _curvature(spot: IsophoteFamily, lobe: float | None) -> tuple[EstimatedCurva
 
 
 def _without_noise(values: Array, covariance: Array | None) -> tuple[Array, bool]:
-    """Shrink the difference of two second moments by its noise; shape (2,), rising.
+    """Shrink the difference of two second moments by its noise; return both, rising, and whether they are equal.
 
-    Noise splits equal eigenvalues: the squared difference of a round spot's moments has the mean of its variance, v.
-    The difference D becomes D - v / D, or 0 where it is below its noise, so that round spots stay round. Of one that is
-    far above its noise this takes v / D, where noise has added v / (4 D) on average: 3 % too much at D = 5 sqrt(v).
+    Noise splits equal eigenvalues: for a round highlight the squared difference has the mean of its variance, v. The
+    difference D becomes D - v / D, or 0 where it is below its noise, so that round highlights stay round. Far above its
+    noise this subtracts v / D where noise has added v / (4 D) on average: 3 % too much at D = 5 sqrt(v).
     """
     if covariance is None:
         return values, False
@@ -119,10 +117,6 @@ def _without_noise(values: Array, covariance: Array | None) -> tuple[Array, bool
     mean, difference = float(values.mean()), float(values[1] - values[0])
     kept = max(difference - noise / difference, 0.0) if difference > 0 else 0.0
     return np.array([mean - kept / 2, mean + kept / 2]), difference**2 < ROUND_SHARE * noise
-
-
-ROUND_SHARE = 3.0
-"""Squared difference of the moments over its noise: -ln 0.05, which 5 % of round spots exceed."""
 
 
 def sign_hypotheses(stiffness: Array, lobe: float) -> Array:

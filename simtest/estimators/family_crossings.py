@@ -1,30 +1,26 @@
 """The crossings of a highlight's isophotes in a basis across its axis, their conics there, and how noise moves them.
 
-All isophotes are worked on at once: a call for each would cost more than the work.
+All isophotes are processed at once: a call for each would cost more than the work.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
+from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue
 from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
-from simtest.estimators.protocol import FittedIsophote
-from simtest.geometry import Camera, Patch
+from simtest.geometry import Array, Camera, Index, Mask, Patch
 from simtest.geometry.level_sets import Sensitivities
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
 STEP_PX = 0.1
-"""Step of the central differences of a distorting lens' sightlines."""
+"""Step of the central differences of a distorting lens's sightlines."""
 
 
 @dataclass(frozen=True)
 class FamilyCrossings:
-    """The points of K isophotes, N in all, one isophote's after the other's.
+    """The points of K isophotes, N in all, one isophote after the other.
 
     Parameters
     ----------
@@ -56,14 +52,14 @@ class FamilyCrossings:
         return np.array([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]]).T
 
     def tangents(self, points: Array) -> Array:
-        """Give the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
+        """Return the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
         if self.camera.distortion is None:
             return self._pinhole(points)[0]
         along = self.frame @ self.camera.unproject(points).T
         return np.asarray(along[:2] / along[2])
 
     def _pinhole(self, points: Array) -> tuple[Array, Array]:
-        """Give the tangents, and the third of the coordinates that they are ratios of: a homography of the image."""
+        """Return the tangents of a pinhole's pixels and the depth they are ratios over: a homography of the image."""
         H = self._from_image
         along = H[:, :2] @ points.T
         along += H[:, 2:]
@@ -83,18 +79,18 @@ class FamilyCrossings:
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
 
     def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, PeakValue] | None = None) -> Rows:
-        """Give what the noise's standard deviation in each raw pixel moves quantities by; the noise must be known.
+        """Return how far one standard deviation of noise in each raw pixel moves quantities; the noise must be known.
 
-        Each crossing moves with the three pixels that it hangs on, two beside it and the peak's; the ellipse, and what
-        is made of it, with its crossings. What is left is a sum over the smoothed pixels.
+        A crossing depends on three pixels, the two beside it and the peak's; the ellipse and what follows from it
+        depend on its crossings. All is summed by smoothed pixel, then carried to the raw ones.
 
         Parameters
         ----------
         by_conic : ndarray, shape (K, Q, 5)
-            How each quantity moves with each isophote's conic.
-        by_level : tuple of ndarray, shape (Q,), and Top, optional
-            How it moves with all -ln t, and the top that these are over: they move with it, and against the peak's
-            pixel.
+            Derivatives of the quantities by each isophote's conic.
+        by_level : tuple of ndarray, shape (Q,), and PeakValue, optional
+            Their derivatives by a common shift of all -ln t, and the peak value that t is relative to: it moves the
+            levels one way, the peak's pixel the other.
 
         Returns
         -------
@@ -102,17 +98,19 @@ class FamilyCrossings:
         """
         noise, moved = self.patch.noise, self._sensitivities
         assert noise is not None
+        # by crossing, through the conics
         by_moment, moments = self._conics_by_crossings
         by_crossing = np.concatenate(
             [each @ moments[:, part] for each, part in zip(by_conic @ by_moment, self._parts, strict=True)], axis=1
         )
+        # by smoothed pixel: the two beside each crossing, and the peak's, which sets the level
         by_peak = by_crossing @ (moved.level * np.repeat(self.isovalues, self._counts))
         moves, pixels = [(by_crossing[:, :, None] * moved.weights).reshape(len(by_peak), -1)], [self._pixels]
         if by_level is not None:
-            by_shift, top = by_level
+            by_shift, peak = by_level
             by_peak = by_peak - by_shift / self.patch.peak_value
-            moves.append(by_shift[:, None] * top.weights)
-            pixels.append(top.pixels)
+            moves.append(by_shift[:, None] * peak.weights)
+            pixels.append(peak.pixels)
         width, (column, row) = self.patch.values.shape[1], self.patch.peak_pixel
         flat = np.concatenate([*pixels, np.array([row * width + column])])
         return raw_moves(
@@ -120,13 +118,13 @@ class FamilyCrossings:
         )
 
     @cached_property
-    def _counts(self) -> npt.NDArray[np.intp]:
+    def _counts(self) -> Index:
         """Points of each isophote, shape (K,)."""
         return np.array([len(isophote.points) for isophote in self.isophotes])
 
     @cached_property
     def _parts(self) -> list[slice]:
-        """Where each isophote's points are among those of all."""
+        """The slice of each isophote's points among those of all."""
         ends = np.cumsum(self._counts).tolist()
         return [slice(end - count, end) for end, count in zip(ends, self._counts.tolist(), strict=True)]
 
@@ -136,24 +134,24 @@ class FamilyCrossings:
         return np.concatenate([isophote.points for isophote in self.isophotes])
 
     @cached_property
-    def _places(self) -> Array:
+    def _point_tangents(self) -> Array:
         """Their tangents, shape (2, N)."""
         return self.tangents(self._points)
 
     def _steps(self, vertical: Mask) -> Array:
-        """Tell how the tangents change as each point moves along its line, per px, shape (2, N)."""
+        """Return how the tangents change as each point moves along its line, per px, shape (2, N)."""
         if self.camera.distortion is None:
-            places, depth = self._pinhole(self._points)
+            tangents, depth = self._pinhole(self._points)
             along = self._from_image.take(vertical.astype(np.intp), axis=1)
-            return np.asarray((along[:2] - places * along[2]) / depth)
+            return np.asarray((along[:2] - tangents * along[2]) / depth)
         step, count = STEP_PX * np.array([~vertical, vertical]).T, len(vertical)
-        there = self.tangents(np.concatenate([self._points + step, self._points - step]))
-        return np.asarray((there[:, :count] - there[:, count:]) / (2 * STEP_PX))
+        moved = self.tangents(np.concatenate([self._points + step, self._points - step]))
+        return np.asarray((moved[:, :count] - moved[:, count:]) / (2 * STEP_PX))
 
     @cached_property
     def _misses(self) -> tuple[Array, Array]:
-        """What each point makes of its conic's left side less 1, shape (N,), and the gradient there, shape (2, N)."""
-        x, y = self._places
+        """Left side less 1 of its conic's equation at each point, shape (N,), and its gradient, shape (2, N)."""
+        x, y = self._point_tangents
         a, b, c, d, e = np.repeat(self.conics.T, self._counts, axis=1)
         ax, by, bx, cy = a * x, b * y, b * x, c * y
         return (ax + by + d) * x + (cy + e) * y - 1, np.array([2 * ax + by + d, bx + 2 * cy + e])
@@ -164,13 +162,14 @@ class FamilyCrossings:
         return self.patch.sensitivities(self.isovalues.tolist(), [isophote.cut for isophote in self.isophotes])
 
     @cached_property
-    def _pixels(self) -> npt.NDArray[np.intp]:
-        """Places in the flattened patch of the two pixels beside each point, shape (2 N,)."""
+    def _pixels(self) -> Index:
+        """Indices in the flattened patch of the two pixels beside each point, shape (2 N,)."""
         pixels = self._sensitivities.pixels
         return np.asarray(pixels[..., 1] * self.patch.values.shape[1] + pixels[..., 0]).ravel()
 
     @cached_property
     def _conics_by_crossings(self) -> tuple[Array, Array]:
+        """Derivatives of the conics by their crossings (see `conics_by_crossings`)."""
         moves = self._steps(self._sensitivities.vertical)
         cut = [isophote.cut for isophote in self.isophotes]
-        return conics_by_crossings(self._places, self._misses[1], moves, self._parts, cut)
+        return conics_by_crossings(self._point_tangents, self._misses[1], moves, self._parts, cut)

@@ -1,4 +1,4 @@
-"""Warnings that hang on the isophotes of a highlight."""
+"""Warnings about the isophotes of a highlight."""
 
 from simtest.errors import Reason
 from simtest.estimators.isophote_family import IsophoteFamily
@@ -7,19 +7,19 @@ STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
 
 
-def isophote_flags(spot: IsophoteFamily) -> tuple[str, ...]:
-    """Give the flags of a highlight's isophotes.
+def isophote_flags(family: IsophoteFamily) -> tuple[str, ...]:
+    """Return the flags of a highlight's isophotes.
 
-    ``missing_isovalues``: some isovalues gave no ellipse. ``partial_arc``: some isophotes run into the border of the
-    region, the frame or the view, so that the highlight may be cut there; they are left out, or fitted to what is seen.
-    ``streak``: longer than it is wide by 10 and more, so that along it little holds the centre. ``not_elliptic``: an
-    isophote is no ellipse, as where two highlights touch or the surface's curvature changes under the spot.
+    ``missing_isovalues``: some isovalues have no ellipse. ``partial_arc``: some isophotes run into the border of the
+    region, the frame or the view, so the highlight may be cut there; they are left out, or fitted to what is seen.
+    ``streak``: ten times as long as wide or more, so that its centre is hardly determined along it. ``not_elliptic``:
+    an isophote is no ellipse, as where two highlights touch or the surface's curvature changes under the highlight.
     """
-    missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in spot.failures)
-    said = {
-        "missing_isovalues": bool(spot.failures),
-        "partial_arc": missing or any(isophote.cut for isophote in spot.isophotes),
-        "streak": spot.axis_ratio < STREAK_RATIO,
-        "not_elliptic": spot.is_bent,
+    missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in family.failures)
+    conditions = {
+        "missing_isovalues": bool(family.failures),
+        "partial_arc": missing or any(isophote.cut for isophote in family.isophotes),
+        "streak": family.axis_ratio < STREAK_RATIO,
+        "not_elliptic": family.is_bent,
     }
-    return tuple(flag for flag, holds in said.items() if holds)
+    return tuple(flag for flag, holds in conditions.items() if holds)

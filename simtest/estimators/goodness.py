@@ -1,37 +1,33 @@
-"""Whether a fitted lobe explains its pixels, and how far the normal hangs on which of them are fitted."""
+"""Goodness of a lobe's fit: whether it explains its pixels, and how far the normal depends on which are fitted."""
 
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric
+from simtest.geometry import Array, Mask
 from simtest.geometry.vectors import tangent_coordinates
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
 RINGS, SECTORS = 6, 8
-"""The lobe is cut into rings of equal numbers of pixels by the model's intensity, each into sectors."""
+"""The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
 
 MIN_IN_BIN = 8
 LEVEL = 1e-3
-"""A fit is a misfit where noise alone would leave as much structure in so small a share of fits."""
+"""A fit is a misfit if noise alone would leave as much structure in less than this share of fits."""
 
 FLOOR = 2e-3
-"""Structure below this share of the peak is none: rendering and sampling leave as much."""
+"""Structure below this share of the peak does not count: rendering and sampling leave as much."""
 
 INNER = 0.5
-"""Around the peak every smooth lobe is the same: pixels above this share of it are fitted for comparison."""
+"""Near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison."""
 
 
 def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
-    """Tell whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
+    """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
 
-    A sum over single pixels would notice less, since misfits are smooth, and hang on the noise being known to a part
-    in a hundred.
+    A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
 
     Parameters
     ----------
@@ -40,7 +36,7 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
     observed : ndarray, shape (m,)
         Intensities.
     clipped : ndarray of bool, shape (m,), optional
-        Left out.
+        Pixels to leave out.
     noise : float, or ndarray, shape (m,)
         Standard deviation of each pixel's noise.
 
@@ -56,13 +52,15 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
     variance = np.broadcast_to(np.square(noise), model.shape)[kept]
     if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
         return False
+    # bins: rings by intensity, sectors by direction from the axis
     ring = np.searchsorted(np.quantile(level, np.arange(1, RINGS) / RINGS), level)
     angle = np.arctan2(rays[kept] @ f, rays[kept] @ e)
     sector = np.minimum(((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int), SECTORS - 1)
-    place = ring * SECTORS + sector
+    number = ring * SECTORS + sector
     count, total, spread = (
-        np.bincount(place, weights, RINGS * SECTORS) for weights in (np.ones(len(place)), residual, variance)
+        np.bincount(number, weights, RINGS * SECTORS) for weights in (np.ones(len(number)), residual, variance)
     )
+    # chi-square of the bins' means
     used = count >= MIN_IN_BIN
     mean = total[used] / count[used]
     allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
@@ -70,7 +68,7 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
 
 
 def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
-    """Give by how much the normal moves when only the pixels near the peak are fitted, beyond noise, squared, rad^2.
+    """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
 
     Parameters
     ----------
@@ -84,7 +82,7 @@ def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped
     Returns
     -------
     float
-        0 where the inner pixels do not determine a fit of their own.
+        0 where the inner pixels alone do not determine a fit.
     """
     model, _ = fitted.model.evaluate()
     near = model > INNER * model.max()

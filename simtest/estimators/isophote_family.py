@@ -1,10 +1,10 @@
-"""The isophotes of one highlight together: where their centre goes and what shape they take as t goes to 1.
+"""The isophotes of one highlight together: their centre and shape, extrapolated to t -> 1.
 
 Near its peak the lobe is Gaussian to second order: -log(I / I0) = w^T H w / 2, w the tangent of the image angle. The
 isophote at t is then an ellipse with second moments E(t) = -2 ln t / H, and the axis of its cone is the peak's
-sightline. Terms of higher order in w make E(t) / (-2 ln t) and the axis run linearly with -ln t to leading order, so
-both are followed to the peak by a straight line (theory.md section 3, items 3 and 4; section 6). The axis is followed
-over the isophote's area, and to the peak of the lobe as it was before smoothing (`simtest.estimators.extrapolation`).
+sightline. Terms of higher order in w make E(t) / (-2 ln t) and the axis linear in -ln t to leading order, so both are
+extrapolated to the peak by a straight line (theory.md section 3, items 3 and 4; section 6): the axis over the
+isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.extrapolation`).
 """
 
 from collections.abc import Sequence
@@ -12,39 +12,36 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_crossings import FamilyCrossings
+from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
-from simtest.estimators.protocol import FittedIsophote, fit_cut_isophote, fit_isophotes
-from simtest.geometry import Camera, CirclePose, Patch, circle_poses, cone_axes
+from simtest.geometry import Array, Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
-from simtest.geometry.vectors import tangent_basis
-
-Array = npt.NDArray[np.float64]
+from simtest.geometry.vectors import basis_across
 
 MIN_ISOPHOTES = 2
 """One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
-"""Squared Mahalanobis distances beyond which the axis' drift is more than noise, and may be: 0.1 % and 20 % of normal
-pairs lie beyond. A surface whose curvature does not change drifts by noise alone; on a colon hardly a highlight does,
-and where noise hides the drift, it hides an error several times the mean axis' noise."""
+"""Squared Mahalanobis distances beyond which the axis's drift is more than noise, or may be: 0.1 % and 20 % of normal
+pairs lie beyond. On a surface of constant curvature the drift is noise alone; on a colon hardly a highlight is like
+that, and where noise hides the drift it hides an error several times the mean axis's noise."""
 
 MEAN_SHARE = 0.5
-"""Variance of the mean axis along the drift, over the squared drift: the peak lies there, by 0.8 to 1.7 times it."""
+"""Variance of the mean axis along the drift, over the squared drift; the peak lies 0.8 to 1.7 times the drift away."""
 
 PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
-"""Variance of the axis at the peak over the squared drift, and what is added to it, px^2, where there is a drift: terms
-of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE are what 614 highlights of the
-generated colon showed, on viewpoints that no figure of the page is from."""
+"""Variance of the axis at the peak over the squared drift, and a constant added to it, px^2, where there is a drift:
+terms of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE were fitted to 614 highlights
+of the generated colon, on viewpoints that no published figure uses."""
 
 NOISE_FACTOR = 2.0
-"""How many standard deviations of a contour's noise its distance from the ellipse may have on top, in squares."""
+"""Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ class IsophoteFamily:
     @cached_property
     def basis(self) -> Array:
         """Two unit vectors across the axis, shape (2, 3): ``tangent_basis`` of the normal that is its reverse."""
-        return np.concatenate(tangent_basis(-self.axis[None]))
+        return basis_across(-self.axis)
 
     @cached_property
     def _crossings(self) -> FamilyCrossings:
@@ -95,12 +92,12 @@ class IsophoteFamily:
     def levels(self) -> Array:
         """-ln t of each isophote, t over the lobe's peak, shape (K,).
 
-        The highest pixel that isovalues are relative to is too high where the top is flat and noisy.
+        The highest pixel, which isovalues are relative to, is too high where the peak is flat and noisy.
         """
-        return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._top.value))
+        return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._peak.value))
 
     @cached_property
-    def _top(self) -> PeakValue:
+    def _peak(self) -> PeakValue:
         return fit_peak_value(self.patch)
 
     @cached_property
@@ -120,26 +117,26 @@ class IsophoteFamily:
 
     @cached_property
     def drift(self) -> Array:
-        """How far the axis at the peak lies from the mean axis, in the basis, rad, shape (2,); 0 for one isophote."""
-        places = np.array([pose.axis for pose in self.poses]) @ self.basis.T
-        return self._weights @ places if self.can_extrapolate else np.zeros(2)
+        """Offset of the axis at the peak from the mean axis, in the basis, rad, shape (2,); 0 for one isophote."""
+        axes = np.array([pose.axis for pose in self.poses]) @ self.basis.T
+        return self._weights @ axes if self.can_extrapolate else np.zeros(2)
 
     @property
     def peak_axis(self) -> Array:
-        """The axis followed to the lobe's peak before smoothing, unit, shape (3,), camera frame."""
+        """The axis extrapolated to the lobe's peak before smoothing, unit, shape (3,), camera frame."""
         axis = self.axis + self.drift @ self.basis
         return np.asarray(axis / np.linalg.norm(axis))
 
     @property
     def drift_is_real(self) -> bool:
-        """Whether the drift is more than noise; not known, and taken as not, where the noise is not known."""
+        """Whether the drift is more than noise; False where the noise is not known."""
         return self._drift_chi2 > DRIFT_CHI2
 
     @cached_property
     def _drift_chi2(self) -> float:
         """Squared Mahalanobis distance of the drift from 0; 0 where the noise is not known."""
         covariance = self.axes_covariance
-        # Without noise any drift is real, but for rounding.
+        # Without noise any drift but rounding is real.
         if covariance is None or not self.can_extrapolate or not self.drift @ self.drift > 1e-18:
             return 0.0
         return float(self.drift @ np.linalg.solve(covariance[2:4, 2:4] + 1e-18 * np.eye(2), self.drift))
@@ -149,22 +146,22 @@ class IsophoteFamily:
         """1/H, the lobe's second moments at its peak, rad^2, in the basis, shape (2, 2).
 
         Corrected for smoothing, which adds s^2 I px^2 to the moments of the lobe, and for the contour's linear
-        interpolation, which adds v I to them but takes v I off the isophote's, the peak being a pixel's value.
+        interpolation, which adds v I to them but subtracts v I from the isophote's, since the peak is a pixel's value.
         """
         return self._moments_at(0.0)
 
     def _moments_at(self, shift: float) -> Array:
-        """Give the moments with the levels moved by a shift."""
+        """Return the moments with all levels shifted."""
         levels = self.levels + shift
         return np.asarray(np.einsum("k,kij->ij", weights_at_zero(levels) / (2 * levels), self._narrowed(levels)))
 
     @property
     def mean_moments(self) -> Array:
-        """The same without the way to t -> 1, shape (2, 2): of less noise, and of the same principal directions."""
+        """The same without extrapolation, shape (2, 2): less noisy, with the same principal directions."""
         return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
 
     def _narrowed(self, levels: Array) -> Array:
-        """Give E(t) of each isophote less what smoothing and interpolation add to it, shape (K, 2, 2)."""
+        """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
         return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)
 
     @cached_property
@@ -178,10 +175,10 @@ class IsophoteFamily:
 
     @cached_property
     def _px2(self) -> Array:
-        """What 1 px^2 about the axis' pixel is in the basis, rad^2, shape (2, 2)."""
-        place = self.camera.project(self.axis)
+        """1 px^2 about the axis's pixel in the basis, rad^2, shape (2, 2)."""
+        pixel = self.camera.project(self.axis)
         steps = np.array([[0.5, 0.0], [0.0, 0.5]])
-        ahead, behind = self.camera.unproject(place + steps), self.camera.unproject(place - steps)
+        ahead, behind = self.camera.unproject(pixel + steps), self.camera.unproject(pixel - steps)
         J = self.basis @ (ahead - behind).T
         return np.asarray(J @ J.T)
 
@@ -190,6 +187,7 @@ class IsophoteFamily:
         """Covariance by noise of mean axis and drift, shape (4, 4); None without known noise."""
         if self.patch.noise is None:
             return None
+        # derivatives of the mean of the axes, and of the drift, by each isophote's (d, e)
         by_linear = self._by_linear
         by_conic = np.zeros((len(by_linear), 4, 5))
         by_conic[:, :2, 3:] = by_linear / len(by_linear)
@@ -202,25 +200,26 @@ class IsophoteFamily:
         """Covariance by noise of the moments 11, 12, 22, shape (3, 3); None without known noise."""
         if self.patch.noise is None:
             return None
+        # derivative by a common shift of the levels, which the peak value causes
         step = 1e-4
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
-        return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._top)))
+        return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
     def conic(self, k: int) -> Array:
-        """Give (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
+        """Return (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
         return self._crossings.conics[k]
 
     def conic_covariance(self, k: int) -> Array:
-        """Give its covariance by noise, shape (5, 5); the noise must be known."""
+        """Return the conic's covariance by noise, shape (5, 5); the noise must be known."""
         alone = replace(self._crossings, isophotes=self.isophotes[k : k + 1])
         return gram(alone.moved_by_noise(np.eye(5)[None]))
 
     def widening(self, k: int = 0) -> Array:
-        """Give what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
+        """Return what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
         return self._added_px2(self.levels)[k] * self._px2
 
     def _added_px2(self, levels: Array) -> Array:
-        """Give the same in px^2, for each level."""
+        """Return the widening at each level, px^2."""
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @property
@@ -231,11 +230,11 @@ class IsophoteFamily:
             return None
         if self._drift_chi2 <= SUSPECT_CHI2:
             return covariance[:2, :2]
-        return np.asarray(covariance[:2, :2] + MEAN_SHARE * np.outer(self.drift, self.drift) + self._left_open)
+        return np.asarray(covariance[:2, :2] + MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error)
 
     @property
     def drift_excess(self) -> float:
-        """Squared drift beyond noise, rad^2; 0 where it is hardly more than noise, or the noise is not known."""
+        """Squared drift beyond noise, rad^2; 0 where it may be noise, or the noise is not known."""
         covariance = self.axes_covariance
         if covariance is None or self._drift_chi2 <= SUSPECT_CHI2:
             return 0.0
@@ -243,46 +242,46 @@ class IsophoteFamily:
 
     @property
     def peak_covariance(self) -> Array | None:
-        """Covariance of the axis at the peak in the basis, rad^2, shape (2, 2): noise, and what a line leaves open."""
+        """Covariance of the axis at the peak in the basis, rad^2, shape (2, 2): noise, and a straight line's error."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
         noise = np.asarray(both @ covariance @ both.T)
-        # Noise that drifts far has moved this axis far: more for a mere suspicion would be for such noise.
-        return noise + self._left_open if self.drift_is_real else noise
+        # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
+        return noise + self._line_error if self.drift_is_real else noise
 
     @property
-    def _left_open(self) -> Array:
-        """What a lopsided highlight leaves open about its peak, rad^2, shape (2, 2)."""
+    def _line_error(self) -> Array:
+        """Covariance of the peak of a lopsided highlight beyond noise, rad^2, shape (2, 2)."""
         return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self._px2)
 
     def tangents(self, points: Array) -> Array:
-        """Give the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
+        """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         return self._crossings.tangents(points).T
 
     @cached_property
     def is_bent(self) -> bool:
-        """Whether an isophote is no ellipse by more than that of a point highlight may differ, and noise allows for."""
+        """Whether an isophote differs from an ellipse by more than a point highlight's does, noise included."""
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
-        # Of a Gaussian lobe: noise over t |d log I / d log r| moves the contour by that share of its radius.
+        # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
         return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
 
     @property
     def _by_linear(self) -> Array:
-        """Tell how each cone's axis moves with (d, e) of its conic, shape (K, 2, 2)."""
-        # The cone's axis is its third eigenvector, near the basis' own: -(A + I)^-1 (d, e) / 2.
+        """Derivative of each cone's axis by (d, e) of its conic, shape (K, 2, 2)."""
+        # The cone's axis is its third eigenvector, near that of the basis: -(A + I)^-1 (d, e) / 2.
         a, b, c = self._crossings.conics.T[:3]
         determinant = (a + 1) * (c + 1) - b * b / 4
         return np.asarray((np.array([[c + 1, -b / 2], [-b / 2, a + 1]]) / (-2 * determinant)).transpose(2, 0, 1))
 
     @property
     def _moments_by_conic(self) -> Array:
-        """Tell how the moments move with the conic of each isophote, shape (K, 3, 5)."""
+        """Derivative of the moments by the conic of each isophote, shape (K, 3, 5)."""
         a, b, c = self._crossings.conics.T[:3]
         made = np.zeros((len(self.isophotes), 3, 5))
         # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
@@ -298,25 +297,18 @@ _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
     """Fit the isophotes of one highlight.
 
-    Parameters
-    ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    isovalues : sequence of float
-        Each t in (0, 1).
-
     Returns
     -------
-    Spot or Failure
-        Where fewer than 2 isophotes (1, where no more were asked for) are whole, those that are cut are fitted to what
-        is seen of them; with fewer than 2 of either kind the first one's Failure.
+    IsophoteFamily or Failure
+        Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut
+        are fitted too; with fewer than 2 of either kind, the first one's Failure.
     """
+    # whole isophotes
     fitted, failures = fit_isophotes(patch, camera, isovalues)
     kept, poses, failures = _with_poses(fitted, failures)
     least = min(MIN_ISOPHOTES, len(isovalues))
     if len(poses) < least:
+        # too few: add arcs of those that the border or the view cuts
         whole = {isophote.isovalue for isophote in kept}
         arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in whole]
         cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
@@ -333,7 +325,7 @@ def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]
 def _with_poses(
     fitted: list[FittedIsophote], failures: list[Failure]
 ) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
-    """Give the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
+    """Return the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
     if not fitted:
         return [], [], failures
     found = circle_poses(

@@ -1,33 +1,31 @@
-"""Which of several lights made a highlight: told by where the others' highlights are beside it."""
+"""Which of several lights made a highlight: decided by the positions of the other highlights around it."""
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import Priors
 from simtest.estimators.isophote_family import IsophoteFamily
-
-Array = npt.NDArray[np.float64]
+from simtest.geometry import Array
 
 LARGEST_MISFIT = 0.25
-"""Of the offsets that the mirror geometry predicts, as a share of their length."""
+"""Largest misfit of the offsets that the mirror geometry predicts, as a share of their length."""
 
 CLEAR = 2.0
-"""The next best light must fit this many times worse."""
+"""The next best light must fit this many times worse for the choice to be clear."""
 
 
-def light_of_highlight(spot: IsophoteFamily, priors: Priors) -> int | None:
-    """Tell which light made a highlight; None where that cannot be told.
+def light_of_highlight(family: IsophoteFamily, priors: Priors) -> int | None:
+    """Return the index of the light that made a highlight; None where that is not clear.
 
     The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
-    turns by half the light's angle, the normal against the sightline by M. M is the root of the lobe's H up to a
-    factor, taken as positive: a surface that is not curved inwards beyond its centre. The factor is fitted.
+    turns by half the light's angle, the normal turns against the sightline by M. M is the root of the lobe's H up to a
+    factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature.
 
     Parameters
     ----------
-    spot : IsophoteFamily
-        The highlight; its patch names the frame's others, of which the nearest are taken, one a light.
+    family : IsophoteFamily
+        The highlight; of the frame's others, which its patch names, the nearest are used, one for each other light.
     priors : Priors
-        Its lights are used.
+        For the lights.
 
     Returns
     -------
@@ -36,21 +34,23 @@ def light_of_highlight(spot: IsophoteFamily, priors: Priors) -> int | None:
     """
     if len(priors.lights_mm) == 1:
         return 0
-    others = _other_peaks(spot)[: len(priors.lights_mm) - 1]
-    values, vectors = np.linalg.eigh(spot.moments)
+    # observed offsets, turned by M into those of the lights up to a factor
+    others = _other_peaks(family)[: len(priors.lights_mm) - 1]
+    values, vectors = np.linalg.eigh(family.moments)
     if not len(others) or values[0] <= 0:
         return None
     M = vectors @ np.diag(np.sqrt(values[0] / values)) @ vectors.T
     seen = others @ M
-    places = priors.lights @ spot.basis.T
-    misfits = np.array([_misfit(seen, np.delete(places, i, axis=0) - place) for i, place in enumerate(places)])
+    # misfit if light i made this highlight
+    lights = priors.lights @ family.basis.T
+    misfits = np.array([_misfit(seen, np.delete(lights, i, axis=0) - light) for i, light in enumerate(lights)])
     first, second = np.argsort(misfits, kind="stable")[:2]
     clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
     return int(first) if clear else None
 
 
 def _misfit(seen: Array, offsets: Array) -> float:
-    """Give how badly the other peaks fit the other lights' offsets, any positive factor between them.
+    """Compute how badly the other peaks fit the other lights' offsets, with any positive factor between them.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def _misfit(seen: Array, offsets: Array) -> float:
     Returns
     -------
     float
-        RMS of what is left over RMS of the offsets; 0 is a perfect fit.
+        RMS of the residual over RMS of the offsets; 0 is a perfect fit.
     """
     best = np.inf
     # Each pairing of the first peak sets the factor; the other peaks then take the nearest light.
@@ -78,8 +78,8 @@ def _misfit(seen: Array, offsets: Array) -> float:
     return best
 
 
-def _other_peaks(spot: IsophoteFamily) -> Array:
-    """Give where the nearest other highlights lie from the own one, tangents in the basis, shape (K, 2)."""
-    others = np.array(spot.patch.others_px).reshape(-1, 2)
-    gaps = np.linalg.norm(others - spot.patch.peak_px, axis=1)
-    return np.asarray(spot.tangents(others[np.argsort(gaps, kind="stable")]) - spot.tangents(spot.patch.peak_px[None]))
+def _other_peaks(family: IsophoteFamily) -> Array:
+    """Return the offsets of the other highlights, the nearest first, tangents in the basis, shape (K, 2)."""
+    others, peak = np.array(family.patch.others_px).reshape(-1, 2), family.patch.peak_px
+    order = np.argsort(np.linalg.norm(others - peak, axis=1), kind="stable")
+    return np.asarray(family.tangents(others[order]) - family.tangents(peak[None]))

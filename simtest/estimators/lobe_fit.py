@@ -4,28 +4,26 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from simtest.geometry import Array, Mask
 
 MAX_STEPS = 30
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-7, 1e6
 CONVERGED = 1e-8
-"""Relative fall of the sum of squares below which a fit has converged."""
+"""A fit has converged when the sum of squares falls by less than this share."""
 
 EXACT = 1e-24
-"""Share of the observed power that a residual of rounding leaves."""
+"""Share of the observed power that rounding alone leaves as residual."""
 
 
 class LobeModel(Protocol):
     """A highlight's model at some values of its parameters."""
 
     def evaluate(self) -> tuple[Array, Array]:
-        """Give the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
+        """Return the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
 
     def moved(self, step: Array) -> Self:
-        """Give the model at parameters that differ by a step, shape (p,)."""
+        """Return the model at parameters that differ by a step, shape (p,)."""
 
 
 Model = TypeVar("Model", bound=LobeModel)
@@ -65,27 +63,29 @@ def fit_lobe(
     observed : ndarray, shape (m,)
         Intensities of the model's pixels.
     clipped : ndarray of bool, shape (m,), optional
-        Pixels that say only that the intensity is at least what was observed: a model above it leaves no residual.
+        Censored pixels: the intensity is at least what was observed, so a model above it leaves no residual.
     rounding : float
         Relative error of the sum of squares by the model's rounding: a change by no more than that ends the fit.
 
     Returns
     -------
     LobeFit or None
-        None where it does not converge, or the pixels leave a parameter open.
+        None where it does not converge, or the pixels do not determine a parameter.
     """
-    # A step too far leaves the range of numbers: it is then not taken.
+    # A step too far overflows, and is then not taken.
     with np.errstate(all="ignore"):
         return _descend(start, observed, clipped, rounding)
 
 
 def _descend(start: Model, observed: Array, clipped: Mask | None, rounding: float) -> LobeFit[Model] | None:
+    """Run the damped Gauss-Newton steps."""
     model, damping, power = start, FIRST_DAMPING, float(observed @ observed)
     residual, J = _residual(model, observed, clipped)
     chi2 = float(residual @ residual)
     if not np.isfinite(chi2):
         return None
     for _ in range(MAX_STEPS):
+        # trial step
         normal, gradient = J.T @ J, J.T @ residual
         try:
             damped = normal + damping * np.diag(np.diag(normal))
@@ -97,12 +97,14 @@ def _descend(start: Model, observed: Array, clipped: Mask | None, rounding: floa
         next_chi2 = float(next_residual @ next_residual)
         if abs(next_chi2 - chi2) < rounding * chi2:
             break
+        # reject: more damping
         if not (next_chi2 < chi2 and np.isfinite(next_J).all()):
             if damping > MOST_DAMPING:
-                # No step downhill is left: the minimum, to rounding.
+                # No downhill step is left: the minimum, to rounding.
                 break
             damping *= 10
             continue
+        # accept: less damping
         fall = (chi2 - next_chi2) / chi2
         model, residual, J, chi2 = trial, next_residual, next_J, next_chi2
         damping = max(damping / 10, LEAST_DAMPING)
@@ -110,10 +112,11 @@ def _descend(start: Model, observed: Array, clipped: Mask | None, rounding: floa
             break
     else:
         return None
-    return _concluded(model, J, chi2)
+    return _with_covariance(model, J, chi2)
 
 
 def _residual(model: LobeModel, observed: Array, clipped: Mask | None) -> tuple[Array, Array]:
+    """Return the residual and the model's derivatives, both 0 at censored pixels that the model exceeds."""
     intensity, J = model.evaluate()
     residual = observed - intensity
     if clipped is not None:
@@ -123,11 +126,13 @@ def _residual(model: LobeModel, observed: Array, clipped: Mask | None) -> tuple[
     return residual, J
 
 
-def _concluded(model: Model, J: Array, chi2: float) -> LobeFit[Model] | None:
+def _with_covariance(model: Model, J: Array, chi2: float) -> LobeFit[Model] | None:
+    """Add the Gauss-Newton covariance; None where a parameter is not determined."""
     count, parameters = J.shape
     if count <= parameters:
         return None
     variance = chi2 / (count - parameters)
+    # scaled to a diagonal of 1, so that the condition does not depend on units
     scale = np.sqrt(np.sum(J * J, axis=0))
     if not (scale > 0).all():
         return None

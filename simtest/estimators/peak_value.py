@@ -1,27 +1,23 @@
-"""The top of a lobe: its peak value from all pixels around the peak, not from the highest one alone."""
+"""The peak value of a lobe, from all pixels around the peak instead of the highest one alone."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from simtest.geometry import Patch
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from simtest.geometry import Array, Index, Mask, Patch
 
 TOP_ISOVALUE = 0.8
-"""Above it a glossy lobe is quadratic in the logarithm to a part in a thousand."""
+"""Above it the logarithm of a glossy lobe is quadratic to a part in a thousand."""
 
 CLIPPED_ISOVALUE = 0.5
-"""Above it, where the top is clipped: what is left must be wide enough for the paraboloid's bend to show."""
+"""The same where the top is clipped: the rest must be wide enough to show the paraboloid's curvature."""
 
 CLIPPED_NEAR = 0.05
-"""Largest share of clipped pixels around one that is fitted: more, and clipping has drawn its smoothed value down."""
+"""Largest share of clipped pixels around a fitted one: with more, clipping has lowered its smoothed value."""
 
 MIN_PIXELS = 12
-"""Twice the parabola's coefficients."""
+"""Twice the number of the paraboloid's coefficients."""
 
 
 @dataclass(frozen=True)
@@ -33,22 +29,23 @@ class PeakValue:
     value : float
         Intensity.
     pixels : ndarray of int, shape (N,)
-        Places in the flattened patch.
+        Indices in the flattened patch.
     weights : ndarray, shape (N,)
         Change of log(value) per unit of intensity of each.
     """
 
     value: float
-    pixels: npt.NDArray[np.intp]
+    pixels: Index
     weights: Array
 
 
 def fit_peak_value(patch: Patch) -> PeakValue:
-    """Fit a paraboloid to the logarithm of a patch above t = 0.8 and give its apex.
+    """Fit a paraboloid to the logarithm of a patch above t = 0.8 and return its apex.
 
-    Where pixels there are clipped, the ring around them down to t = 0.5 is fitted. The peak's own pixel stands in where
-    the region does not close, is small, or is no dome.
+    Where pixels there are clipped, the ring around them down to t = 0.5 is fitted. Where the region does not close, is
+    small, or is no dome, the peak's own pixel is used.
     """
+    # candidates: the pixels of the region, their coordinates centred and scaled
     column, row = patch.peak_pixel
     own = np.array([row * patch.values.shape[1] + column])
     fallback = PeakValue(patch.peak_value, own, np.array([1 / patch.peak_value]))
@@ -59,9 +56,10 @@ def fit_peak_value(patch: Patch) -> PeakValue:
         return fallback
     rows = pixels // patch.values.shape[1]
     x, y = _centred(pixels - rows * patch.values.shape[1]), _centred(rows)
+    # least squares by the normal equations
     design = np.array([np.ones_like(x), x, y, x * x, x * y, y * y])
     normal = design @ design.T
-    # The eigenvalues tell the condition and, with the vectors, solve for both right sides.
+    # The eigenvalues show the condition and, with the vectors, solve for both right sides.
     spread, vectors = np.linalg.eigh(normal)
     if not spread[0] * 1e12 > spread[-1]:
         return fallback
@@ -69,23 +67,24 @@ def fit_peak_value(patch: Patch) -> PeakValue:
     f, d, e, a, b, c = (inverse @ (design @ np.log(values))).tolist()
     if not (a < 0 and 4 * a * c > b * b):
         return fallback
+    # apex; rejected outside of the pixels
     determinant = 4 * a * c - b * b
     u, v = (b * e - 2 * c * d) / determinant, (b * d - 2 * a * e) / determinant
     apex = np.array([1.0, u, v, u * u, u * v, v * v])
     value = float(np.exp(apex @ [f, d, e, a, b, c]))
     if u * u + v * v > 1:
         return fallback
-    # At the apex the value does not move with the place.
+    # At the apex the value's derivative by position is 0, so only the fit's coefficients move it.
     return PeakValue(value, pixels, (inverse @ apex) @ design / values)
 
 
-def _centred(places: npt.NDArray[np.intp]) -> Array:
-    """Give places about their mean, over their range."""
-    return np.asarray((places - places.mean()) / max(places.max() - places.min(), 1))
+def _centred(indices: Index) -> Array:
+    """Return indices relative to their mean, over their range."""
+    return np.asarray((indices - indices.mean()) / max(indices.max() - indices.min(), 1))
 
 
 def _region(patch: Patch) -> Mask:
-    """Give the pixels that the paraboloid is fitted to, shape (h, w)."""
+    """Return the pixels that the paraboloid is fitted to, shape (h, w)."""
     inside = patch.inside(TOP_ISOVALUE, cut=True)
     if patch.saturated is None or not (patch.saturated & inside).any():
         return inside

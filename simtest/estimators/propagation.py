@@ -1,4 +1,4 @@
-"""Noise of a frame's pixels in what hangs on the crossings of isophotes."""
+"""Propagation of pixel noise to quantities that depend on the crossings of isophotes."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from simtest.geometry import Array, Index
+
 Rows = npt.NDArray[np.float32]
 
 KERNEL_SIGMAS = 4.0
@@ -16,17 +17,17 @@ KERNEL_SIGMAS = 4.0
 def conics_by_crossings(
     tangents: Array, gradient: Array, steps: Array, parts: Sequence[slice], weighted: Sequence[bool]
 ) -> tuple[Array, Array]:
-    """Tell how fitted conics a x^2 + b x y + c y^2 + d x + e y = 1 move with their points.
+    """Compute how fitted conics a x^2 + b x y + c y^2 + d x + e y = 1 move with their points.
 
-    To first order a fit to points near an ellipse moves as the linear one does, with each point weighed by the conic's
-    gradient where the fit is gradient-weighted.
+    To first order a fit to points near an ellipse moves as the linear fit does, where a gradient-weighted fit weights
+    each point by the conic's gradient.
 
     Parameters
     ----------
     tangents, gradient, steps : ndarray, shape (2, N)
-        The points of all conics, the conic's gradient there, and how each moves per unit along its line.
+        The points of all conics, the conic's gradient there, and the motion of each point per unit along its line.
     parts : sequence of slice
-        Points of each conic.
+        The points of each conic.
     weighted : sequence of bool
         Whether each fit is gradient-weighted.
 
@@ -34,7 +35,7 @@ def conics_by_crossings(
     -------
     by_moment : ndarray, shape (K, 5, 5)
     moments : ndarray, shape (5, N)
-        Conic k moves by by_moment[k] @ moments[:, parts[k]] with its points.
+        Conic k moves by by_moment[k] @ moments[:, parts[k]] as its points move.
     """
     (x, y), (by_x, by_y) = tangents, gradient
     design = np.array([x * x, x * y, y * y, x, y])
@@ -43,7 +44,7 @@ def conics_by_crossings(
         counts = [part.stop - part.start for part in parts]
         moments = design / np.where(np.repeat(weighted, counts), by_x**2 + by_y**2, 1.0)
     normal = np.array([moments[:, part] @ design[:, part].T for part in parts])
-    # Powers of small tangents differ by orders of magnitude: the equations are solved with a diagonal of 1.
+    # Powers of small tangents differ by orders of magnitude, so the equations are scaled to a diagonal of 1.
     scale = 1 / np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
     scales = scale[:, :, None] * scale[:, None, :]
     by_moment = -scales * np.linalg.inv(normal * scales)
@@ -51,17 +52,17 @@ def conics_by_crossings(
 
 
 def raw_moves(
-    pixels: npt.NDArray[np.intp], moves: Array, width: int, noise: float | npt.NDArray[np.float32], smoothing_px: float
+    pixels: Index, moves: Array, width: int, noise: float | npt.NDArray[np.float32], smoothing_px: float
 ) -> Rows:
-    """Give what the noise's standard deviation in each raw pixel moves K quantities by, shape (K, P).
+    """Return how far one standard deviation of noise in each raw pixel moves K quantities, shape (K, P).
 
-    What hangs on the smoothed pixels does on the raw ones, whose noise is independent, by the transpose of smoothing:
-    the product of the result with its transpose is the quantities' covariance.
+    The transpose of smoothing carries derivatives by smoothed pixels to raw pixels, whose noise is independent. The
+    product of the result with its transpose is therefore the quantities' covariance.
 
     Parameters
     ----------
     pixels : ndarray of int, shape (N,)
-        Places in the flattened patch; each may occur several times.
+        Indices in the flattened patch; each may occur several times.
     moves : ndarray, shape (K, N)
         Change of each quantity per unit of intensity there.
     width : int
@@ -75,19 +76,20 @@ def raw_moves(
     -------
     ndarray of float32, shape (K, P)
     """
+    # box around the pixels, with a margin of the kernel's half-width
     rows = pixels // width
     columns = pixels - rows * width
     top, bottom, left, right = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
     margin = int(np.ceil(KERNEL_SIGMAS * smoothing_px))
     wide, high = right - left + 2 * margin, bottom - top + 2 * margin
-    place = (rows - (top - margin)) * wide + (columns - (left - margin))
-    # The noise comes in first: what it does has the size of an angle, whatever the unit of the intensities.
+    flat = (rows - (top - margin)) * wide + (columns - (left - margin))
+    # Scaled by the noise first, so that the numbers have the size of angles, whatever the unit of the intensities.
     scale = float(noise.max()) if isinstance(noise, np.ndarray) else noise
-    # Single precision from here on: these are standard deviations, and it takes half the time.
+    # Single precision, which takes half the time, suffices for standard deviations.
     raw = np.empty((len(moves), high * wide), np.float32)
     for image, each in zip(raw, moves, strict=True):
-        image[:] = np.bincount(place, scale * each, high * wide)
-    # Margins keep the images apart, so that one call smooths all.
+        image[:] = np.bincount(flat, scale * each, high * wide)
+    # The margins separate the images, so one call smooths all.
     smoothed = _smooth_transposed(raw.reshape(-1, wide), smoothing_px, margin).reshape(len(moves), high, wide)
     if isinstance(noise, np.ndarray) and scale > 0:
         smoothed *= np.pad(noise[top:bottom, left:right] / np.float32(scale), margin, mode="edge")
@@ -95,8 +97,8 @@ def raw_moves(
 
 
 def gram(rows: Rows) -> Array:
-    """Give the products of few long rows, shape (K, P), with each other, shape (K, K)."""
-    # A product of the matrix with its own transpose takes a routine that is several times slower on so few rows.
+    """Return the products of few long rows, shape (K, P), with each other, shape (K, K)."""
+    # A copy, because BLAS's routine for a matrix times its own transpose is several times slower on so few rows.
     products = np.dot(rows, rows.copy().T).astype(float)
     return np.asarray((products + products.T) / 2)
 

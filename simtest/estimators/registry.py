@@ -1,60 +1,80 @@
-"""Finds estimators by name, those of other packages too, through the entry-point group ``simtest.estimators``."""
+"""Estimators by name, those of other packages too, through the entry-point group ``simtest.estimators``."""
 
-from collections.abc import Sequence
-from importlib.metadata import EntryPoint, entry_points
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
-from simtest.errors import InputError
-from simtest.estimators.protocol import Estimator
+from simtest.calibration import Priors
+from simtest.errors import Failure, InputError
+from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
+from simtest.geometry import Camera, Patch
+from simtest.runtime.plugins import PluginGroup
 
-GROUP = "simtest.estimators"
-
-
-def _entry_points() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=GROUP)}
-
-
-def available() -> list[str]:
-    """List the names of all installed estimators, sorted."""
-    return sorted(_entry_points())
+ESTIMATORS = PluginGroup("simtest.estimators", "estimator")
 
 
-def load_estimators(names: Sequence[str]) -> dict[str, Estimator]:
-    """Load estimators.
+@dataclass(frozen=True)
+class PlainCallable:
+    """A function of patch and camera, the old form of an estimator, which this release still accepts.
 
     Parameters
     ----------
-    names : sequence of str
-        As registered.
+    function : callable
+        Takes a patch and a camera and returns an Estimate or a Failure; it is told no priors.
+    """
 
-    Returns
-    -------
-    dict
-        Estimator by name, in the order asked for.
+    function: Callable[[Patch, Camera], Estimate | Failure]
+
+    def estimate(self, patch: Patch, camera: Camera, _priors: Priors, /) -> Estimate | Failure:
+        """Call the function."""
+        return self.function(patch, camera)
+
+
+def as_estimator(name: str, given: object) -> AnyEstimator:
+    """Return an object as an estimator; a plain callable is wrapped, with a DeprecationWarning.
 
     Raises
     ------
     InputError
-        If a name is unknown, given twice, or its package cannot be imported.
+        If it is neither an estimator nor callable, or a class where an instance is meant.
     """
-    points = _entry_points()
-    loaded: dict[str, Estimator] = {}
-    for name in names:
-        if name not in points:
-            raise InputError(f"estimator {name!r}: not installed; allowed: {', '.join(sorted(points))}")
+    if isinstance(given, type):
+        raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
+    if isinstance(given, Estimator | FrameEstimator):
+        return given
+    if not callable(given):
+        raise InputError(f"estimator {name!r}: {given!r} is not callable and has neither estimate nor estimate_frame")
+    warnings.warn(
+        f"estimator {name!r} is a plain callable, which the next release refuses: give it a method "
+        "estimate(patch, camera, priors)", DeprecationWarning, stacklevel=3,
+    )  # fmt: skip
+    return PlainCallable(given)
+
+
+def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:
+    """Load estimators.
+
+    Parameters
+    ----------
+    estimators : sequence of str, or mapping
+        Names as registered, "package:name" where two packages register one name; or the estimators themselves by name.
+
+    Returns
+    -------
+    dict
+        Estimator by name, in the given order.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, ambiguous or given twice, its package cannot be imported, or an object is no estimator.
+    """
+    if isinstance(estimators, Mapping):
+        return {name: as_estimator(name, given) for name, given in estimators.items()}
+    loaded: dict[str, AnyEstimator] = {}
+    for name in estimators:
+        given = ESTIMATORS.load(name)
         if name in loaded:
             raise InputError(f"estimator {name!r}: given twice")
-        try:
-            estimator = points[name].load()
-        except Exception as error:
-            raise InputError(f"estimator {name!r}: {points[name].value} cannot be imported ({error})") from error
-        if not callable(estimator):
-            raise InputError(f"estimator {name!r}: {points[name].value} is not callable")
-        loaded[name] = estimator
+        loaded[name] = as_estimator(name, given)
     return loaded
-
-
-def distributions(names: Sequence[str]) -> dict[str, str]:
-    """Give the package and version that each estimator comes from, by "estimator NAME"."""
-    points = _entry_points()
-    found = {name: points[name].dist for name in names if name in points}
-    return {f"estimator {name}": f"{dist.name} {dist.version}" if dist else "" for name, dist in found.items()}

@@ -1,14 +1,22 @@
-"""NumPy geometry of images: cameras, isophotes, conics, ellipse fits and circle pose."""
+"""NumPy geometry of images.
+
+Pixels to sightlines (`camera`, `distortion`), a highlight's isophotes (`patch`, `isophotes`, `level_sets`), ellipses
+fitted to them (`ellipse_fit`, `arc_fit`), the cones of their sightlines (`conics`), and the circles whose images these
+may be (`circle_from_cone`, `pose_region`).
+"""
 
 from simtest.geometry.arc_fit import FittedArc, fit_arc
+from simtest.geometry.arrays import Array, Image, Index, Mask
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.circle_pose import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
+from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
 from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
-from simtest.geometry.isophotes import Patch, smooth
+from simtest.geometry.gaussian_smoothing import smooth
+from simtest.geometry.patch import Patch
 
 __all__ = [
+    "Array",
     "BrownConrady",
     "Camera",
     "CirclePose",
@@ -17,7 +25,10 @@ __all__ = [
     "Ellipse",
     "FittedArc",
     "FittedConic",
+    "Image",
+    "Index",
     "KannalaBrandt",
+    "Mask",
     "Patch",
     "ViewMask",
     "backproject_conic",

@@ -6,14 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.geometry.arrays import Array
 from simtest.geometry.checks import check_number, check_numbers
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class AngularProfile:
-    """A factor over the angle from an axis, 1 on the axis or relative to the table's unit.
+    """A factor over the angle from an axis: cos^k, which is 1 on the axis, or a table in any unit.
 
     Parameters
     ----------
@@ -22,7 +21,7 @@ class AngularProfile:
     angles : tuple of float
         Angles of a table, rad, rising from 0 to at most pi; empty for cos^k.
     values : tuple of float
-        Factors at those angles, >= 0; linear between them, the last one holds beyond the table.
+        Factors at those angles, >= 0; interpolated linearly, constant beyond the table.
 
     Raises
     ------
@@ -54,13 +53,13 @@ class AngularProfile:
         return self.power == 0 and not self.angles
 
     def at(self, cosine: npt.ArrayLike, sine: npt.ArrayLike | None = None) -> Array:
-        """Give the factor where the angle from the axis has this cosine.
+        """Return the factor at an angle from the axis, named by its cosine.
 
         Parameters
         ----------
         cosine : array_like, shape (...)
         sine : array_like, shape (...), optional
-            Of the same angle, >= 0: with it a table keeps the digits that the cosine has lost next to the axis.
+            Of the same angle, >= 0. Near the axis it keeps the digits that the cosine has lost; only tables use it.
 
         Returns
         -------

@@ -1,7 +1,7 @@
-"""Gradient-weighted ellipse fit [Sampson 1982] of contours of which only a part is seen.
+"""Gradient-weighted ellipse fit [Sampson 1982] of contours that are seen in part.
 
-The direct algebraic fit weighs points by the gradient of the conic, which shrinks an ellipse of which a part is missing
-along the missing side (theory.md section 6). Here each point counts by its distance to the conic, to first order.
+The direct algebraic fit weights points by the conic's gradient. Where a part of the contour is missing, that shortens
+the ellipse on the missing side (theory.md section 6). Here each residual is the distance from the conic to first order.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from simtest.errors import Failure, Reason
+from simtest.geometry.arrays import Array
 from simtest.geometry.ellipse_fit import MAX_AXIS_RATIO, FittedConic, fit_ellipse
 
-Array = npt.NDArray[np.float64]
-
 MIN_ARC_RAD = np.radians(120.0)
-"""Shorter arcs leave the ellipse open: here the noise of the centre is a hundred times that of a whole ellipse."""
+"""Shorter arcs do not determine the ellipse: at this length the centre is already a hundred times as noisy as that of
+a whole ellipse."""
 
 MAX_EVALUATIONS = 30
 TOLERANCE = 1e-10
@@ -31,8 +31,7 @@ class FittedArc:
     conic : FittedConic
         As of `simtest.geometry.fit_ellipse`.
     arc : float
-        Extent of the points around the ellipse, which is all around but for the largest gap, rad, in its eccentric
-        anomaly.
+        Range of eccentric anomalies that the points cover: 2 pi less their largest gap, rad.
     residual : float
         RMS distance of the points from the ellipse over the ellipse's mean radius, sqrt(a b).
     """
@@ -43,10 +42,10 @@ class FittedArc:
 
 
 def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
-    """Fit an ellipse to an arc: minimise the sum of (F / |grad F|)^2, F the conic's equation at each point.
+    """Fit an ellipse to an arc by minimising the sum of (F / |grad F|)^2, F the conic's value at each point.
 
-    The ellipse is |L^T (x - c)| = 1 with L lower triangular, so that no step leaves the ellipses; the start is the
-    direct fit.
+    The ellipse is |L^T (x - c)| = 1 with L lower triangular, so every step stays an ellipse. The direct fit is the
+    starting point.
 
     Parameters
     ----------
@@ -56,14 +55,15 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
     Returns
     -------
     FittedArc or Failure
-        A Failure as of `fit_ellipse`, where it does not converge to an ellipse, and ``too_few_points`` for arcs
-        shorter than 120 deg.
+        A Failure where `fit_ellipse` fails, where the fit does not converge to an ellipse, and, with the reason
+        ``too_few_points``, for arcs shorter than 120 deg.
 
     Raises
     ------
     InputError
         If the points are no numbers of shape (N, 2).
     """
+    # start: the direct fit, in its centred and scaled coordinates
     start = fit_ellipse(points)
     if isinstance(start, Failure):
         return start
@@ -73,8 +73,9 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
     L = np.linalg.cholesky(C[:2, :2] / -(C[2, 2] + C[:2, 2] @ centre))
     first = np.array([*centre, L[0, 0], L[1, 0], L[1, 1]])
+    # refine by Levenberg and Marquardt's method
     with np.errstate(all="ignore"):
-        # A step into the void gives residuals that are not finite: least_squares says so by a ValueError.
+        # Residuals that are not finite make least_squares raise a ValueError.
         try:
             found = least_squares(
                 lambda p: _residuals(xy, p)[0], first, lambda p: _residuals(xy, p)[1], method="lm",
@@ -84,17 +85,17 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
             return Failure(Reason.NOT_CONVERGED, "the arc's fit left the ellipses")
     if not found.success:
         return Failure(Reason.NOT_CONVERGED, "the arc's fit did not converge")
-    return _concluded(xy, found.x, T, float(np.sqrt(np.mean(found.fun**2))))
+    return _checked_arc(xy, found.x, T, float(np.sqrt(np.mean(found.fun**2))))
 
 
 def angular_extent(vectors: Array) -> float:
-    """Give how far around the origin vectors, shape (N, 2), reach: all around but for their largest gap, rad."""
+    """Return the angle that vectors, shape (N, 2), cover around the origin: 2 pi less their largest gap, rad."""
     phases = np.sort(np.arctan2(vectors[:, 1], vectors[:, 0]))
     return 2 * np.pi - float(np.max(np.diff(phases, append=phases[0] + 2 * np.pi)))
 
 
 def _residuals(xy: Array, parameters: Array) -> tuple[Array, Array]:
-    """Give F / |grad F| of each point, shape (N,), and its derivatives, shape (N, 5)."""
+    """Return F / |grad F| of each point, shape (N,), and its derivatives, shape (N, 5)."""
     L = np.array([[parameters[2], 0.0], [parameters[3], parameters[4]]])
     y = xy - parameters[:2]
     u = y @ L
@@ -111,10 +112,12 @@ def _residuals(xy: Array, parameters: Array) -> tuple[Array, Array]:
     return F / size, J
 
 
-def _concluded(xy: Array, parameters: Array, T: Array, rms: float) -> FittedArc | Failure:
+def _checked_arc(xy: Array, parameters: Array, T: Array, rms: float) -> FittedArc | Failure:
+    """Return the fitted arc, or a Failure where the conic is no ellipse or the arc too short."""
     centre = parameters[:2]
     L = np.array([[parameters[2], 0.0], [parameters[3], parameters[4]]])
     Q = L @ L.T
+    # reject what is no ellipse, or one so long that it is a line
     low, high = np.linalg.eigvalsh(Q) if np.isfinite(Q).all() else (np.nan, np.nan)
     if not (np.isfinite(centre).all() and low > 0 and high <= MAX_AXIS_RATIO**2 * low):
         return Failure(Reason.NOT_AN_ELLIPSE, "the arc's conic is no ellipse")
@@ -123,6 +126,7 @@ def _concluded(xy: Array, parameters: Array, T: Array, rms: float) -> FittedArc 
     if arc < MIN_ARC_RAD:
         least = np.degrees(MIN_ARC_RAD)
         return Failure(Reason.TOO_FEW_POINTS, f"an arc of {np.degrees(arc):.0f} deg; at least {least:.0f} are needed")
+    # (x - c)^T Q (x - c) = 1 as a homogeneous conic
     linear = -Q @ centre
     C = np.array([[*Q[0], linear[0]], [*Q[1], linear[1]], [*linear, centre @ Q @ centre - 1]])
     return FittedArc(FittedConic(C / np.linalg.norm(C), T), arc, rms * float(low * high) ** 0.25)

@@ -8,14 +8,12 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
+from simtest.geometry.arrays import Array, Mask
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.distortion import Distortion
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
 FOLD_GRID = 33
-"""Points along each side of the image at which a lens is tried for a fold."""
+"""Points along each side of the image at which a lens is checked for a fold."""
 
 FOLD_CIRCLE = 256
 """The same around a view mask."""
@@ -51,9 +49,9 @@ class ViewMask:
             raise InputError(f"view_mask.radius = {self.radius!r}: must be > 0")
 
     def contains(self, points_px: npt.ArrayLike) -> Mask:
-        """Tell which pixel positions, shape (..., 2), lie inside the circle."""
+        """Return which pixel positions, shape (..., 2), lie inside the circle."""
         points = np.asarray(points_px, dtype=float)
-        # Squared, as the renderer tells it too.
+        # Squared distances, as in the renderer, so that both decide alike at the border.
         return np.asarray((points[..., 0] - self.cx) ** 2 + (points[..., 1] - self.cy) ** 2 <= self.radius**2)
 
 
@@ -70,11 +68,11 @@ class Camera:
     cx, cy : float
         Principal point, px, pixel centres at integer + 0.5.
     skew : float
-        Skew, px.
+        px.
     distortion : BrownConrady or KannalaBrandt, optional
         The lens between sightlines and normalised image coordinates; default none.
     view_mask : ViewMask, optional
-        What of the image is seen; default all of it.
+        The part of the image that is seen; default all of it.
 
     Raises
     ------
@@ -111,6 +109,7 @@ class Camera:
 
     def _check_fold(self, distortion: Distortion) -> None:
         """Raise `InputError` where a pixel that should be seen has no sightline on the lens's first branch."""
+        # candidates: a grid over the image, and the circle of the view mask
         x, y = (np.linspace(0.0, size, FOLD_GRID) for size in (self.width, self.height))
         tried = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.view_mask is not None:
@@ -122,11 +121,11 @@ class Camera:
         folded = tried[np.isnan(self.unproject(tried)).any(axis=1)]
         if len(folded):
             gaps = np.hypot(*(folded - [self.cx, self.cy]).T)
-            place = folded[int(gaps.argmin())]
+            pixel = folded[int(gaps.argmin())]
             within = "image" if self.view_mask is None else "view mask"
             raise InputError(
                 f"camera.distortion: the lens folds over at {np.degrees(distortion.limit_angle):.4g} deg off its axis, "
-                f"by pixel ({place[0]:.0f}, {place[1]:.0f}), {gaps.min():.0f} px from the principal point; must stay "
+                f"by pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), {gaps.min():.0f} px from the principal point; must stay "
                 f"monotone over the {within}: other coefficients, or a smaller view_mask.radius"
             )
 
@@ -177,7 +176,7 @@ class Camera:
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
-        """Give the unit sightlines of pixels, inside the image and outside.
+        """Return the unit sightlines of pixels, inside the image and outside.
 
         Parameters
         ----------
@@ -200,10 +199,10 @@ class Camera:
         return rays
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """Give the pixels of points or directions that the lens images.
+        """Return the pixels at which the lens images points or directions.
 
-        Like `unproject` it speaks of the lens alone and goes on outside the image and the view mask; `contains` tells
-        what is in view.
+        Like `unproject` it describes the lens alone, also outside the image and the view mask; what is in view,
+        `contains` decides.
 
         Parameters
         ----------
@@ -225,7 +224,7 @@ class Camera:
         return np.stack([self.fx * x + self.skew * y + self.cx, self.fy * y + self.cy], axis=-1)
 
     def pixel_centres(self) -> Array:
-        """Give the centres of all pixels, shape (height, width, 2), px."""
+        """Return the centres of all pixels, shape (height, width, 2), px."""
         x = np.arange(self.width) + PIXEL_CENTRE
         y = np.arange(self.height) + PIXEL_CENTRE
         return np.stack(np.meshgrid(x, y), axis=-1)
@@ -236,7 +235,7 @@ class Camera:
         return None if self.view_mask is None else self.view_mask.contains(self.pixel_centres())
 
     def contains(self, points_px: npt.ArrayLike) -> Mask:
-        """Tell which pixel positions, shape (..., 2), lie inside the image and the view mask."""
+        """Return which pixel positions, shape (..., 2), lie inside the image and the view mask."""
         points = np.asarray(points_px, dtype=float)
         inside = ((points >= 0) & (points <= [self.width, self.height])).all(axis=-1)
         return np.asarray(inside if self.view_mask is None else inside & self.view_mask.contains(points))

@@ -37,13 +37,13 @@ def check_numbers(name: str, values: Any) -> None:
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:
-    """Raise `InputError` where a value is not of a type of simtest's."""
+    """Raise `InputError` where a value is no instance of a simtest type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is a {type(value).__name__}: must be a simtest {kind.__name__}")
 
 
 def is_finite_number(value: Any) -> bool:
-    """Tell whether a value is a real number of Python's or NumPy's, and finite; truth values are none."""
+    """Return whether a value is a finite real number, of Python's or NumPy's; a truth value is none."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:

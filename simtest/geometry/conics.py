@@ -5,18 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from simtest.geometry.arrays import Array
 from simtest.geometry.camera import Camera
-from simtest.geometry.circle_pose import cone_axes
+from simtest.geometry.circle_from_cone import cone_axes
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
-
-Array = npt.NDArray[np.float64]
 
 
 def backproject_conic(conic: FittedConic | FittedConics, camera: Camera) -> Array:
-    """Give the cone of sightlines through an image ellipse, or each of several: C' = K^T C K [MB, section 2.3, step 3].
+    """Return the cone of sightlines through an image ellipse, or through each: C' = K^T C K [MB, section 2.3, step 3].
 
-    The transforms are multiplied before the conic is touched, so that a small ellipse far from the origin keeps its
-    digits.
+    The transforms are multiplied first, so that a small ellipse far from the origin keeps its digits.
 
     Parameters
     ----------
@@ -34,7 +32,7 @@ def backproject_conic(conic: FittedConic | FittedConics, camera: Camera) -> Arra
 
 
 def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -> Array:
-    """Give the cone of directions through an ellipse of a plane, or each of several: C' = A^T C A.
+    """Return the cone of directions through an ellipse of a plane, or through each of several: C' = A^T C A.
 
     Parameters
     ----------
@@ -55,14 +53,14 @@ def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -
 
 
 def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None, count: int = 73) -> Array:
-    """Give directions along the cone of an ellipse, to draw it through any lens.
+    """Return directions along the cone of an ellipse, to draw it through any lens.
 
     Parameters
     ----------
     cone : array_like, shape (3, 3)
         C', camera frame.
     sightline : array_like, shape (3,), optional
-        Any direction on the side of the cone that is meant; default forward.
+        Any direction on the wanted side of the cone; default forward.
     count : int
         Number of directions; the first is repeated at the end.
 
@@ -96,7 +94,7 @@ class Ellipse:
     angle: float
 
     def points(self, count: int = 100) -> Array:
-        """Give points along the ellipse, shape (count, 2), the first repeated at the end."""
+        """Return points along the ellipse, shape (count, 2), the first repeated at the end."""
         phase = np.linspace(0, 2 * np.pi, count)
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         local = np.stack([self.semi_major * np.cos(phase), self.semi_minor * np.sin(phase)], axis=1)
@@ -104,7 +102,7 @@ class Ellipse:
 
 
 def ellipse_of_conic(conic: npt.ArrayLike) -> Ellipse:
-    """Give centre and axes of a conic that is a real ellipse.
+    """Compute centre and axes of a conic that is a real ellipse.
 
     Parameters
     ----------

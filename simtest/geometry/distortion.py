@@ -1,8 +1,8 @@
 """Lens distortion: from directions to normalised image coordinates and back.
 
-Normalised coordinates m are those that K maps to pixels; without distortion m = (x/z, y/z). Each model is followed on
-its first monotone branch only, from the optical axis outwards: beyond it the lens would fold over, and one pixel would
-see two directions.
+Normalised coordinates m are those that K maps to pixels; without distortion m = (x/z, y/z). Each model is used on its
+first monotone branch only, from the optical axis outwards: beyond it the lens would fold over, and one pixel would see
+two directions.
 """
 
 from collections.abc import Callable
@@ -14,17 +14,17 @@ import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
 from simtest.errors import InputError
+from simtest.geometry.arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
 Curve = Callable[[Array], tuple[Array, Array]]
 
 NEWTON_STEPS = 100
 STEEPEST = 1e6
-"""Largest tangent of a field angle that a perspective lens is asked for."""
+"""Largest tangent of a field angle for which a perspective lens is evaluated."""
 
 CLOSE = 4 * float(np.finfo(float).eps)
 REAL_ROOT = 1e-9
-"""Share of a root's size below which its imaginary part is rounding."""
+"""An imaginary part below this share of a root's size is rounding."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class BrownConrady:
 
     @cached_property
     def _reach(self) -> float:
-        """What the radial part rises to on its first branch: inf where it ends at a pole."""
+        """Supremum of the radial part on its first branch: inf where the branch ends at a pole."""
         return np.inf if self._turn_and_pole[1] <= self.limit else float(self._radial(np.array(self.limit))[0])
 
     @property
@@ -88,7 +88,7 @@ class BrownConrady:
         return Polynomial([1.0, self.k1, self.k2, self.k3]), Polynomial([1.0, self.k4, self.k5, self.k6])
 
     def distort(self, rays: npt.ArrayLike) -> Array:
-        """Give the normalised image coordinates of directions.
+        """Return the normalised image coordinates of directions.
 
         Parameters
         ----------
@@ -109,7 +109,7 @@ class BrownConrady:
         return np.asarray(np.where(valid[..., None], m, np.nan))
 
     def undistort(self, m: npt.ArrayLike) -> Array:
-        """Give the unit directions of normalised image coordinates, by Newton's method.
+        """Return the unit directions of normalised image coordinates, found by Newton's method.
 
         Parameters
         ----------
@@ -122,6 +122,7 @@ class BrownConrady:
         """
         target = np.asarray(m, dtype=float)
         radius = np.linalg.norm(target, axis=-1)
+        # start: the radial part alone
         tangential = self.p1 != 0 or self.p2 != 0
         reach = radius
         if tangential:
@@ -130,6 +131,7 @@ class BrownConrady:
         inner = _invert(self._radial, reach, self.limit, self._reach)
         with np.errstate(invalid="ignore", divide="ignore"):
             xy = np.where(radius[..., None] > 0, target * (inner / radius)[..., None], target)
+        # refine: the tangential terms too
         if tangential:
             xy = self._polish(xy, target)
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
@@ -137,14 +139,14 @@ class BrownConrady:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def _radial(self, r: Array) -> tuple[Array, Array]:
-        """Give the radial part r R(r^2) and its slope."""
+        """Return the radial part r R(r^2) and its slope."""
         u = r * r
         above, below = self._radial_polynomials
         ratio = above(u) / below(u)
         return r * ratio, ratio + 2 * u * (above.deriv()(u) - ratio * below.deriv()(u)) / below(u)
 
     def _forward(self, xy: Array) -> tuple[Array, Array]:
-        """Give m and the Jacobian's three entries (it is symmetric): xx, xy, yy, shape (..., 3)."""
+        """Return m and the three entries of its symmetric Jacobian: xx, xy, yy, shape (..., 3)."""
         x, y = xy[..., 0], xy[..., 1]
         u = x * x + y * y
         above, below = self._radial_polynomials
@@ -162,14 +164,15 @@ class BrownConrady:
         )
         return m, jacobian
 
-    def _on_branch(self, xy: Array, jacobian: Array) -> npt.NDArray[np.bool_]:
+    def _on_branch(self, xy: Array, jacobian: Array) -> Mask:
+        """Return which points lie on the first monotone branch."""
         xx, mixed, yy = jacobian[..., 0], jacobian[..., 1], jacobian[..., 2]
         inside = np.hypot(xy[..., 0], xy[..., 1]) < self.limit
         # Both eigenvalues are positive on the axis; the first one to vanish ends the branch.
         return np.asarray(inside & (xx * yy - mixed * mixed > 0) & (xx + yy > 0))
 
     def _polish(self, xy: Array, target: Array) -> Array:
-        """Solve for the tangential terms too, from the radial solution; NaN where it does not converge."""
+        """Refine the radial solution for the tangential terms by damped Newton steps; NaN where that fails."""
         start, wanted = xy.reshape(-1, 2), target.reshape(-1, 2)
         solution, scale = np.full_like(start, np.nan), 1 + np.linalg.norm(wanted, axis=1)
         active = np.flatnonzero(np.isfinite(start).all(axis=1))
@@ -181,7 +184,7 @@ class BrownConrady:
                 gap = m - wanted[active]
                 step = np.stack([yy * gap[:, 0] - mixed * gap[:, 1], xx * gap[:, 1] - mixed * gap[:, 0]], axis=1)
                 step /= (xx * yy - mixed * mixed)[:, None]
-                # A step across the whole branch would leave it.
+                # A longer step could leave the branch.
                 length = np.linalg.norm(step, axis=1)
                 most = 0.2 * (0.1 + np.linalg.norm(x, axis=1))
                 x = x - step * np.where(length > most, most / length, 1.0)[:, None]
@@ -201,8 +204,8 @@ class KannalaBrandt:
     """A fisheye lens: OpenCV's fisheye model (ROS: equidistant).
 
     With theta the angle off the optical axis and phi the direction around it,
-    m = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (cos phi, sin phi). All coefficients 0 is the
-    equidistant lens. Angles of 90 deg and more are seen like the others.
+    m = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (cos phi, sin phi). With all coefficients 0 the
+    lens is equidistant. Angles of 90 deg and more are imaged like the others.
 
     Parameters
     ----------
@@ -230,18 +233,7 @@ class KannalaBrandt:
         return float(min(np.pi, np.sqrt(_first_root(slope))))
 
     def distort(self, rays: npt.ArrayLike) -> Array:
-        """Give the normalised image coordinates of directions.
-
-        Parameters
-        ----------
-        rays : array_like, shape (..., 3)
-            Camera frame, any length.
-
-        Returns
-        -------
-        ndarray, shape (..., 2)
-            NaN beyond the first monotone branch, and straight behind the camera.
-        """
+        """Return image coordinates as `BrownConrady.distort` does; NaN beyond the branch, and straight behind."""
         P = np.asarray(rays, dtype=float)
         across = np.hypot(P[..., 0], P[..., 1])
         theta = np.arctan2(across, P[..., 2])
@@ -253,17 +245,7 @@ class KannalaBrandt:
         return np.asarray(P[..., :2] * share[..., None])
 
     def undistort(self, m: npt.ArrayLike) -> Array:
-        """Give the unit directions of normalised image coordinates, by Newton's method.
-
-        Parameters
-        ----------
-        m : array_like, shape (..., 2)
-
-        Returns
-        -------
-        ndarray, shape (..., 3)
-            Camera frame; NaN where no direction of the first monotone branch is seen.
-        """
+        """Return unit directions as `BrownConrady.undistort` does."""
         target = np.asarray(m, dtype=float)
         radius = np.hypot(target[..., 0], target[..., 1])
         top = self.limit_angle
@@ -273,6 +255,7 @@ class KannalaBrandt:
         return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
 
     def _radial(self, theta: Array) -> tuple[Array, Array]:
+        """Return abs(m) at field angles, and its slope."""
         u = theta * theta
         factor = Polynomial([1.0, self.k1, self.k2, self.k3, self.k4])
         return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
@@ -288,9 +271,9 @@ def _check_finite(model: Distortion) -> None:
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Give the smallest positive real root of a polynomial that is 1 at 0; inf where there is none."""
-    # Those of the reversed polynomial, whose first coefficient is that 1, are the inverses: tiny last coefficients
-    # then make roots near 0 in place of a matrix of huge entries.
+    """Return the smallest positive real root of a polynomial that is 1 at 0; inf where there is none."""
+    # The reversed polynomial, whose first coefficient is that 1, has the inverse roots: tiny last coefficients then
+    # make roots near 0 instead of a companion matrix with huge entries.
     inverse = np.roots(polynomial.coef)
     real = np.real(inverse)[np.abs(np.imag(inverse)) <= REAL_ROOT * np.abs(inverse)]
     most = float(max(real, default=0.0))
@@ -303,12 +286,12 @@ def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
     Parameters
     ----------
     curve : callable
-        Gives value and slope; 0 at 0, and rising up to `top`.
+        Returns value and slope; 0 at 0, and rising up to `top`.
     value : ndarray, shape (...)
         At least 0.
     top : float
     reach : float
-        What the curve rises to at `top`; may be inf.
+        The curve's value at `top`; may be inf.
 
     Returns
     -------
@@ -318,9 +301,11 @@ def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
     wanted = np.ravel(value).astype(float)
     found = np.full(wanted.shape, np.nan)
     open_ = np.flatnonzero((wanted < reach) & np.isfinite(wanted))
+    # start: the identity, or the middle of the bracket
     low, high, target = np.zeros(len(open_)), np.full(len(open_), top), wanted[open_]
     x = np.minimum(target, 0.5 * high)
     for _ in range(NEWTON_STEPS):
+        # narrow the bracket, then take Newton's step where it stays inside, else bisect
         reached, slope = curve(x)
         gap = reached - target
         low, high = np.where(gap < 0, x, low), np.where(gap > 0, x, high)

@@ -1,4 +1,4 @@
-"""Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled, of many contours at once."""
+"""Direct least-squares ellipse fit [FF99] in its stable form [HF98], centred and scaled; fits many contours at once."""
 
 import operator
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, InputError, Reason
+from simtest.geometry.arrays import Array, Index, Mask
 from simtest.geometry.ellipse_pencil import constrained_minimum
-
-Array = npt.NDArray[np.float64]
 
 MIN_POINTS = 6
 """An ellipse has five parameters; with five points or fewer the fit has no residual."""
@@ -24,21 +23,20 @@ MAX_AXIS_RATIO = 1e4
 """A fitted ellipse longer than this over its width is a line."""
 
 _LINE = 1e-14
-"""A share of the squared second moments' trace below which their determinant is rounding."""
+"""A determinant of second moments below this share of their squared trace is rounding: the points lie on a line."""
 
 _RANK = 1e-15
-"""A share of the largest moment below which an eigenvalue is rounding."""
+"""An eigenvalue below this share of the largest moment is rounding."""
 
 _AT_ONCE = 2**18
-"""Points that are worked on at once: more would only take memory."""
+"""Points that are fitted at once: more would only take memory."""
 
 
 @dataclass(frozen=True)
 class FittedConic:
     """An ellipse in coordinates centred on its points and scaled by their spread.
 
-    Kept with its transform, because the conic of a small ellipse far from the image's origin has entries that
-    cancel to nothing.
+    It is kept with its transform: in pixels, the entries of a small ellipse far from the origin would cancel.
 
     Parameters
     ----------
@@ -57,6 +55,20 @@ class FittedConic:
         T = self.normalised_from_image
         return np.asarray(T.T @ self.normalised @ T)
 
+    def centre_and_matrix(self) -> tuple[Array, Array]:
+        """Return centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
+        C, T = self.normalised, self.normalised_from_image
+        centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
+        level = -(C[2, 2] + C[:2, 2] @ centre)
+        Q = T[:2, :2].T @ C[:2, :2] @ T[:2, :2] / level
+        return np.asarray(np.linalg.solve(T[:2, :2], centre - T[:2, 2])), np.asarray(Q)
+
+    def relative_radii(self, points: Array) -> Array:
+        """Return the distance of points, shape (N, 2), px, from the centre over the ellipse's radius that way."""
+        centre, Q = self.centre_and_matrix()
+        gap = points - centre
+        return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", gap, Q, gap)))
+
 
 @dataclass(frozen=True)
 class FittedConics:
@@ -67,7 +79,7 @@ class FittedConics:
     normalised, normalised_from_image : ndarray, shape (N, 3, 3)
         As of `FittedConic`; those of a failed fit mean nothing.
     failures : mapping
-        Failure by the contour's number.
+        Failure by the contour's index.
     """
 
     normalised: Array
@@ -78,7 +90,7 @@ class FittedConics:
         return len(self.normalised)
 
     def __getitem__(self, index: int) -> FittedConic | Failure:
-        # Failures are numbered from 0: one that is asked for from the end must be found too.
+        # A negative index must find its failure too.
         index = range(len(self))[operator.index(index)]
         failure = self.failures.get(index)
         return failure or FittedConic(self.normalised[index], self.normalised_from_image[index])
@@ -88,15 +100,15 @@ class _Failures:
     """The first failure of each contour."""
 
     def __init__(self) -> None:
-        self._noted: list[tuple[npt.NDArray[np.bool_], Reason, str]] = []
+        self._noted: list[tuple[Mask, Reason, str]] = []
 
-    def add(self, which: npt.NDArray[np.bool_], reason: Reason, detail: str) -> None:
+    def add(self, which: Mask, reason: Reason, detail: str) -> None:
         self._noted.append((which, reason, detail))
 
     @property
     def found(self) -> dict[int, Failure]:
         found: dict[int, Failure] = {}
-        # As a rule there are none: one look at all then does.
+        # Usually there are none, which one test of all finds.
         if np.array([which for which, _, _ in self._noted]).any():
             for which, reason, detail in self._noted:
                 for index in np.flatnonzero(which).tolist():
@@ -144,6 +156,7 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
         If a contour is no numbers of shape (N, 2).
     """
     count = len(contours)
+    # candidates: contours of six points and more
     normalised, transforms = np.zeros((2, count, 3, 3)) + np.eye(3)
     failures: dict[int, Failure] = {}
     arrays = [_points(points, index) for index, points in enumerate(contours)]
@@ -153,6 +166,7 @@ def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
             failures[index] = Failure(Reason.TOO_FEW_POINTS, f"{len(xy)} points; at least {MIN_POINTS} are needed")
         else:
             long_enough.append(index)
+    # fit them, a bounded number of points at once
     for part in _parts(long_enough, [len(xy) for xy in arrays]):
         fitted = _fit_together([arrays[i] for i in part])
         normalised[part], transforms[part] = fitted.normalised, fitted.normalised_from_image
@@ -175,7 +189,7 @@ def _parts(members: list[int], lengths: list[int]) -> Iterator[list[int]]:
 
 
 def _points(points: npt.ArrayLike, index: int) -> Array:
-    """Give a contour as an array of shape (N, 2)."""
+    """Return a contour as an array of shape (N, 2)."""
     try:
         xy = np.asarray(points, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -191,7 +205,7 @@ def _points(points: npt.ArrayLike, index: int) -> Array:
 class _Batch:
     """Points of B contours one after the other.
 
-    Every sum is over one contour's points alone, so that a fit's last bits do not depend on what else is in the batch.
+    Every sum runs over one contour's points alone, so that a fit's last bits do not depend on the rest of the batch.
 
     Parameters
     ----------
@@ -201,7 +215,7 @@ class _Batch:
     """
 
     points: Array
-    counts: npt.NDArray[np.intp]
+    counts: Index
 
     @classmethod
     def of(cls, contours: list[Array]) -> "_Batch":
@@ -209,16 +223,16 @@ class _Batch:
         return cls(np.concatenate(contours).T.copy(), counts)
 
     @cached_property
-    def first(self) -> npt.NDArray[np.intp]:
+    def first(self) -> Index:
         """First point of each contour, shape (B,)."""
         return np.asarray(np.cumsum(self.counts) - self.counts)
 
     def sums(self, table: Array) -> Array:
-        """Add up what belongs to each contour, from shape (K, N) to (K, B)."""
+        """Sum a table over each contour's points, from shape (K, N) to (K, B)."""
         return np.add.reduceat(table, self.first, axis=1)
 
     def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Give each point the value of its contour, from shape (..., B) to (..., N)."""
+        """Repeat the value of each contour for its points, from shape (..., B) to (..., N)."""
         return np.repeat(values, self.counts, axis=-1)
 
 
@@ -237,17 +251,18 @@ def _fit_together(contours: list[Array]) -> FittedConics:
 
 
 def _normalise(batch: _Batch, failures: _Failures) -> Array:
-    """Move points to their centre, principal axes and unit spread; give the similarities, shape (B, 3, 3).
+    """Move points to their centre, principal axes and unit spread; return the similarities, shape (B, 3, 3).
 
     In the principal axes the moments of a long ellipse are graded, and no digits are lost between them.
     """
     points, counts = batch.points, batch.counts
     centre = np.zeros((2, len(counts)))
-    # Twice: far from the origin the first mean is off by its rounding, and the points would share that offset.
+    # Twice: far from the origin the first mean is off by rounding, and all points would share that offset.
     for _ in range(2):
         mean = batch.sums(points) / counts
         points -= batch.spread(mean)
         centre += mean
+    # scale: the root of the mean variance
     x, y = points
     xx, xy, yy = batch.sums(np.array([x * x, x * y, y * y]))
     scale = np.sqrt((xx + yy) / counts / 2)
@@ -256,6 +271,7 @@ def _normalise(batch: _Batch, failures: _Failures) -> Array:
     if together.any():
         points[:, batch.spread(together)] = 0.0
         scale[together] = 1.0
+    # principal axes
     angle = np.arctan2(2 * xy, xx - yy) / 2
     cos, sin = np.cos(angle) / scale, np.sin(angle) / scale
     transforms = np.zeros((len(counts), 3, 3))
@@ -269,14 +285,14 @@ def _normalise(batch: _Batch, failures: _Failures) -> Array:
 
 
 _QUARTIC, _CUBIC, _QUADRATIC = [0, 1, 2, 1, 2, 3, 2, 3, 4], [5, 6, 6, 7, 7, 8], slice(9, 12)
-"""Where in the table of moments those of (x^2, x y, y^2) with themselves, with (x, y) and with 1 are."""
+"""Indices in the table of moments of (x^2, x y, y^2) with themselves, with (x, y) and with 1."""
 
 
 _CIRCLE = np.eye(3)
 
 
 def _moments(batch: _Batch) -> Array:
-    """Sum up x^4, x^3 y, x^2 y^2, x y^3, y^4, x^3, x^2 y, x y^2, y^3, x^2, x y, y^2; shape (B, 12)."""
+    """Sum x^4, x^3 y, x^2 y^2, x y^3, y^4, x^3, x^2 y, x y^2, y^3, x^2, x y, y^2 over each contour; shape (B, 12)."""
     x, y = batch.points
     table = np.empty((12, len(x)))
     xx, yy = table[9], table[11]
@@ -290,10 +306,11 @@ def _moments(batch: _Batch) -> Array:
 
 
 def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
-    """Give conics of normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
+    """Fit conics to normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
 
-    The sums of x and of y are 0: the linear and the constant part do not mix.
+    The sums of x and of y are 0, so the linear and the constant part do not mix.
     """
+    # scatter matrices of the design's three parts [HF98]
     moments = _moments(batch)
     S1, S2 = moments[:, _QUARTIC].reshape(-1, 3, 3), moments[:, _CUBIC].reshape(-1, 3, 2)
     S3 = moments[:, _QUADRATIC]
@@ -301,34 +318,34 @@ def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     spread = xx * yy - xy * xy
     on_line = ~(spread > _LINE * (xx + yy) ** 2)
     failures.add(on_line, Reason.DEGENERATE_CONIC, "the points lie on a line")
-    # d, e and f that minimise the residual for given a, b, c: (d, e) = -linear (a, b, c), f = -constant (a, b, c).
+    # eliminate d, e, f: for given a, b, c the residual is least at (d, e) = -linear (a, b, c), f = -constant (a, b, c)
     inverse = np.array([yy, -xy, -xy, xx]) / np.where(on_line, 1.0, spread)
     linear = np.ascontiguousarray(inverse.T).reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
     constant = S3 / batch.counts[:, None]
     M = S1 - S2 @ linear - S3[:, :, None] * constant[:, None, :]
     M = (M + M.transpose(0, 2, 1)) / 2
-    # One eigenvalue of M is 0 on an exact ellipse; where two are, as on four points, many conics fit.
+    # One eigenvalue of M is 0 on an exact ellipse; where two are 0, as for four points, many conics fit.
     trace, rounding = np.einsum("nii->n", M), _RANK * np.einsum("nii->n", S1)
     minors = (trace * trace - (M * M).sum(axis=(1, 2))) / 2
     many = ~((trace > rounding) & (minors > rounding * trace))
     failures.add(many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse")
-    # A circle's problem stands in for those without a solution.
+    # solve; a circle's problem stands in for those without a solution
     M[many | on_line] = _CIRCLE
     quadratic = constrained_minimum(M)
     a, b, c = quadratic.T
     d, e = -(linear @ quadratic[:, :, None])[:, :, 0].T
     f = -(constant * quadratic).sum(axis=1)
-    # In rows: the order of the norm's sum hangs on the layout.
+    # In rows: the order in which the norm is summed depends on the layout.
     conics = np.ascontiguousarray(np.array([a, b / 2, d / 2, b / 2, c, e / 2, d / 2, e / 2, f]).T)
     conics *= (np.where(a + c < 0, -1.0, 1.0) / np.sqrt((conics * conics).sum(axis=1)))[:, None]
     return np.asarray(conics.reshape(-1, 3, 3))
 
 
 def _check(conics: Array, failures: _Failures) -> None:
-    """Refuse conics that are no real ellipse, or so long that they are lines."""
+    """Note a failure for conics that are no real ellipse, or so long that they are lines."""
     a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
     high = (a + c + np.hypot(a - c, 2 * b)) / 2
-    # low as the product over high: the difference would cancel.
+    # The smaller eigenvalue as product over the larger one: the difference would cancel.
     low = (a * c - b * b) / high
     not_real = ~((low > 0) & (np.linalg.det(conics) < 0))
     failures.add(not_real, Reason.NOT_AN_ELLIPSE, "the fitted conic is no real ellipse")

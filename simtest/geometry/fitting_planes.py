@@ -4,13 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
+from simtest.geometry.arrays import Array
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
-
-Array = npt.NDArray[np.float64]
 
 FORWARD: Array = np.array([0.0, 0.0, 1.0])
 FORWARD.flags.writeable = False
@@ -29,7 +27,7 @@ class FittingPlanes:
     sightlines : ndarray, shape (N, 3)
         A direction inside each cone, unit, camera frame.
     failures : mapping
-        Failure by the contour's number; the other entries of such a contour mean nothing.
+        Failure by the contour's index; the other entries of such a contour mean nothing.
     """
 
     points: Sequence[Array]
@@ -41,8 +39,8 @@ class FittingPlanes:
 def fitting_planes(contours: Sequence[Array], camera: Camera) -> FittingPlanes:
     """Map contours to the planes in which their ellipses are fitted.
 
-    A pinhole has ellipses in its image: the plane is the image, its transform K. Where a lens distorts, the plane lies
-    across the contour's mean sightline, and the transform is a rotation.
+    A pinhole images ellipses: its plane is the image, with the transform K. Where a lens distorts, the plane is
+    perpendicular to the contour's mean sightline, and the transform is a rotation.
 
     Parameters
     ----------
@@ -54,11 +52,12 @@ def fitting_planes(contours: Sequence[Array], camera: Camera) -> FittingPlanes:
     Returns
     -------
     FittingPlanes
-        A Failure for each contour with points that the lens images nothing at, or that reaches 90 deg from its mean
+        A Failure for each contour with points at which the lens images nothing, or that reaches 90 deg from its mean
         sightline.
     """
     if camera.distortion is None or not contours:
         return FittingPlanes(contours, camera.K, np.broadcast_to(FORWARD, (len(contours), 3)))
+    # mean sightline of each contour
     counts = np.array([len(points) for points in contours])
     first = np.cumsum(counts) - counts
     rays = camera.unproject(np.concatenate(contours))
@@ -69,6 +68,7 @@ def fitting_planes(contours: Sequence[Array], camera: Camera) -> FittingPlanes:
         failures[index] = Failure(Reason.NOT_FINITE, "the lens images nothing at points of the isophote")
     sightlines = np.where(length[:, None] > 0, mean, FORWARD)
     sightlines /= np.linalg.norm(sightlines, axis=1, keepdims=True)
+    # gnomonic projection onto the plane across it
     rotations = np.stack([*tangent_basis(sightlines), sightlines], axis=1)
     across = np.einsum("nij,nj->ni", np.repeat(rotations, counts, axis=0), rays)
     nearest = np.minimum.reduceat(across[:, 2], first)

@@ -1,4 +1,4 @@
-"""Specular isocurves on a plane [MB, sections 2.1 and 2.2]: the quartic Q, and its two circles in endoscopy.
+"""Specular isocurves on a plane [MB, sections 2.1 and 2.2]: the quartic Q, and its two circles where L = V.
 
 The plane is z = 0, p = (x, y) a point of it, P = (x, y, 0); the camera centre V and the light L lie at z > 0. With the
 mirrored light R = (L_X, L_Y, -L_Z), the angle beta between view and mirror direction obeys
@@ -9,69 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
-
-Array = npt.NDArray[np.float64]
-
-
-def cosine_of_isovalue(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, scale: npt.ArrayLike = 1.0) -> Array:
-    """Give tau = (t / c)^(1/n), the cosine of beta on the isophote at t [MB, section 2.1].
-
-    Parameters
-    ----------
-    isovalue : array_like
-        t in (0, c).
-    exponent : array_like
-        Roughness exponent n > 0.
-    scale : array_like
-        c > 0.
-
-    Returns
-    -------
-    ndarray
-        tau in (0, 1).
-
-    Raises
-    ------
-    InputError
-        If a value is out of range.
-    """
-    t, n, c = (np.asarray(value, dtype=float) for value in (isovalue, exponent, scale))
-    if not (np.all(n > 0) and np.all(c > 0)):
-        raise InputError(f"exponent n = {exponent!r}, scale c = {scale!r}: both must be > 0")
-    if not (np.all(t > 0) and np.all(t < c)):
-        raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, c), c = {scale!r}")
-    return np.asarray((t / c) ** (1 / n))
-
-
-def kappa(tau: npt.ArrayLike) -> Array:
-    """Give kappa = 1 - tau^2 [MB, section 2.2]; for tau in (0, 1) it lies in (0, 1)."""
-    return np.asarray(1 - np.asarray(tau, dtype=float) ** 2)
-
-
-def cosine_beta(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> Array:
-    """Give cos(beta) at points of the plane: the specular term is c max(0, cos beta)^n.
-
-    Parameters
-    ----------
-    points : array_like, shape (..., 2)
-        p on the plane z = 0.
-    light, camera : array_like, shape (3,) or (..., 3)
-        L and V.
-
-    Returns
-    -------
-    ndarray, shape (...)
-    """
-    to_mirrored, to_camera = _directions(points, light, camera)
-    lengths = np.linalg.norm(to_mirrored, axis=-1) * np.linalg.norm(to_camera, axis=-1)
-    return np.asarray(-np.sum(to_mirrored * to_camera, axis=-1) / lengths)
+from simtest.geometry.arrays import Array, Mask
 
 
 def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike, tau: npt.ArrayLike) -> Array:
-    """Give Q(p) = ((R-P).(V-P))^2 - tau^2 abs(R-P)^2 abs(V-P)^2 [MB, section 2.1, Proposition 1].
+    """Evaluate Q(p) = ((R-P).(V-P))^2 - tau^2 abs(R-P)^2 abs(V-P)^2 [MB, section 2.1, Proposition 1].
 
-    Its zeros are the quartic that holds the isophote; it has two branches, cos(beta) = tau, which is the isophote, and
-    cos(beta) = -tau, which is none (see `on_isophote_branch`).
+    Its zeros are a quartic with two branches: cos(beta) = tau, which is the isophote, and cos(beta) = -tau, which is
+    none (see `on_isophote_branch`).
 
     Parameters
     ----------
@@ -80,7 +25,7 @@ def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.A
     light, camera : array_like, shape (3,) or (..., 3)
         L and V.
     tau : array_like
-        See `cosine_of_isovalue`.
+        (t / c)^(1/n) on the isophote at t of a lobe c cos(beta)^n.
 
     Returns
     -------
@@ -93,44 +38,21 @@ def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.A
     return np.asarray(product**2 - np.asarray(tau, dtype=float) ** 2 * lengths)
 
 
-def on_isophote_branch(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Tell which points lie where cos(beta) > 0: the part of the quartic that is the isophote."""
+def on_isophote_branch(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> Mask:
+    """Return which points lie where cos(beta) > 0: on the branch of the quartic that is the isophote."""
     to_mirrored, to_camera = _directions(points, light, camera)
     return np.asarray(np.sum(to_mirrored * to_camera, axis=-1) < 0)
 
 
 def _directions(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return R - P and V - P."""
     p, L, V = (np.asarray(value, dtype=float) for value in (points, light, camera))
     P = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], axis=-1)
     return L * [1.0, 1.0, -1.0] - P, V - P
 
 
-def endoscopic_isocurve(points: npt.ArrayLike, camera: npt.ArrayLike, kappa_value: npt.ArrayLike) -> Array:
-    """Give E(p) = kappa rho^4 + 2 V_Z^2 (kappa - 2) rho^2 + kappa V_Z^4, Q with L = V [MB, section 2.2, Proposition 2].
-
-    rho is the distance from the camera's foot. E = kappa q+ q- with the circles q+- = rho^2 - r+-^2 (`isocurve_radii`);
-    the article's factorisation omits the factor kappa.
-
-    Parameters
-    ----------
-    points : array_like, shape (..., 2)
-        p on the plane z = 0.
-    camera : array_like, shape (3,)
-        V = L.
-    kappa_value : array_like
-        See `kappa`.
-
-    Returns
-    -------
-    ndarray, shape (...)
-    """
-    p, V, k = (np.asarray(value, dtype=float) for value in (points, camera, kappa_value))
-    squared, height = np.sum((p - V[..., :2]) ** 2, axis=-1), V[..., 2] ** 2
-    return np.asarray(k * squared**2 + 2 * height * (k - 2) * squared + k * height**2)
-
-
 def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
-    """Give the radius r- of the isophote at t about the foot of V = L, abs(V_Z) tan(acos(tau)/2) [MB, section 2.2].
+    """Return the radius r- of the isophote at t about the foot of V = L, abs(V_Z) tan(acos(tau)/2) [MB, section 2.2].
 
     Parameters
     ----------
@@ -150,7 +72,7 @@ def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
 
 
 def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[Array, Array]:
-    """Give the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2].
+    """Return the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2].
 
     r+- = abs(V_Z) sqrt((2-kappa)/kappa +- sqrt(((2-kappa)/kappa)^2 - 1)). The isophote is r-; r+ is the branch
     cos(beta) = -tau; r+ r- = V_Z^2. Computed in the form r- = abs(V_Z) tan(acos(tau)/2), which does not cancel.
@@ -183,7 +105,7 @@ def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[A
 
 
 def brightest_point(light: Array, camera: Array) -> Array:
-    """Give the BP on the plane z = 0, shape (2,): where the mirrored light, the point and the camera are in line.
+    """Return the BP on the plane z = 0, shape (2,): there the mirrored light, the point and the camera are collinear.
 
     Parameters
     ----------

@@ -1,343 +1,85 @@
-"""Isophotes of a highlight: the border of the region above a share of the smoothed peak that holds the peak."""
+"""Isophotes around a peak: the border of the region above a share of the peak that holds the peak."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
-import numpy.typing as npt
-from scipy import ndimage
 
-from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.level_sets import (
-    Crossings,
-    LevelSet,
-    Sensitivities,
-    crossings,
-    cut_level_set_around,
-    level_set_around,
-)
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
-
-MIN_PLATEAU_PX = 12
-"""Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
+from simtest.geometry.arrays import Array, Image, Mask
+from simtest.geometry.level_sets import Crossings, LevelSet, crossings, cut_level_set_around, level_set_around
 
 CUT_SIGMAS = 1.5
-"""Nearer than this to a cut, over the smoothing's standard deviation, an isophote is left out: smoothing there draws it
-aside, at the cut by 0.8 of that deviation, here by 0.06."""
+"""Nearer than this to a cut, over the smoothing's standard deviation, an isophote is left out: smoothing moves it, at
+the cut by 0.8 of that deviation, at this distance by 0.06."""
 
 
-def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
-    """Smooth a frame with a Gaussian.
-
-    Parameters
-    ----------
-    frame : array_like, shape (H, W) or (H, W, C)
-        Intensities.
-    sigma_px : float
-        Standard deviation, px; 0 leaves the frame as it is.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside a camera's view mask. Each smoothed value is then the weighted mean of those alone, so that
-        the dark around them does not draw the values at the mask's border down; the others are 0.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-    """
-    image = np.ascontiguousarray(frame, dtype=np.float32)
-    if seen is None:
-        return _blurred(image, sigma_px)
-    inside = seen if image.ndim == 2 else seen[:, :, None]
-    weights = _blurred(seen.astype(np.float32), sigma_px).reshape(inside.shape)
-    blurred = _blurred(np.where(inside, image, np.float32(0)), sigma_px)
-    return np.asarray(np.divide(blurred, weights, where=inside, out=np.zeros_like(image)))
-
-
-def _blurred(image: Image, sigma_px: float) -> Image:
-    if sigma_px <= 0:
-        return image
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A region of interest of a smoothed frame around one peak.
+@dataclass(frozen=True, eq=False)
+class IsophoteTracer:
+    """The level sets around one peak, each found once; what was found depends on the arguments alone.
 
     Parameters
     ----------
     values : ndarray, shape (h, w)
-        Smoothed intensities of the region.
-    origin_px : tuple of int
-        Column and row of the region's first pixel in the frame.
-    peak_px : ndarray, shape (2,)
-        Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
-    peak_value : float
-        Smoothed intensity of the peak's pixel: isovalues are relative to it.
+        Smoothed intensities.
     peak_pixel : tuple of int
-        Column and row of the peak's pixel in the region.
-    saturated : ndarray of bool, shape (h, w), optional
-        Where the sensor is clipped; None where that is not known.
-    seen : ndarray of bool, shape (h, w), optional
-        The pixels inside the camera's view mask; default all. An isophote that runs into others is not closed.
-    raw : ndarray, shape (h, w), optional
-        Intensities before smoothing, whose noise is independent from pixel to pixel.
-    noise : float, or ndarray of float32, shape (h, w), optional
-        Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
+        Column and row of the peak.
+    peak_value : float
+        Isovalues are relative to it.
+    seen : ndarray of bool, shape (h, w), or None
+        The pixels inside the camera's view mask; None: all.
     smoothing_px : float
-        Standard deviation of the Gaussian that the frame was smoothed with, px.
-    others_px : tuple of tuple of float
-        Peaks of the frame's other specularities, px.
+        Standard deviation of the Gaussian that `values` were smoothed with, px.
     """
 
     values: Image | Array
-    origin_px: tuple[int, int]
-    peak_px: Array
-    peak_value: float
     peak_pixel: tuple[int, int]
-    saturated: Mask | None = None
-    seen: Mask | None = None
-    raw: Image | Array | None = None
-    noise: float | Image | None = None
-    smoothing_px: float = 0.0
-    others_px: tuple[tuple[float, float], ...] = ()
-    _level_sets: dict[float, LevelSet | Failure] = field(default_factory=dict, compare=False, repr=False)
-    _cut_sets: dict[float, LevelSet] = field(default_factory=dict, compare=False, repr=False)
-    _crossings: dict[tuple[LevelSet, ...], Crossings] = field(
-        default_factory=dict, init=False, compare=False, repr=False
-    )
+    peak_value: float
+    seen: Mask | None
+    smoothing_px: float
+    _closed: dict[float, LevelSet | Failure] = field(default_factory=dict, init=False, repr=False)
+    _cut: dict[float, LevelSet] = field(default_factory=dict, init=False, repr=False)
+    _crossings: dict[tuple[LevelSet, ...], Crossings] = field(default_factory=dict, init=False, repr=False)
 
-    @classmethod
-    def cut(
-        cls,
-        smoothed: Image | Array,
-        box: tuple[int, int, int, int],
-        peak: tuple[int, int] | None = None,
-        origin_px: tuple[int, int] = (0, 0),
-        saturated: Mask | None = None,
-        seen: Mask | None = None,
-        raw: Image | Array | None = None,
-        noise: float | Image | None = None,
-        smoothing_px: float = 0.0,
-    ) -> "Patch | Failure":
-        """Cut a region out of a smoothed frame.
+    def finds_the_same_as(self, other: "IsophoteTracer") -> bool:
+        """Return whether another tracer works on the same arrays, not copies, with the same peak and smoothing."""
+        arrays = self.values is other.values and self.seen is other.seen
+        peaks = self.peak_pixel == other.peak_pixel and self.peak_value == other.peak_value
+        return arrays and peaks and self.smoothing_px == other.smoothing_px
 
-        Parameters
-        ----------
-        smoothed : ndarray, shape (H, W)
-            The frame.
-        box : tuple of int
-            Column, row, width, height of the region; inside the frame.
-        peak : tuple of int, optional
-            Column and row of the peak's pixel; default the brightest of the region.
-        origin_px : tuple of int
-            Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
-        saturated : ndarray of bool, shape (H, W), optional
-            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
-        seen : ndarray of bool, shape (H, W), optional
-            The frame's pixels inside the camera's view mask; default all.
-        raw : ndarray, shape (H, W), optional
-            The frame before smoothing.
-        noise : float, or ndarray of float32, shape (H, W), optional
-            Standard deviation of the frame's noise before smoothing; None: not known.
-        smoothing_px : float
-            Standard deviation of the Gaussian that it was smoothed with, px.
+    def closed(self, isovalue: float) -> LevelSet | Failure:
+        """Return the region above t times the peak; a Failure where its border does not close."""
+        if isovalue not in self._closed:
+            level = _checked(isovalue) * self.peak_value
+            self._closed[isovalue] = level_set_around(self.values, self.peak_pixel, level, self.seen) or Failure(
+                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
+            )
+        return self._closed[isovalue]
 
-        Returns
-        -------
-        Patch or Failure
-            A Failure if the region holds values that are not finite, or no positive one above the others.
+    def cut(self, isovalue: float) -> LevelSet:
+        """Return the same region where the border or the view may cut it, its border open there."""
+        if isovalue not in self._cut:
+            margin = max(int(np.ceil(CUT_SIGMAS * self.smoothing_px)), 1)
+            level = _checked(isovalue) * self.peak_value
+            self._cut[isovalue] = cut_level_set_around(self.values, self.peak_pixel, level, margin, self.seen)
+        return self._cut[isovalue]
 
-        Raises
-        ------
-        InputError
-            If the box is empty or leaves the frame.
-        """
-        x, y, width, height = box
-        rows, columns = smoothed.shape
-        if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
-            raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
-        values = smoothed[y : y + height, x : x + width]
-        # Either end of the range shows NaN and infinity, at less than the price of a look at every value.
-        lowest, highest = float(values.min()), float(values.max())
-        if not (np.isfinite(lowest) and np.isfinite(highest)):
-            return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
-        if peak is None:
-            row, column = divmod(int(values.argmax()), values.shape[1])
-        else:
-            column, row = peak[0] - x, peak[1] - y
-        if seen is not None:
-            seen = seen[y : y + height, x : x + width]
-            lowest = float(values.min(where=seen, initial=np.inf))
-        corner = (x + origin_px[0], y + origin_px[1])
-        unsmoothed = None if raw is None else raw[y : y + height, x : x + width]
-        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
-        plateau = None if clipped is None else _plateau(clipped, row, column)
-        if clipped is None or plateau is None:
-            place = _parabolic_peak(values, row, column)
-        else:
-            place = np.argwhere(plateau)[:, ::-1].mean(axis=0)
-            # Where falloff was divided away the plateau is slanted, and highest at its rim; its holes may be dark.
-            pixels = np.argwhere(plateau & clipped)[:, ::-1]
-            column, row = pixels[np.argmin(np.sum((pixels - place) ** 2, axis=1))]
-        value = float(values[row, column])
-        if value <= 0 or value <= lowest:
-            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
-        if isinstance(noise, np.ndarray):
-            noise = noise[y : y + height, x : x + width]
-        pixel, place = (int(column), int(row)), place + PIXEL_CENTRE + corner
-        return cls(values, corner, place, value, pixel, clipped, seen, unsmoothed, noise, smoothing_px)
-
-    def crossings(self, isovalue: float) -> Array | Failure:
-        """Give the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
-
-        The isophote is the outer border of the region above t times the peak that holds the peak. Its points lie where
-        it crosses the lines between the centres of neighbouring pixels.
-
-        Parameters
-        ----------
-        isovalue : float
-            t in (0, 1), relative to the smoothed peak.
-
-        Returns
-        -------
-        ndarray, shape (N, 2), or Failure
-            In the frame, px, each point once: where a pixel's value is the level, several of these lines cross at it.
-
-        Raises
-        ------
-        InputError
-            If t is outside (0, 1).
-        """
-        return self.crossings_of([isovalue])[0]
-
-    def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
-        """Give the points of several isophotes (see `crossings`), at little more than the price of one."""
-        found = [self._level_set(t) for t in isovalues]
-        closed = [each for each in found if not isinstance(each, Failure)]
-        if not closed:
-            return [each for each in found if isinstance(each, Failure)]
-        traced = self._crossings_of_sets(closed)
-        points = iter(traced.each(traced.points + self._first_centre))
-        return [each if isinstance(each, Failure) else next(points) for each in found]
-
-    def arc(self, isovalue: float) -> Array:
-        """Give what is to be seen of an isophote that the region's border or the view cuts, shape (N, 2), in no order.
-
-        Points nearer to the cut than 1.5 times the smoothing's width are left out.
-        """
-        return self._crossings_of_sets([self._cut_set(isovalue)]).points + self._first_centre
-
-    def sensitivities(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Sensitivities:
-        """Tell how the points of `crossings`, or of `arc` where cut, move with the patch's values, in the same order.
-
-        Parameters
-        ----------
-        isovalues : sequence of float
-            Of isophotes that were found.
-        cut : sequence of bool
-            Whether each is an arc.
-
-        Returns
-        -------
-        Sensitivities
-            One isophote's after the other's.
-        """
-        found = [self._cut_set(t) if arc else self._level_set(t) for t, arc in zip(isovalues, cut, strict=True)]
-        return self._crossings_of_sets([each for each in found if not isinstance(each, Failure)]).sensitivities
-
-    def _crossings_of_sets(self, sets: list[LevelSet]) -> Crossings:
-        """Give the crossings of level sets; as a rule their points are asked for first, then their sensitivities."""
+    def crossings(self, sets: list[LevelSet]) -> Crossings:
+        """Return where the borders of level sets cross the lines between pixel centres."""
+        # Usually the points are asked for first, then their sensitivities.
         key = tuple(sets)
         if key not in self._crossings:
             self._crossings[key] = crossings(sets)
         return self._crossings[key]
 
-    @property
-    def _first_centre(self) -> Array:
-        """Centre of the region's first pixel, shape (2,), px."""
-        return np.array(self.origin_px) + PIXEL_CENTRE
 
-    def isophote(self, isovalue: float) -> Array | Failure:
-        """Give the same points as `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.
-
-        A point where the border meets itself, a pixel whose value is the level, is passed more than once.
-        """
-        found = self._level_set(isovalue)
-        return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
-
-    def _level_set(self, isovalue: float) -> LevelSet | Failure:
-        if not 0 < isovalue < 1:
-            raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
-        if isovalue not in self._level_sets:
-            found = level_set_around(self.values, self.peak_pixel, isovalue * self.peak_value, self.seen)
-            self._level_sets[isovalue] = found or Failure(
-                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
-            )
-        return self._level_sets[isovalue]
-
-    def _cut_set(self, isovalue: float) -> LevelSet:
-        if not 0 < isovalue < 1:
-            raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
-        if isovalue not in self._cut_sets:
-            margin = max(int(np.ceil(CUT_SIGMAS * self.smoothing_px)), 1)
-            level = isovalue * self.peak_value
-            self._cut_sets[isovalue] = cut_level_set_around(self.values, self.peak_pixel, level, margin, self.seen)
-        return self._cut_sets[isovalue]
-
-    def inside(self, isovalue: float, cut: bool = False) -> Mask:
-        """Tell which of the region's pixels an isophote encloses, shape (h, w).
-
-        Where it does not close all that are seen, or with `cut` those that it encloses together with the cut.
-        """
-        found = self._level_set(isovalue)
-        if isinstance(found, Failure):
-            if cut:
-                return np.asarray(self._cut_set(isovalue).inside[1:-1, 1:-1])
-            return np.ones(self.values.shape, dtype=bool) if self.seen is None else self.seen
-        mask = np.zeros(self.values.shape, dtype=bool)
-        height, width = found.inside.shape
-        x, y = found.corner
-        mask[y : y + height, x : x + width] = found.inside
-        return mask
-
-    def saturated_share(self, isovalue: float) -> float | None:
-        """Give the share of the pixels inside an isophote that are clipped; None where that is not known."""
-        if self.saturated is None:
-            return None
-        inside = self.inside(isovalue)
-        return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
-
-
-def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
-    """Give the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
-    if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
-        return None
-    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
-    if not whole[row, column]:
-        return None
-    labels, _ = ndimage.label(whole, np.ones((3, 3)))
-    plateau = np.asarray(labels == labels[row, column])
-    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX and (plateau & clipped).any() else None
-
-
-def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
-    """Refine a peak's pixel by a parabola along each axis; at the border the pixel itself is kept. Gives (x, y)."""
-    position = [float(column), float(row)]
-    for axis, (index, line) in enumerate(((column, values[row, :]), (row, values[:, column]))):
-        if 0 < index < len(line) - 1:
-            before, here, after = (float(v) for v in line[index - 1 : index + 2])
-            bend = before - 2 * here + after
-            if bend < 0:
-                position[axis] += min(max(0.5 * (before - after) / bend, -0.5), 0.5)
-    return np.array(position)
+def _checked(isovalue: float) -> float:
+    if not 0 < isovalue < 1:
+        raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
+    return isovalue
 
 
 def encloses(points: Array, point: Array) -> bool:
-    """Tell whether a closed polygon, shape (N, 2), encloses a point, shape (2,), by the even-odd rule."""
+    """Return whether a closed polygon, shape (N, 2), encloses a point, shape (2,), by the even-odd rule."""
     x, y = (points - point).T
     crosses = (y[:-1] > 0) != (y[1:] > 0)
     x0, y0, x1, y1 = x[:-1][crosses], y[:-1][crosses], x[1:][crosses], y[1:][crosses]

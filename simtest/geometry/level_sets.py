@@ -1,7 +1,7 @@
 """The region above a level around a pixel, and where its outer border crosses the lines between pixel centres.
 
-These are the points of marching squares, whose contours are the region's border; a fit needs no order among them,
-and without it they are found several times faster than by tracing.
+These are the points of marching squares, whose contours are the region's border. A fit needs no order among them, and
+without it they are found several times faster than by tracing.
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from skimage.measure import find_contours
 
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
+from simtest.geometry.arrays import Array, Image, Index, Mask
 
 LINEAR_INTERPOLATION_PX2 = 1 / 6
-"""Variance that linear interpolation between two pixels adds along their axis, px^2, averaged over the place between.
+"""Variance that linear interpolation between two pixels adds along their axis, px^2, averaged over the gap.
 
-Between neighbours a distance 1 apart it overestimates I by f (1 - f) I'' / 2, on average I'' / 12, as a convolution of
-variance 1/6 would.
+At share f of the way between neighbours it overestimates I by f (1 - f) I'' / 2, on average I'' / 12, as a convolution
+of variance 1/6 does.
 """
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
@@ -40,7 +38,7 @@ class Sensitivities:
     vertical : ndarray of bool, shape (N,)
         Whether the line is vertical; else it is horizontal.
     pixels : ndarray of int, shape (N, 2, 2)
-        Column and row of the line's first and second pixel in the array that the region was found in.
+        Column and row of the line's first and second pixel in the region's array.
     weights : ndarray, shape (N, 2)
         w1 and w2, px per unit of intensity.
     level : ndarray, shape (N,)
@@ -48,7 +46,7 @@ class Sensitivities:
     """
 
     vertical: Mask
-    pixels: npt.NDArray[np.intp]
+    pixels: Index
     weights: Array
     level: Array
 
@@ -57,25 +55,25 @@ class Sensitivities:
 class Crossings:
     """Where the borders of K level sets cross the lines between pixel centres, by linear interpolation.
 
-    One set after the other; of each the points between horizontal neighbours first, row by row, then those between
-    vertical ones. Each point once, though several lines cross a border at a pixel whose value is the level.
+    One set after the other; in each, row by row, first the points between horizontal neighbours, then those between
+    vertical ones. A pixel whose value is the level, where several lines cross the border, counts once.
 
     Parameters
     ----------
     counts : ndarray of int, shape (K,)
         Points of each set.
     first : ndarray of int, shape (N, 2)
-        Column and row of each line's first pixel in the array that the regions were found in.
+        Column and row of each line's first pixel in the regions' array.
     vertical : ndarray of bool, shape (N,)
         Whether the line is vertical; else it is horizontal.
     share : ndarray, shape (N,)
-        How far from the first pixel, px.
+        Distance of the crossing from the first pixel, px.
     rise : ndarray, shape (N,)
         Intensity of the line's second pixel less that of its first.
     """
 
-    counts: npt.NDArray[np.intp]
-    first: npt.NDArray[np.intp]
+    counts: Index
+    first: Index
     vertical: Mask
     share: Array
     rise: Array
@@ -120,8 +118,8 @@ class LevelSet:
     corner : tuple of int
         Column and row of the region's first pixel in the array; -1 where the margin lies outside.
     sound : ndarray of bool, shape (h, w), optional
-        Of a region that something cuts: the pixels far enough from the cut, none of them in the margin. Only lines
-        between these are crossed.
+        For a cut region: the pixels far enough from the cut, none of them in the margin. Only lines between these
+        count.
     """
 
     values: Image | Array
@@ -131,11 +129,11 @@ class LevelSet:
     sound: Mask | None = None
 
     def polygon(self) -> Array:
-        """Give the same points in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
+        """Return the crossings in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
 
-        A pixel whose value is the level is passed once for each time that the border comes to it.
+        A pixel whose value is the level is passed each time that the border comes to it.
         """
-        # Traced on the region itself: on the values, contours that meet at such a pixel would fall apart there.
+        # Traced on the region itself: on the values, contours that meet at such a pixel would separate there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)
         x, y = self.corner
@@ -147,7 +145,7 @@ class LevelSet:
 
 
 def crossings(sets: Sequence[LevelSet]) -> Crossings:
-    """Give the crossings of level sets of one array, all at once: a call for each would cost more than the work.
+    """Compute the crossings of level sets of one array, all at once: a call for each would cost more than the work.
 
     Parameters
     ----------
@@ -159,22 +157,24 @@ def crossings(sets: Sequence[LevelSet]) -> Crossings:
     Crossings
         In the order of the sets.
     """
+    # candidates: lines with one end inside, as flat indices into (set, direction, row, column)
     (x, y), crossed = _crossed_lines(sets)
     height, width = crossed.shape[2:]
-    places = np.flatnonzero(crossed)
+    indices = np.flatnonzero(crossed)
     # Floor division by one number is several times faster than divmod.
-    rows = places // width
+    rows = indices // width
     planes = rows // height
     number, vertical = planes >> 1, (planes & 1).astype(bool)
-    first = np.array([places - rows * width + x, rows - planes * height + y]).T
-    # A copy of the sets' part of the array alone: it may be that of a whole frame. The margin is never crossed.
+    first = np.array([indices - rows * width + x, rows - planes * height + y]).T
+    # interpolate; only the sets' part of the array is copied, since it may be a whole frame's. The margin is never
+    # crossed.
     part = sets[0].values[max(y, 0) : y + height, max(x, 0) : x + width]
-    place = (first[:, 1] - max(y, 0)) * part.shape[1] + first[:, 0] - max(x, 0)
+    flat = (first[:, 1] - max(y, 0)) * part.shape[1] + first[:, 0] - max(x, 0)
     values = part.ravel()
-    start, end = values.take([place, place + np.where(vertical, part.shape[1], 1)]).astype(float)
+    start, end = values.take([flat, flat + np.where(vertical, part.shape[1], 1)]).astype(float)
     rise = end - start
     share = (np.array([each.level for each in sets]).take(number) - start) / rise
-    # Rounding too can put a crossing onto a pixel.
+    # reject repeated crossings at a pixel; rounding too can put one there
     at_pixel = np.abs(share - 0.5) > _AT_PIXEL
     if at_pixel.any():
         along = share[:, None] * np.array([~vertical, vertical]).T
@@ -184,7 +184,7 @@ def crossings(sets: Sequence[LevelSet]) -> Crossings:
 
 
 def _crossed_lines(sets: Sequence[LevelSet]) -> tuple[tuple[int, int], Mask]:
-    """Tell which lines right and down from the pixels of a box are crossed, shape (K, 2, h, w), and the box' corner."""
+    """Return which lines right and down from the pixels of a box are crossed, (K, 2, h, w), and the box's corner."""
     x, y = (min(each.corner[axis] for each in sets) for axis in (0, 1))
     width, height = (max(each.corner[axis] + each.inside.shape[1 - axis] for each in sets) for axis in (0, 1))
     inside = np.zeros((len(sets), height - y, width - x), dtype=bool)
@@ -222,16 +222,16 @@ def level_set_around(
     Returns
     -------
     LevelSet or None
-        None where the region reaches the array's border or a pixel that is not seen, across a corner too: its own
-        border is not closed then.
+        None where the region touches the array's border or, across a corner too, an unseen pixel: its border is open.
     """
     marks = (values > level if seen is None else (values > level) & seen).view(np.uint8)
-    # Low values are connected across corners, high ones are not, as in marching squares for an ambiguous cell.
+    # High values are 4-connected, low ones 8-connected: marching squares' choice for an ambiguous cell.
     _, _, _, (x, y, width, height) = cv2.floodFill(marks, None, pixel, _REGION, flags=4)
     rows, columns = marks.shape
     if x == 0 or y == 0 or x + width == columns or y + height == rows:
         return None
     box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
+    # reject what touches unseen pixels, then fill the holes
     around = (marks[box] == _REGION).view(np.uint8)
     if seen is not None and (cv2.dilate(around, _NEIGHBOURS) > 0)[~seen[box]].any():
         return None
@@ -242,7 +242,7 @@ def level_set_around(
 def cut_level_set_around(
     values: Image | Array, pixel: tuple[int, int], level: float, margin_px: int, seen: Mask | None = None
 ) -> LevelSet:
-    """Find the region above a level that holds a pixel, where the array's border or the view cuts it.
+    """Find the region above a level that holds a pixel where the array's border or the view cuts it.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def cut_level_set_around(
     level : float
         The level.
     margin_px : int
-        Where the border is crossed nearer than this to the cut, smoothing has drawn it aside: it is left out.
+        Crossings nearer than this to the cut are left out: smoothing has moved the border there.
     seen : ndarray of bool, shape (H, W), optional
         Where the values are known; default everywhere.
 
@@ -273,9 +273,9 @@ def cut_level_set_around(
 
 
 def _first_of_each(points: Array, suspects: Mask) -> Mask:
-    """Tell which points, shape (N, 2), are the first of equal ones among the suspects."""
-    places = np.flatnonzero(suspects)
-    _, first = np.unique(points[places], axis=0, return_index=True)
+    """Return a mask that drops repeated points, shape (N, 2), among the suspects."""
+    indices = np.flatnonzero(suspects)
+    _, first = np.unique(points[indices], axis=0, return_index=True)
     keep = ~suspects
-    keep[places[first]] = True
+    keep[indices[first]] = True
     return np.asarray(keep)

@@ -1,4 +1,4 @@
-"""The normals that a noisy isophote allows, taken as a circle: a region about both members of the pose."""
+"""The normals for which a noisy isophote is the image of a circle: a region about both members of the pose."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from simtest.geometry.arrays import Array, Mask
 from simtest.geometry.vectors import tangent_basis
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 CONFIDENCE = 0.95
 
@@ -22,9 +20,9 @@ class PoseRegion:
 
         g(N) = (u^T C u - v^T C v, 2 u^T C v) = 0,
 
-    two conditions on the cone's five parameters, linear in them; the other three are the circle's place and size. So
-    with Gaussian noise on the cone g^T cov(g)^-1 g at the true N is chi-squared with two degrees of freedom, exactly,
-    also where N+ and N- meet and the normals' own errors are not Gaussian.
+    two conditions that are linear in the cone's five parameters; the other three are the circle's position and size.
+    With Gaussian noise on the cone, g^T cov(g)^-1 g at the true N is therefore exactly chi-squared with two degrees of
+    freedom, also where N+ and N- meet and the errors of the normals are not Gaussian.
 
     Parameters
     ----------
@@ -41,7 +39,7 @@ class PoseRegion:
     covariance: Array
 
     def statistic(self, normals: npt.ArrayLike) -> Array:
-        """Give the squared Mahalanobis distance of the cone from those of circles across some normals.
+        """Compute the squared Mahalanobis distance of the cone from the cones of circles perpendicular to some normals.
 
         Parameters
         ----------
@@ -53,6 +51,7 @@ class PoseRegion:
         ndarray, shape (...)
             0 at N+ and N-.
         """
+        # g = G (a, b, c, d, e, -1) in the basis of each normal
         N = np.asarray(normals, dtype=float)
         local = N.reshape(-1, 3) @ self.frame.T
         u, v = tangent_basis(local)
@@ -62,12 +61,12 @@ class PoseRegion:
         return np.asarray(np.einsum("ni,ni->n", g, np.linalg.solve(spread, g[..., None])[..., 0]).reshape(N.shape[:-1]))
 
     def contains(self, normals: npt.ArrayLike, confidence: float = CONFIDENCE) -> Mask:
-        """Tell which normals, shape (..., 3), lie in the region that holds the truth with some confidence."""
+        """Return which normals, shape (..., 3), lie in the region that holds the truth with a given confidence."""
         return np.asarray(self.statistic(normals) <= stats.chi2.ppf(confidence, 2))
 
 
 def _products(u: Array, v: Array) -> Array:
-    """Give u^T C v as weights of the conic's five parameters and of its constant -1, shape (N, 6)."""
+    """Return u^T C v as weights of the conic's five parameters and of its constant -1, shape (N, 6)."""
     (ux, uy, uz), (vx, vy, vz) = u.T, v.T
     parts = (ux * vx, (ux * vy + uy * vx) / 2, uy * vy, (ux * vz + uz * vx) / 2, (uy * vz + uz * vy) / 2, uz * vz)
     return np.stack(parts, axis=1)

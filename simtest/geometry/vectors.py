@@ -1,21 +1,20 @@
 """Unit vectors: tangent bases and the difference of two directions."""
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from simtest.geometry.arrays import Array
 
 
 def angle_deg(first: Array, second: Array) -> Array:
-    """Give the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
+    """Return the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
     cross = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """Give two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
+    """Return two unit vectors that with each unit normal, shape (N, 3), form a right-handed orthonormal basis.
 
-    The branch-free construction of Duff et al. 2017 (J. Comput. Graph. Tech. 6(1)). Covariances of normals are given
+    The branch-free construction of Duff et al. 2017 (J. Comput. Graph. Tech. 6(1)). Covariances of normals are stated
     in this basis.
     """
     x, y, z = normal[:, 0], normal[:, 1], normal[:, 2]
@@ -27,8 +26,13 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
     return first, second
 
 
+def basis_across(normal: Array) -> Array:
+    """Return the tangent basis of one unit normal, shape (3,), as rows, shape (2, 3)."""
+    return np.concatenate(tangent_basis(normal[None]))
+
+
 def tangent_coordinates(normal: Array, other: Array) -> Array:
-    """Give the rotation from one unit vector to another as a vector of the first one's tangent basis, rad.
+    """Return the rotation from one unit vector to another as a vector of the first one's tangent basis, rad.
 
     Parameters
     ----------
@@ -40,8 +44,8 @@ def tangent_coordinates(normal: Array, other: Array) -> Array:
     ndarray, shape (2,)
         Its length is the angle between the two.
     """
-    first, second = (basis[0] for basis in tangent_basis(normal[None]))
+    first, second = basis_across(normal)
     across = np.array([first @ other, second @ other])
     sine = float(np.hypot(*across))
     angle = float(np.arctan2(sine, normal @ other))
-    return across * (angle / sine) if sine > 0 else across
+    return across * (angle / sine) if sine > 0 else across  # 0 stays 0

@@ -1,5 +1,8 @@
-"""The estimator that differentiates the renderer; no other estimator may import it."""
+"""The estimator that differentiates the renderer; no other estimator may import it.
 
-from simtest.inverse.estimator import inverse_rendering
+`estimator` fits a `rendered_quadric`, whose radiance and derivatives come from `patch_renderer`.
+"""
 
-__all__ = ["inverse_rendering"]
+from simtest.inverse.estimator import InverseRendering, inverse_rendering
+
+__all__ = ["InverseRendering", "inverse_rendering"]

@@ -1,42 +1,40 @@
 """Radiance of a quadric patch and its derivatives, by Mitsuba's BSDFs and Dr.Jit's forward mode.
 
-Mitsuba cannot differentiate its intersections of rays with analytic shapes. Here the patch is a quadratic equation a
-ray, written in Dr.Jit, and its surface points are handed to Mitsuba's BSDF, with everything that hangs on the patch's
-parameters differentiated. Each parameter has a copy of the pixels of its own, in which it alone moves, so that one pass
-of one kernel gives the intensities and all derivatives; another highlight compiles nothing. Inter-reflections of the
+Mitsuba cannot differentiate its intersections of rays with analytic shapes. Here each ray solves a quadratic equation,
+written in Dr.Jit, and the surface points are passed to Mitsuba's BSDF; everything that depends on the patch's
+parameters is differentiated. Each parameter has its own copy of the pixels, in which it alone varies, so that one pass
+of one kernel computes the intensities and all derivatives; another highlight compiles nothing. Inter-reflections of the
 patch with itself are added as a sampled term that follows scale and base.
 """
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from simtest.geometry import Array
 from simtest.rendering import backend, phong
 from simtest.rendering.direct import Material
 
 if TYPE_CHECKING:
-    from simtest.inverse.patch import RenderedQuadric
-
-Array = npt.NDArray[np.float64]
+    from simtest.inverse.rendered_quadric import RenderedQuadric
 
 PASSING = 1e-6
-"""Share of the squared slope that stands in for the discriminant where a ray passes the quadric by."""
+"""Where a ray misses the quadric, this share of the squared slope replaces the discriminant."""
 
 SAME_HIT = 1e-3
-"""Share of the distance by which a blocker stands before a point at least."""
+"""A blocker stands before a point by at least this share of the distance."""
 
 FLAT = 1e-6
 """Added to tr(K^2), which is 0 on a plane."""
 
 REACH = 1.0
-"""Half the side of the patch, over the distance, that sends light back to itself; its border is not differentiated."""
+"""Half side, over the distance, of the patch that lights itself; its border is not differentiated."""
 
 LOG_SCALE = 5
-"""Place of the log scale among the parameters."""
+"""Index of the log scale among the parameters."""
 
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
-"""Steps of the R2 sequence: evenly spread points of the unit square, the same for every pixel and every evaluation."""
+"""Steps of the R2 sequence, evenly spread points of the unit square; the same for every pixel and evaluation."""
 
 
 class PatchRenderer:
@@ -49,7 +47,7 @@ class PatchRenderer:
     path_depth : int
         2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself.
     samples : int
-        Paths a pixel, where there are inter-reflections.
+        Paths per pixel, where there are inter-reflections.
     variant : str, optional
         Mitsuba variant.
     """
@@ -60,20 +58,20 @@ class PatchRenderer:
         self.mi, self.count, self.depth = mi, len(rays), path_depth
         self.samples = samples
         self._rays = np.ascontiguousarray(rays, dtype=np.float32)
-        # Lobe and base of unit strength: what they are scaled by is differentiated outside of the BSDF.
+        # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
         self._bsdf = mi.load_dict(
             {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
         )
 
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
-        """Give intensities and their derivatives by the parameters that are kept.
+        """Compute intensities and their derivatives by the parameters that are kept.
 
         Parameters
         ----------
         patch : RenderedQuadric
-            At some values of its parameters.
+            The patch at the current parameters.
         kept : list of bool
-            Of the eight: s (2), stretch (3), log scale, log n, base.
+            For each of the eight: s (2), stretch (3), log scale, log n, base.
 
         Returns
         -------
@@ -81,7 +79,7 @@ class PatchRenderer:
         derivatives : ndarray, shape (m, p)
         """
         mi, columns, lanes = self.mi, int(sum(kept)), len(self._rays)
-        # A copy of all pixels for each parameter.
+        # lanes: a copy of all pixels for each parameter
         rays = mi.Vector3f(np.tile(self._rays.T, (1, columns)))
         which = self._lanes(lanes * columns) // self._opaque(lanes, mi.UInt32)
         direct = _Surface(self, patch, self._parameters(patch, kept, which)).radiance(rays)
@@ -89,17 +87,17 @@ class PatchRenderer:
         intensity, J = image[0], slopes.T
         if self.depth > 2:
             intensity, J = self._with_bounces(patch, kept, intensity, J)
-        # Mitsuba's calls of any BSDF trace all that exist: this one must not hold the copies on.
+        # Mitsuba's virtual calls trace every existing BSDF: this one must not keep the copies alive.
         self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
         return intensity, J
 
     def _with_bounces(
         self, patch: "RenderedQuadric", kept: list[bool], intensity: Array, J: Array
     ) -> tuple[Array, Array]:
-        """Add what the patch sends back to itself, and its derivatives by log scale and base.
+        """Add the light that the patch sends to itself, with its derivatives by log scale and base.
 
-        By place and shape it is not differentiated: its paths are drawn, and light that a concave patch gathers makes
-        their derivatives noise, while the intensities themselves hardly move.
+        It is not differentiated by position and shape: where a concave patch focuses light, the derivatives of sampled
+        paths are noise, while the intensities hardly move.
         """
         rays = self.mi.Vector3f(np.ascontiguousarray(np.repeat(self._rays, self.samples, axis=0).T))
         by_base = [False] * (len(kept) - 1) + [kept[-1]]
@@ -113,22 +111,22 @@ class PatchRenderer:
         return intensity + value, J
 
     def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
-        """Give the eight parameters; of those that are kept, each moves in the lanes of its own number."""
+        """Return the eight parameters; each kept one has gradient 1 in its own copy of the pixels."""
         import drjit as dr
 
-        mi, made, place = self.mi, [], 0
+        mi, made, lane = self.mi, [], 0
         values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.log_exponent, patch.base]
         for value, is_kept in zip(values, kept, strict=True):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
             if is_kept:
                 dr.enable_grad(parameter)
-                dr.set_grad(parameter, dr.select(which == place, mi.Float(1), mi.Float(0)))
-                place += 1
+                dr.set_grad(parameter, dr.select(which == lane, mi.Float(1), mi.Float(0)))
+                lane += 1
             made.append(parameter)
         return made
 
     def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
-        """Give the values of all lanes and their derivatives by whatever moves in each."""
+        """Return the values of all lanes and their derivatives by the parameter that varies in each."""
         import drjit as dr
 
         slope = dr.forward_to(radiance) if dr.grad_enabled(radiance) else dr.zeros(type(radiance), dr.width(radiance))
@@ -136,12 +134,13 @@ class PatchRenderer:
         return np.array(radiance, dtype=np.float64), np.array(slope, dtype=np.float64)
 
     def _lanes(self, width: int) -> Any:
+        """Return the lane numbers."""
         import drjit as dr
 
         return dr.arange(self.mi.UInt32, width)
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
-        """Give a value that the kernel reads, and that does not compile it anew."""
+        """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
         import drjit as dr
 
         held = (kind or self.mi.Float)(value)
@@ -149,13 +148,14 @@ class PatchRenderer:
         return held
 
     def _bounced(self, surface: "_Surface", rays: Any) -> Any:
-        """Give the radiance along rays from the camera that took more than one bounce."""
+        """Return the radiance along rays from the camera after more than one bounce."""
         import drjit as dr
 
         mi = self.mi
         si = surface.first_hit(rays)
         radiance, weight = mi.Float(0), mi.Float(1)
         for bounce in range(self.depth - 2):
+            # sample the BSDF, go on to the next point, and add the direct light there
             first, second = self._numbers(bounce, dr.width(rays))
             local, density = surface.sample(si, first, second)
             weight *= dr.select(density > 0, surface.reflected(si, local) / dr.maximum(density, 1e-6), 0)
@@ -165,12 +165,12 @@ class PatchRenderer:
         return radiance * dr.exp(surface.log_scale)
 
     def _numbers(self, bounce: int, width: int) -> tuple[Any, Any]:
-        """Give the random numbers of a bounce: of each path its own, the same at every evaluation."""
+        """Return the random numbers of a bounce: different for each path, the same at every evaluation."""
         import drjit as dr
 
         mi, lane, samples = self.mi, self._lanes(width), self._opaque(self.samples, self.mi.UInt32)
         number = mi.Float(lane % samples)
-        # Each pixel shifts the sequence by an amount of its own.
+        # Each pixel shifts the sequence by its own amount.
         pixel = lane // samples
         shift = [mi.Float(mi.sample_tea_32(pixel, 3 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
         u, v = (number * step + offset for step, offset in zip(GOLDEN, shift[:2], strict=True))
@@ -179,7 +179,7 @@ class PatchRenderer:
 
 
 class _Surface:
-    """The patch as the kernel sees it: all that hangs on its parameters."""
+    """The patch as the kernel sees it: everything that depends on its parameters."""
 
     def __init__(self, renderer: PatchRenderer, patch: "RenderedQuadric", parameters: list[Any]) -> None:
         import drjit as dr
@@ -190,6 +190,7 @@ class _Surface:
         shrink = dr.exp(-log_exponent / 2)
         self.K = (first * shrink - 1, both * shrink, second * shrink - 1)
         self.distance = opaque(patch.distance)
+        # q = tr(K^3) / tr(K^2), times the roundness
         k11, k12, k22 = self.K
         cubes, squares = k11**3 + k22**3 + 3 * k12**2 * (k11 + k22), k11**2 + 2 * k12**2 + k22**2
         self.bulge = opaque(patch.roundness) * cubes / (squares + FLAT) / self.distance
@@ -199,6 +200,7 @@ class _Surface:
             dr.make_opaque(held)
             return held
 
+        # frame at the BP: its normal bisects the directions to light and camera
         across, along = (vector(v) for v in patch.turning)
         sightline = dr.normalize(vector(patch.sightline) + by_first * across + by_second * along)
         self.foot = self.distance * sightline
@@ -213,24 +215,24 @@ class _Surface:
         self.material = Material(bsdf, None)
 
     def radiance(self, rays: Any) -> Any:
-        """Give the radiance along rays from the camera that comes straight from the lights."""
+        """Return the radiance along rays from the camera that comes straight from the lights."""
         import drjit as dr
 
         return self.direct(self.first_hit(rays)) * dr.exp(self.log_scale)
 
     def local(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Give a vector's parts along e, f and N."""
+        """Return a vector's components along e, f and N."""
         import drjit as dr
 
         return dr.dot(self.e, vector), dr.dot(self.f, vector), dr.dot(self.normal, vector)
 
     def bent(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Give K (x, y)^T / d."""
+        """Return K (x, y)^T / d."""
         k11, k12, k22 = self.K
         return (k11 * x + k12 * y) / self.distance, (k12 * x + k22 * y) / self.distance
 
     def first_hit(self, direction: Any) -> Any:
-        """Give the first surface points on rays from the camera."""
+        """Return the first surface points on rays from the camera."""
         import drjit as dr
 
         # (x, y, z) = t r - p solves z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0.
@@ -241,20 +243,20 @@ class _Surface:
         q = self.bulge
         a, b = (rx * bx + ry * by + q * rz * rz) / 2, rz - (px * bx + py * by + q * pz * rz)
         c = (px * cx + py * cy + q * pz * pz) / 2 - pz
-        # Where a ray passes the quadric by, its closest approach stands in.
+        # Where a ray misses the quadric, its closest approach is used.
         root = dr.sqrt(dr.maximum(b * b - 4 * a * c, PASSING * b * b))
         t = 2 * c / (root - b)
         return self.interaction(direction, t * direction, t)
 
     def next_hit(self, si: Any, direction: Any) -> tuple[Any, Any]:
-        """Give the surface points on rays from surface points, and whether there are any, facing the ray."""
+        """Return the next surface points on rays from surface points, and whether there are any, facing the ray."""
         import drjit as dr
 
         x, y, z = self.local(si.p - self.foot)
         wx, wy, wz = self.local(direction)
         bx, by = self.bent(wx, wy)
         a, b = (wx * bx + wy * by + self.bulge * wz * wz) / 2, wz + x * bx + y * by + self.bulge * z * wz
-        # One root is the point itself.
+        # One root is the starting point, the other the next hit.
         found = (a * b < 0) & (dr.abs(a) > 1e-9)
         t = dr.select(found, -b / dr.select(found, a, 1), 1)
         hit = self.interaction(direction, si.p + t * direction, t)
@@ -262,7 +264,7 @@ class _Surface:
         return hit, found & near & (dr.dot(hit.n, direction) < 0)
 
     def interaction(self, direction: Any, position: Any, reach: Any) -> Any:
-        """Give Mitsuba's surface interaction at surface points."""
+        """Return Mitsuba's surface interaction at surface points."""
         import drjit as dr
 
         mi = self.mi
@@ -276,7 +278,7 @@ class _Surface:
         return si
 
     def direct(self, si: Any, lit: Any = True) -> Any:
-        """Give the radiance off surface points that comes straight from the lights, per unit of their power."""
+        """Return the radiance of surface points lit straight by the lights, per unit of their power."""
         import drjit as dr
 
         mi, radiance = self.mi, self.mi.Float(0)
@@ -288,7 +290,7 @@ class _Surface:
         return radiance
 
     def reflected(self, si: Any, local: Any) -> Any:
-        """Give f cos(theta) of lobe and base together."""
+        """Return f cos(theta) of lobe and base together."""
         import drjit as dr
 
         lobe, base = self.material.parts(self.mi, si, local, self.mi.Bool(True))
@@ -304,7 +306,7 @@ class _Surface:
             return mi.Vector3f(dr.detach(bs.wo)), mi.Float(dr.detach(bs.pdf))
 
     def is_seen(self, si: Any) -> Any:
-        """Tell whether the first light reaches surface points past the patch itself."""
+        """Return whether the first light reaches surface points past the patch itself."""
         import drjit as dr
 
         with dr.suspend_grad():

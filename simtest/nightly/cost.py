@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import polars as pl
 
-from simtest.calibration import Priors
+from simtest.calibration import Priors, exactly
 from simtest.errors import Failure
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
@@ -61,12 +61,12 @@ def reference_kernel() -> Piece:
 def estimator_pieces() -> dict[str, Piece]:
     """Give estimators at work on one highlight."""
     patch, camera = highlight()
-    priors = Priors(lobe_curvature=200.0)
+    priors = Priors(lobe_curvature=exactly(200.0))
     return {
-        "circle_pose": lambda: circle_pose(anew(patch), camera),
-        "cone_axis": lambda: cone_axis(anew(patch), camera),
-        "curved": lambda: curved(anew(patch), camera, priors),
-        "photometric": lambda: photometric(anew(patch), camera),
+        "circle_pose": lambda: circle_pose.estimate(anew(patch), camera),
+        "cone_axis": lambda: cone_axis.estimate(anew(patch), camera),
+        "curved": lambda: curved.estimate(anew(patch), camera, priors),
+        "photometric": lambda: photometric.estimate(anew(patch), camera),
     }
 
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Response
+from simtest.calibration import Calibration, Frame, Response
 from simtest.detection.blobs import Highlight
 from simtest.detection.colour import ColourDetection, detect_colour
 from simtest.detection.view_mask import View, find_view
-from simtest.estimators import Estimate, Estimator, load_estimators
+from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, FrameCut, Specularity, check_frame, run_estimators
 
 Image = npt.NDArray[np.float32]
@@ -59,14 +59,14 @@ class ColourReconstruction:
     ----------
     specularities : list of Specularity
         Those reconstructed, the brightest first.
-    highlights : list of Highlight
-        What the detection says of each of them.
+    highlights : list of Highlight or None
+        The detected highlight of each; None for an estimate that looks elsewhere.
     found : PictureDetection
         All that was detected.
     """
 
     specularities: list[Specularity]
-    highlights: list[Highlight]
+    highlights: list[Highlight | None]
     found: PictureDetection
 
 
@@ -108,7 +108,7 @@ def _linear(picture: Image, response: Response) -> Image:
 def reconstruct_colour(
     picture: npt.ArrayLike,
     calibration: Calibration,
-    estimators: Sequence[str] | Mapping[str, Estimator] = DEFAULT_ESTIMATORS,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator] = DEFAULT_ESTIMATORS,
     smoothing_px: float = SMOOTHING_PX,
     isolated: bool = True,
 ) -> ColourReconstruction:
@@ -142,7 +142,7 @@ def reconstruct_colour(
     """
     camera = calibration.camera
     image = check_frame(picture, camera)
-    chosen = estimators if isinstance(estimators, Mapping) else load_estimators(estimators)
+    chosen = load_estimators(estimators)
     level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
     found = detect_in_picture(image, calibration.response, level, camera.seen)
     # Light is split in linear values, which have no response of their own; falloff is divided away afterwards.
@@ -151,12 +151,15 @@ def reconstruct_colour(
     cut = FrameCut.of(corrected, plain, smoothing_px, found.view.seen)
     highlights = found.detection.isolated if isolated else found.detection.highlights
     patches = [(h.region, cut.patch(h.region.box, h.region.peak)) for h in highlights]
-    made = run_estimators(patches, chosen, calibration, corrected.limited)
+    frame = Frame(image, calibration, smoothing_px, found.view.seen, found.detection.light.specular)
+    made = run_estimators(patches, chosen, frame, corrected.limited)
     specularities = [
         _flagged_small(spot) if _radius_px(highlight) < SMALL_RADIUS * smoothing_px else spot
-        for spot, highlight in zip(made, highlights, strict=True)
+        for spot, highlight in zip(made[: len(highlights)], highlights, strict=True)
     ]
-    return ColourReconstruction(specularities, list(highlights), found)
+    # Estimates of a `FrameEstimator` that no patch takes have no highlight.
+    undetected = made[len(highlights) :]
+    return ColourReconstruction(specularities + undetected, [*highlights, *[None] * len(undetected)], found)
 
 
 def _radius_px(highlight: Highlight) -> float:

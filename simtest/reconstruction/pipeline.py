@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, CorrectedFrame
+from simtest.calibration import Calibration, CorrectedFrame, Frame
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
-from simtest.errors import Failure, InputError
-from simtest.estimators import Estimate, Estimator, load_estimators
-from simtest.estimators.execution_guard import run_each
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import AnyEstimator, Estimate, load_estimators
+from simtest.estimators.dispatch import run_in_frame
 from simtest.geometry import Camera, Patch, smooth
 from simtest.runtime.resources import shown
 
@@ -46,7 +46,7 @@ class Specularity:
 def reconstruct(
     frame: npt.ArrayLike,
     camera: Camera | Calibration,
-    estimators: Sequence[str] | Mapping[str, Estimator] = DEFAULT_ESTIMATORS,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator] = DEFAULT_ESTIMATORS,
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float = DEFAULT_SMOOTHING_PX,
     isolated: bool = True,
@@ -92,12 +92,12 @@ def reconstruct(
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
     roi = None if roi is None else _check_roi(roi)
-    chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
+    chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
     frame_cut = FrameCut.of(corrected, calibration, smoothing_px)
     if roi is not None:
         patch = frame_cut.patch(roi)
         peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
-        found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
+        found = [(Region(roi, (peak[0], peak[1]), None), patch)]
     else:
         noise = frame_cut.noise
         regions = detect(frame_cut.smoothed, noise, isolated, view.seen)
@@ -105,7 +105,7 @@ def reconstruct(
         if isolated:
             left, flat = _noise_left(smoothing_px), flat_pixels(image)
             found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
-    return run_estimators(found, chosen, calibration, corrected.limited)
+    return run_estimators(found, chosen, Frame(image, calibration, smoothing_px), corrected.limited)
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class FrameCut:
 
 def run_estimators(
     found: Sequence[tuple[Region, Patch | Failure]],
-    estimators: Mapping[str, Estimator],
-    calibration: Calibration,
+    estimators: Mapping[str, AnyEstimator],
+    frame: Frame,
     limited: Mask | None = None,
 ) -> list[Specularity]:
     """Run estimators on regions of interest.
@@ -163,27 +163,36 @@ def run_estimators(
         Regions with their patches.
     estimators : mapping
         Estimator by name.
-    calibration : Calibration
-        Camera, and what is known beside the picture.
+    frame : Frame
+        The frame that the patches are cut from, with its calibration.
     limited : ndarray of bool, shape (H, W), optional
         Where too little light is left for the whole correction (`CorrectedFrame.limited`).
 
     Returns
     -------
     list of Specularity
-        In the same order.
+        In the same order; then one for each estimate of a `FrameEstimator` that no patch takes.
     """
     peaks = [(r.peak[0] + PIXEL_CENTRE, r.peak[1] + PIXEL_CENTRE) for r, _ in found]
-    # A region that was given stands for itself.
-    known = [not np.isnan(region.contrast) for region, _ in found]
+    # A user's region may overlap detected peaks, so it gets no list of neighbours.
+    known = [region.contrast is not None for region, _ in found]
     patches = [
         _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
     ]
-    made = {name: run_each(each, patches, calibration.camera, calibration.priors) for name, each in estimators.items()}
-    return [
-        Specularity(region, patch, {name: _flagged(results[i], patch, limited) for name, results in made.items()})
+    made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
+    detected = [
+        Specularity(region, patch, {name: _flagged(made[name].of_patches[i], patch, limited) for name in made})
         for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))
     ]
+    return detected + [_undetected(name, each, frame) for name in made for each in made[name].elsewhere]
+
+
+def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
+    """Return the specularity of an estimate that no patch takes: one pixel, and no patch."""
+    height, width = frame.encoded.shape[:2]
+    x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
+    no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
+    return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
 
 
 def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:

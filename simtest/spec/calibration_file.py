@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, NoiseModel, Priors, Response
+from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.falloff import CosineProfile, Profile
 from simtest.spec.ranges import Coordinate, Millimetres
@@ -71,9 +71,10 @@ class CalibrationSpec(Spec):
 
     def priors(self) -> Priors:
         """Give what estimators are told of lights, distance and lobe."""
-        exponent = self.surface.phong_exponent
-        lobe = None if exponent is None else PhongReflectance(exponent=exponent).lobe_curvature
-        return Priors(self.rig.lights_mm, self.rig.distance_mm, self.rig.distance_sd_mm, lobe)
+        rig, exponent = self.rig, self.surface.phong_exponent
+        distance = None if rig.distance_mm is None else Normal(rig.distance_mm, rig.distance_sd_mm)
+        lobe = None if exponent is None else exactly(PhongReflectance(exponent=exponent).lobe_curvature)
+        return Priors(rig.lights_mm, distance, lobe)
 
 
 def load_calibration(path: str | Path) -> Calibration:

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, NoiseModel, Priors, Response
+from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import CameraSpec
@@ -91,11 +91,10 @@ class Scene(Spec):
             told = distance_mm * (1 + self.known.distance_error)
         lobe = None
         if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
-            lobe = self.reflectance.lobe_curvature
+            lobe = exactly(self.reflectance.lobe_curvature)
         return Priors(
             tuple(light.place_mm for light in self.rig.lights) if self.known.lights else (),
-            told,
-            0.0 if told is None else told * self.known.distance_sd,
+            None if told is None else Normal(told, told * self.known.distance_sd),
             lobe,
         )
 

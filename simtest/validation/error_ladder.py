@@ -10,13 +10,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import NO_PRIORS
 from simtest.conventions import CIRCLE_POSE_ISOVALUE, CONE_AXIS_ISOVALUES, DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Estimator
 from simtest.geometry import Camera, CirclePose, Patch
-from simtest.geometry.circle_pose import circle_pose as pose_of_cone
+from simtest.geometry.circle_from_cone import circle_pose as pose_of_cone
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.seeds import Stage, generator
@@ -145,7 +146,7 @@ class ExactPatch(Patch):
     def of(cls, patch: Patch, scene: ClosedScene) -> "ExactPatch":
         """Give a patch's pixels with the exact contours and peak of a scene."""
         held = {field.name: getattr(patch, field.name) for field in fields(Patch) if field.init}
-        fresh = {"_level_sets": {}, "_cut_sets": {}, "peak_px": CAMERA.project(scene.sightline), "noise": None}
+        fresh = {"peak_px": CAMERA.project(scene.sightline), "noise": None}
         return cls(**(held | fresh), scene=scene)
 
 
@@ -153,7 +154,7 @@ class ExactPatch(Patch):
 class _Ladder:
     """An estimator with its last stage, which takes poses to candidates, shape (K, 3)."""
 
-    whole: Callable[[Patch, Camera], Estimate | Failure]
+    whole: Estimator
     isovalues: tuple[float, ...]
     last: Callable[[Sequence[CirclePose]], Array]
 
@@ -243,7 +244,7 @@ def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung
     for name, estimator in ESTIMATORS.items():
         steps: tuple[list[Array | None], ...] = (
             [found[name] for found in noisy], [smoothed[name]], [sharp[name]],
-            [None if exact is None else _candidates(estimator.whole(exact, CAMERA))],
+            [None if exact is None else _candidates(estimator.whole.estimate(exact, CAMERA, NO_PRIORS))],
             [_of_cones(estimator, scene)], [scene.normal()[None]],
         )  # fmt: skip
         for rung, candidates in zip(RUNGS, steps, strict=True):

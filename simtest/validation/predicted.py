@@ -94,7 +94,7 @@ def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: TrueHighlight, 
     told = scene.calibration(highlight.distance).priors.distance_mm
     if told is None or len(scene.rig.lights) > 1:
         return None
-    return float(np.degrees(laws.bisector_residual(highlight.position, light, told / highlight.distance - 1)))
+    return float(np.degrees(laws.bisector_residual(highlight.position, light, told.mean / highlight.distance - 1)))
 
 
 def axis_ratio_seen(scene: Scene, estimate: Estimate, truth: JudgedHighlight, smoothing_px: float) -> float | None:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Reason
-from simtest.estimators import Estimator
+from simtest.estimators import AnyEstimator
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import View
@@ -47,7 +47,7 @@ class Realisation:
 
 def realise(
     session: Session, experiment: Experiment, case: Case, number: int, seen: View, drawn: dict[str, Any],
-    estimators: dict[str, Estimator],
+    estimators: dict[str, AnyEstimator],
 ) -> Realisation:  # fmt: skip
     """Make one realisation of a case.
 

@@ -18,7 +18,7 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.registry import distributions
+from simtest.estimators.registry import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -243,7 +243,7 @@ def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str
             "experiment": experiment.model_dump(mode="json"),
             "scenes": [case.data for case in cases],
             "inputs": _inputs(cases),
-            "versions": provenance.versions() | distributions(experiment.estimators),
+            "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
             "source": provenance.source_hash(),
             "variant": variant,
         }

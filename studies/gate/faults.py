@@ -13,9 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from simtest.geometry import ellipse_fit, isophotes, vectors
-from simtest.geometry.circle_pose import _ordered
-from simtest.geometry.isophotes import Patch
+from simtest.geometry import ellipse_fit, gaussian_smoothing, vectors
+from simtest.geometry.circle_from_cone import _ordered
+from simtest.geometry.isophotes import IsophoteTracer
+from simtest.geometry.patch import Patch
 from simtest.rendering import exact_points as exact
 from simtest.rendering.direct import DirectLight
 from simtest.rendering.session import Session
@@ -118,7 +119,9 @@ FAULTS: dict[str, tuple[Mutation, ...]] = {
     ),
     "degree for radian: the metric": (Mutation(vectors.angle_deg, "np.degrees(np.arctan2(", "(np.arctan2("),),
     "isovalue off: traced at 0.9 t": (
-        Mutation(Patch._level_set, "isovalue * self.peak_value", "0.9 * isovalue * self.peak_value"),
+        Mutation(
+            IsophoteTracer.closed, "_checked(isovalue) * self.peak_value", "0.9 * _checked(isovalue) * self.peak_value"
+        ),
     ),
     "noise seed reused": (Mutation(Case.noise_seed, "realisation, Stage.SENSOR", "0, Stage.SENSOR"),),
     "falloff dropped": (
@@ -158,7 +161,7 @@ HARMLESS: dict[str, tuple[Mutation, ...]] = {
         Mutation(ellipse_fit._points, "xy = np.asarray(points, dtype=float)", "xy = np.asarray(points, float)[::-1]"),
     ),
     "smoothing in double precision": (
-        Mutation(isophotes._blurred, _BLUR, _BLUR_TWICE),
+        Mutation(gaussian_smoothing._blurred, _BLUR, _BLUR_TWICE),
     ),
     "light off by 1e-7 of itself": (
         Mutation(

@@ -7,6 +7,7 @@ from skimage.measure import find_contours
 from simtest.geometry import isocurves
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
+from tests import isocurve_formulas as formulas
 
 pytestmark = pytest.mark.render
 
@@ -39,7 +40,7 @@ def contours_on_plane(light, isovalue, tilt):
 def test_colocated_isophote_is_the_inner_circle():
     isovalue = 0.4
     session, points, V, _, contour = contours_on_plane([0.0, 0.0, 0.0], isovalue, tilt=10.0)
-    k = isocurves.kappa(isocurves.cosine_of_isovalue(isovalue, EXPONENT))
+    k = formulas.kappa(formulas.cosine_of_isovalue(isovalue, EXPONENT))
     inner, _ = isocurves.isocurve_radii(k, V[2])
     angle = np.arctan2(*(points - V[:2]).T[::-1])
     circle = V[:2] + inner * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -51,7 +52,7 @@ def test_colocated_isophote_is_the_inner_circle():
 def test_isophote_of_a_distant_light_lies_on_the_quartic():
     isovalue = 0.5
     session, points, V, L, contour = contours_on_plane([6.0, -2.0, 1.0], isovalue, tilt=20.0)
-    tau = isocurves.cosine_of_isovalue(isovalue, EXPONENT)
+    tau = formulas.cosine_of_isovalue(isovalue, EXPONENT)
     assert isocurves.on_isophote_branch(points, L, V).all()
 
     # Distance to the quartic in px: its value over its gradient along the image's axes.

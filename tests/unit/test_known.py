@@ -140,7 +140,7 @@ def test_crossings_move_as_their_sensitivities_say():
     before, bump = patch.crossings(t), change * np.random.default_rng(1).standard_normal(patch.values.shape)
     column, row = patch.peak_pixel
     value = float(patch.values[row, column] + bump[row, column])
-    after = replace(patch, values=patch.values + bump, peak_value=value, _level_sets={}).crossings(t)
+    after = replace(patch, values=patch.values + bump, peak_value=value).crossings(t)
     across = np.where(moved.vertical, 1, 0)
     shift = (after - before)[np.arange(len(before)), across]
     by_pixels = np.sum(moved.weights * bump[moved.pixels[..., 1], moved.pixels[..., 0]], axis=1)

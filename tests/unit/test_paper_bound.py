@@ -5,14 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from simtest.errors import InputError
-from simtest.geometry.isocurves import (
-    brightest_point,
-    cosine_beta,
-    cosine_of_isovalue,
-    isocurve_radii,
-    isophote_radius,
-    kappa,
-)
+from simtest.geometry.isocurves import brightest_point, isocurve_radii, isophote_radius
 from simtest.spec.paper import PaperSetting, paper_from_dict
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.protocol import (
@@ -22,6 +15,7 @@ from simtest.validation.paper.protocol import (
     texture,
     window_centre,
 )
+from tests.isocurve_formulas import cosine_beta, cosine_of_isovalue, kappa
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.geometry.isocurves import cosine_beta
 from simtest.pages import style
 from simtest.report import interactive as plotly_base
 from simtest.report import static as base
@@ -23,6 +22,7 @@ from simtest.report.run_folder import read_run
 from simtest.report.series import line_figures
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
+from tests.isocurve_formulas import cosine_beta
 
 COLOURS = {"circle_pose": "#D55E00", "cone_axis": "#0072B2"}
 

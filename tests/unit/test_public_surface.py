@@ -23,7 +23,7 @@ PUBLIC = {
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.distortion",
     "LabelledFrame": "simtest.simulation.labelled_frame",
-    "Patch": "simtest.geometry.isophotes",
+    "Patch": "simtest.geometry.patch",
     "Reason": "simtest.errors",
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -11,9 +10,9 @@ import numpy.typing as npt
 
 from simtest.detection import estimate_noise
 from simtest.errors import Failure
-from simtest.estimators import Estimate
-from simtest.estimators.circle_pose import circle_poses
-from simtest.estimators.protocol import BatchEstimator
+from simtest.estimators import Estimate, Estimator
+from simtest.estimators.circle_pose import CirclePoseEstimator
+from simtest.estimators.dispatch import run_each
 from simtest.geometry import Patch
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.protocol import (
@@ -63,13 +62,13 @@ class Pipeline:
     setting : PaperSetting
         The setting.
     estimators : mapping, optional
-        Estimator of several patches by name; default circle pose at the setting's isovalue.
+        Estimator by name; default circle pose at the setting's isovalue.
     """
 
-    def __init__(self, setting: PaperSetting, estimators: Mapping[str, BatchEstimator] | None = None) -> None:
+    def __init__(self, setting: PaperSetting, estimators: Mapping[str, Estimator] | None = None) -> None:
         self.setting = setting
-        published: dict[str, BatchEstimator] = {"circle_pose": partial(circle_poses, isovalue=setting.isovalue)}
-        self.estimators = dict(estimators) if estimators else published
+        published = {"circle_pose": CirclePoseEstimator(setting.isovalue, with_region=False)}
+        self.estimators: dict[str, Estimator] = dict(estimators or published)
         self.region = region_of_interest(setting)
         self.outer = _grown(self.region, kernel_radius(setting), setting.size)
         self._overhead = np.array([0.0, 0.0, setting.height])
@@ -93,7 +92,7 @@ class Pipeline:
 
     def reconstruct(self, patches: Sequence[Patch | Failure]) -> dict[str, list[Estimate | Failure]]:
         """Give Estimate or Failure of each region of interest by estimator name."""
-        return {name: estimator(patches, self.setting.camera) for name, estimator in self.estimators.items()}
+        return {name: run_each(each, patches, self.setting.camera) for name, each in self.estimators.items()}
 
     def patch(self, rng: np.random.Generator) -> Patch | Failure:
         """Give the smoothed region of interest of one realisation (see `realise`)."""

@@ -1,17 +1,17 @@
 """Rows of results for realisations of the published protocol."""
 
 import itertools
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from simtest.errors import Failure
-from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.circle_pose import circle_poses
-from simtest.estimators.execution_guard import one_by_one
-from simtest.estimators.photometric import photometric_plane
+from simtest.errors import Failure, InputError
+from simtest.estimators import AnyEstimator, Estimate, Estimator, load_estimators
+from simtest.estimators.circle_pose import CirclePoseEstimator
+from simtest.estimators.photometric import Photometric, photometric_plane
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
@@ -64,13 +64,18 @@ def paper_rows(
 @lru_cache(maxsize=2)
 def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
     """Give the pipeline with estimators by name, circle_pose at the setting's isovalue; the last two are kept."""
-    batched = {name: one_by_one(estimator) for name, estimator in load_estimators(estimators).items()}
-    if "circle_pose" in batched:
-        batched["circle_pose"] = partial(circle_poses, isovalue=setting.isovalue)
-    if "photometric" in batched:
-        # The camera is not at the light: the model is another one.
-        batched["photometric"] = one_by_one(photometric_plane)
-    return Pipeline(setting, batched)
+    loaded = load_estimators(estimators)
+    return Pipeline(setting, {name: _of_protocol(name, each, setting) for name, each in loaded.items()})
+
+
+def _of_protocol(name: str, estimator: AnyEstimator, setting: PaperSetting) -> Estimator:
+    """Return the estimator as the published protocol runs it."""
+    if not isinstance(estimator, Estimator):
+        raise InputError(f"estimator {name!r}: needs a whole frame; the published protocol has one region of interest")
+    if isinstance(estimator, CirclePoseEstimator):
+        return replace(estimator, isovalue=setting.isovalue, with_region=False)
+    # The camera is not at the light: the model is another one.
+    return photometric_plane if isinstance(estimator, Photometric) else estimator
 
 
 def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
-from simtest.geometry.circle_pose import circle_pose
+from simtest.geometry.circle_from_cone import circle_pose
 from simtest.geometry.isocurves import isophote_radius
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_coordinates

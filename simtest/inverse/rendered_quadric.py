@@ -1,26 +1,24 @@
-"""A quadric patch under a highlight: its parameters, and the condition that ties its normal to its place."""
+"""A quadric patch under a highlight: its parameters, and the condition that ties its normal to its position."""
 
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.estimators.bisector import bisect
+from simtest.geometry import Array
 from simtest.inverse.patch_renderer import PatchRenderer
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class RenderedQuadric:
-    """A quadric patch whose radiance the renderer gives, for `simtest.estimators.lobe_fit.fit_lobe`.
+    """A quadric patch with rendered radiance: a model for `simtest.estimators.lobe_fit.fit_lobe`.
 
-    The BP is P0 = d s; its normal N bisects the directions to the highlight's light and to the camera. Beside it the
+    The BP is P0 = d s; its normal N bisects the directions to the highlight's light and to the camera. Around it the
     surface is z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0 along N, K = d S. With q = 0 it is a paraboloid; with
     q = tr(K^3) / tr(K^2) it is a sphere or cylinder where the curvatures are those of one. Parameters: rotation of s
     along `turning` (2), the three of sqrt(n) (I + K) in the basis e, f, log of the scale, then log n and the base where
-    they are open. A highlight's shape is sqrt(n) (I + K) to second order; n beside it moves the intensities little.
+    they are open. To second order a highlight's shape depends on sqrt(n) (I + K) alone, and hardly on n besides.
 
     Parameters
     ----------
@@ -33,9 +31,9 @@ class RenderedQuadric:
     distance : float
         d, mm.
     light : ndarray, shape (3,)
-        The highlight's own, camera frame, mm.
+        The highlight's own light, camera frame, mm.
     lights : ndarray, shape (L, 3)
-        All, camera frame, mm.
+        All lights, camera frame, mm.
     stretch : ndarray, shape (3,)
         sqrt(n) (1 + K11), sqrt(n) K12, sqrt(n) (1 + K22).
     log_scale, log_exponent, base : float
@@ -85,7 +83,8 @@ class RenderedQuadric:
         return np.array([[first - 1, both], [both, second - 1]])
 
     def moved(self, step: Array) -> Self:
-        """Give the patch at parameters that differ by a step."""
+        """Return the patch at parameters that differ by a step."""
+        # The normal follows from s; e is carried along, made perpendicular to the new normal.
         s = self.sightline + step[:2] @ self.turning
         s /= np.linalg.norm(s)
         normal = bisect(self.distance * s, self.light)
@@ -99,7 +98,7 @@ class RenderedQuadric:
         )  # fmt: skip
 
     def evaluate(self) -> tuple[Array, Array]:
-        """Give the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
+        """Return the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
         kept = [True] * 6 + [self.open_exponent, self.open_base]
         intensity, J = self.renderer.radiance(self, kept)
         return intensity, J

@@ -1,8 +1,10 @@
-"""The noise of a frame, from the frame."""
+"""The noise of a frame, estimated from the frame."""
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from simtest.geometry.arrays import Mask
 
 _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 """Difference of two Laplacians: blind to any quadratic image (Immerkaer 1996); its norm is 6."""
@@ -10,15 +12,13 @@ _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 MAD_TO_SIGMA = 1.4826
 
 CLEAR_SIDE_PX = 7
-"""Around a pixel whose noise is looked at, no more than one pixel in a square of this side may be clipped."""
+"""A pixel counts if at most one pixel is clipped in the square of this side around it."""
 
 MIN_CLEAR = 100
-"""Fewer pixels clear of clipped ones tell less of the noise than all pixels do."""
+"""With fewer pixels clear of clipped ones, all pixels are the better sample."""
 
 
-def estimate_noise(
-    frame: npt.ArrayLike, seen: npt.NDArray[np.bool_] | None = None, clipped: npt.NDArray[np.bool_] | None = None
-) -> float:
+def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask | None = None) -> float:
     """Estimate the standard deviation of white noise, robust against edges and highlights.
 
     Parameters
@@ -26,10 +26,10 @@ def estimate_noise(
     frame : array_like, shape (H, W)
         Intensities before smoothing.
     seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the camera's view mask; default all. What lies outside is not the sensor's noise alone.
+        The pixels inside the camera's view mask; default all. Outside it there is more than the sensor's noise.
     clipped : ndarray of bool, shape (H, W), optional
-        Pixels at either end of the sensor's range. Their noise is cut off, on a dark ground by half, so that pixels
-        near them are left out where enough others remain.
+        Pixels at either end of the sensor's range. Their noise is truncated, on a dark ground by half, so pixels near
+        them are left out where enough others remain.
 
     Returns
     -------
@@ -39,7 +39,9 @@ def estimate_noise(
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if min(image.shape) < 3:
         return 0.0
+    # second differences: noise, edges and highlights are left
     response = cv2.filter2D(image, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
+    # reject pixels at the view's border and near clipped ones
     whole = np.ones(response.shape, dtype=bool)
     if seen is not None:
         whole = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
@@ -51,4 +53,5 @@ def estimate_noise(
     response = response[whole]
     if not response.size:
         return 0.0
+    # robust spread
     return float(MAD_TO_SIGMA * np.median(np.abs(response)) / 6.0)

@@ -1,4 +1,4 @@
-"""Circle pose from one conic [F91; MB, section 2.3, step 4] and the axis of the back-projected cone."""
+"""Pose of a circle from the cone of its sightlines [F91; MB, section 2.3, step 4], and the axes of that cone."""
 
 import operator
 from collections.abc import Mapping
@@ -8,13 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
-
-Array = npt.NDArray[np.float64]
+from simtest.geometry.arrays import Array
 
 
 @dataclass(frozen=True)
 class CirclePose:
-    """What a cone of sightlines says about a circle.
+    """The two poses of a circle whose sightlines form a cone.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ class CirclePose:
 
 @dataclass(frozen=True)
 class CirclePoses:
-    """What each of N cones says about a circle (see `CirclePose`).
+    """The poses of the circles of N cones (see `CirclePose`).
 
     Parameters
     ----------
@@ -45,7 +44,7 @@ class CirclePoses:
     axis_ratios : ndarray, shape (N,)
     centres : ndarray, shape (N, 2, 3)
     failures : mapping
-        Failure by the cone's number; the other entries of such a cone mean nothing.
+        Failure by the cone's index; the other entries of such a cone mean nothing.
     narrow : ndarray, shape (N, 3)
         Unit e1, times the tangent of the half-angle along it: the narrower one, along which the centres lie.
     """
@@ -61,7 +60,7 @@ class CirclePoses:
         return len(self.normals)
 
     def __getitem__(self, index: int) -> CirclePose | Failure:
-        # Failures are numbered from 0: one that is asked for from the end must be found too.
+        # A negative index must find its failure too.
         index = range(len(self))[operator.index(index)]
         failure = self.failures.get(index)
         ratio = float(self.axis_ratios[index])
@@ -69,15 +68,15 @@ class CirclePoses:
 
 
 def cone_axes(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> tuple[Array, Array]:
-    """Give eigenvalues and eigenvectors of cones in the order of circle pose: l1 >= l2 > 0 > l3.
+    """Return eigenvalues and eigenvectors of cones in the order of circle pose: l1 >= l2 > 0 > l3.
 
     Parameters
     ----------
     cones : array_like, shape (..., 3, 3)
         Symmetric matrices of signature (2, 1) or (1, 2).
     sightlines : array_like, shape (3,) or (..., 3), optional
-        Any direction on the side of the cone that is meant; default forward. A fisheye also sees cones whose axis
-        points backwards.
+        Any direction on the wanted side of the cone; default forward. A fisheye also sees cones whose axis points
+        backwards.
 
     Returns
     -------
@@ -93,9 +92,9 @@ def cone_axes(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> 
 
 
 def _ordered(cones: Array, sightlines: npt.ArrayLike | None) -> tuple[Array, Array]:
-    """Do as `cone_axes`, but of either hand."""
+    """Return what `cone_axes` returns, with eigenvectors of either handedness."""
     values, vectors = np.linalg.eigh(cones)
-    # Two eigenvalues share a sign; eigh sorts upwards, so the middle one tells which.
+    # Two eigenvalues share a sign; eigh sorts upwards, so the middle one has it.
     flipped = values[..., 1] < 0
     values = np.where(flipped[..., None], -values, values[..., ::-1])
     vectors = np.where(flipped[..., None, None], vectors, vectors[..., ::-1])
@@ -105,12 +104,12 @@ def _ordered(cones: Array, sightlines: npt.ArrayLike | None) -> tuple[Array, Arr
 
 
 def circle_pose(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None) -> CirclePose | Failure:
-    """Give the two normals of a circle seen as a conic (see `circle_poses`), shapes (3, 3) and (3,)."""
+    """Return the two poses of a circle seen as a conic (see `circle_poses`), shapes (3, 3) and (3,)."""
     return circle_poses(np.asarray(cone, dtype=float)[None], sightline)[0]
 
 
 def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> CirclePoses:
-    """Give the two normals of each circle seen as a conic [MB, section 2.3; F91].
+    """Compute the two poses of each circle seen as a conic [MB, section 2.3; F91].
 
     g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence
     its distance, is not observable.
@@ -120,22 +119,23 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
     cones : array_like, shape (N, 3, 3)
         C' = K^T C K, any scale and sign.
     sightlines : array_like, shape (N, 3) or (3,), optional
-        Any direction on the side of each cone that is meant; default forward.
+        Any direction on the wanted side of each cone; default forward.
 
     Returns
     -------
     CirclePoses
         A Failure for each C' that is not finite or not the cone of an ellipse.
     """
+    # candidates: finite cones of a size whose squares stay in range; a round cone stands in for the others
     C = np.asarray(cones, dtype=float)
     finite = np.isfinite(C).all(axis=(1, 2))
     if not finite.all():
         C = np.where(finite[:, None, None], C, _ROUND)
-    # The scale means nothing, and squares of very large or small entries would leave the range of numbers.
     size = np.abs(C).max(axis=(1, 2), keepdims=True)
     extreme = (size > _HUGE) | (size < 1 / _HUGE)
     if extreme.any():
         C = C / np.where(extreme, size + (size == 0), 1.0)
+    # reject what is no cone of an ellipse
     values, vectors = _ordered(C, sightlines)
     l1, l2, l3 = values.T
     sound = (l1 >= l2) & (l2 > 0) & (l3 < 0)
@@ -144,9 +144,9 @@ def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) 
         detail = f"eigenvalues {l1[index]:.3g}, {l2[index]:.3g}, {l3[index]:.3g} are not those of a cone"
         cone = Failure(Reason.DEGENERATE_CONIC, detail)
         failures[index] = cone if finite[index] else Failure(Reason.NOT_FINITE, "C' holds NaN or infinity")
-    # The values of a round cone stand in for those that are none.
     if failures:
         l1, l2, l3 = (np.where(sound, value, own) for value, own in zip((l1, l2, l3), (1.0, 1.0, -1.0), strict=True))
+    # pose [MB, section 2.3, step 4]
     e1, e3 = vectors[:, :, 0], vectors[:, :, 2]
     g, h = np.sqrt((l1 - l2) / (l1 - l3)), np.sqrt((l2 - l3) / (l1 - l3))
     normals = _pair(e1 * g[:, None], e3 * h[:, None])
@@ -161,7 +161,7 @@ _HUGE = 1e100
 
 
 def _pair(across: Array, along: Array) -> Array:
-    """Give the unit vectors along -(+-across + along), shape (N, 2, 3)."""
+    """Return the unit vectors along -(+-across + along), shape (N, 2, 3)."""
     both = np.empty((len(along), 2, 3))
     np.add(along, across, out=both[:, 0])
     np.subtract(along, across, out=both[:, 1])

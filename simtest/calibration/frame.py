@@ -1,0 +1,113 @@
+"""A frame as detectors and frame estimators see it, each step of its correction computed when first asked for."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
+
+import cv2
+import numpy as np
+
+from simtest.calibration.calibration import Calibration, CorrectedFrame
+from simtest.calibration.noise_estimate import estimate_noise
+from simtest.calibration.response import Response
+from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.errors import Failure
+from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.arrays import Image, Mask
+
+Box = tuple[int, int, int, int]
+
+_LEVELS = 2**16
+"""A picture has at most as many values; its response is looked up in a table of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame with its calibration and smoothing.
+
+    Parameters
+    ----------
+    encoded : ndarray of float32, shape (H, W) or (H, W, C)
+        Values as the camera gave them, finite.
+    calibration : Calibration
+        Of a camera of the same size.
+    smoothing_px : float
+        Standard deviation of the Gaussian smoothing, px.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels that show tissue; default the camera's view mask. None: all.
+    light : ndarray of float32, shape (H, W), optional
+        Linear light that stands in for the mean of the channels: the specular part of a colour frame, for example.
+    """
+
+    encoded: Image
+    calibration: Calibration
+    smoothing_px: float = DEFAULT_SMOOTHING_PX
+    seen: Mask | None = None
+    light: Image | None = None
+    _patches: dict[tuple[Box, tuple[int, int] | None], Patch | Failure] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        if self.seen is None:
+            object.__setattr__(self, "seen", self.camera.seen)
+
+    @property
+    def camera(self) -> Camera:
+        """The calibration's camera."""
+        return self.calibration.camera
+
+    @cached_property
+    def channels(self) -> Image:
+        """Linear light of each channel, same shape as `encoded`; sRGB is decoded where no response is known.
+
+        Values as encoded must lie in [0, 1], on 16 bits at most, unless the response is linear.
+        """
+        response = self.calibration.response or Response("srgb")
+        if response.kind == "linear":
+            return self.encoded
+        table = response.decode(np.linspace(0, 1, _LEVELS)).astype(np.float32)
+        return np.asarray(table[cv2.multiply(self.encoded, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)])
+
+    @cached_property
+    def clipped(self) -> Mask:
+        """Where a channel is clipped, shape (H, W); at 1 where the calibration knows no level."""
+        level = 1.0 if self.calibration.saturation_level is None else self.calibration.saturation_level
+        planes = [self.encoded] if self.encoded.ndim == 2 else list(np.moveaxis(self.encoded, -1, 0))
+        return np.asarray(reduce(np.maximum, planes) >= np.float32(level))
+
+    @cached_property
+    def corrected(self) -> CorrectedFrame:
+        """The frame, or `light`, with everything undone that the calibration knows."""
+        if self.light is None:
+            return self.calibration.correct(self.encoded)
+        # Light is linear, so no response is left to undo; the falloff is.
+        plain = replace(self.calibration, response=None, saturation_level=None)
+        return replace(plain.correct(self.light), saturated=self.clipped, channels=self.encoded.shape[2])
+
+    @cached_property
+    def smoothed(self) -> Image:
+        """The corrected intensity, smoothed, shape (H, W)."""
+        return smooth(self.corrected.intensity, self.smoothing_px, self.seen)
+
+    @cached_property
+    def noise(self) -> float | Image:
+        """Standard deviation of the corrected intensity's noise before smoothing; in each pixel, where it differs."""
+        corrected, model = self.corrected, self.calibration.noise
+        # A sensor that clips at full scale clips at 0 as well.
+        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
+        # estimate where the noise is white, before the falloff's correction amplifies it
+        white = estimate_noise(corrected.linear, self.seen, clipped)
+        if model.is_silent and corrected.gain is None:
+            return white
+        known = model.at(smooth(corrected.linear, self.smoothing_px, self.seen), corrected.channels)
+        noise = np.maximum(white, known)
+        return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
+
+    def patch(self, box: Box, peak: tuple[int, int] | None = None) -> Patch | Failure:
+        """Cut a region of interest out (see `Patch.cut`); the same box and peak give the same patch again."""
+        if (box, peak) not in self._patches:
+            self._patches[box, peak] = Patch.cut(
+                self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen,
+                raw=self.corrected.intensity, noise=self.noise, smoothing_px=self.smoothing_px,
+            )  # fmt: skip
+        return self._patches[box, peak]

@@ -1,0 +1,65 @@
+"""Detector protocol, and detectors by name through the entry-point group ``simtest.detectors``."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from simtest.calibration import Frame, Priors
+from simtest.detection.regions import Region
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.runtime.plugins import PluginGroup
+
+DETECTORS = PluginGroup("simtest.detectors", "detector")
+
+
+@dataclass(frozen=True)
+class Detection:
+    """The specularities of a frame.
+
+    Parameters
+    ----------
+    regions : tuple of Region
+        The brightest first.
+    frame : Frame
+        The frame that their patches are cut from: the given one, or one of its specular light.
+    """
+
+    regions: tuple[Region, ...]
+    frame: Frame
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds the specularities of a frame; other packages register theirs in the group ``simtest.detectors``."""
+
+    def detect(self, frame: Frame, camera: Camera, priors: Priors, /) -> Detection:
+        """Find the specularities of a frame, from the frame alone.
+
+        Parameters
+        ----------
+        frame : Frame
+            Values as encoded, linear light, smoothed light, noise, view and clipped pixels.
+        camera : Camera
+            The frame's camera.
+        priors : Priors
+            What is known of lights, distance and lobe.
+
+        Returns
+        -------
+        Detection
+        """
+
+
+def load_detector(detector: str | object) -> Detector:
+    """Return a detector by its name, "package:name" where two packages register one name, or the given one.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown or ambiguous, its package cannot be imported, or the object is no detector.
+    """
+    name = detector if isinstance(detector, str) else type(detector).__qualname__
+    given = DETECTORS.load(detector) if isinstance(detector, str) else detector
+    if isinstance(given, type) or not isinstance(given, Detector):
+        raise InputError(f"detector {name!r}: {given!r} is no object with a method detect(frame, camera, priors)")
+    return given

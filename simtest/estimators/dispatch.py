@@ -1,0 +1,196 @@
+"""Run estimators on the highlights of a frame so that whatever they do is an `Estimate` or a `Failure`."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtest.calibration import NO_PRIORS, Frame, Priors
+from simtest.errors import Failure, Reason
+from simtest.estimators.protocol import AnyEstimator, BatchEstimator, Estimate, Estimator, FrameEstimator
+from simtest.geometry import Array, Camera, Patch
+
+UNIT_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class FrameResults:
+    """The results of one estimator in a frame.
+
+    Parameters
+    ----------
+    of_patches : list
+        Estimate or Failure of each patch.
+    elsewhere : list of Estimate
+        Estimates that look where no patch is, or where another estimate is nearer to the patch's peak.
+    """
+
+    of_patches: list[Estimate | Failure]
+    elsewhere: list[Estimate] = field(default_factory=list)
+
+
+def run(estimator: Estimator, patch: Patch | Failure, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+    """Run an estimator on a patch.
+
+    Returns
+    -------
+    Estimate or Failure
+        A patch that is a Failure is passed on. What the estimator raises, or returns in another form than `Estimate`
+        describes, is a Failure ``estimator_error`` (one highlight must not end a run of thousands); values that are
+        not finite are a Failure ``not_finite``.
+    """
+    if isinstance(patch, Failure):
+        return patch
+    try:
+        return _checked(estimator.estimate(patch, camera, priors), camera, patch.peak_px)
+    except Exception as error:
+        return _estimator_error(error)
+
+
+def run_each(
+    estimator: Estimator, patches: Sequence[Patch | Failure], camera: Camera, priors: Priors = NO_PRIORS
+) -> list[Estimate | Failure]:
+    """Run an estimator on several patches, in one batch where it takes batches, else one by one (see `run`).
+
+    A batch that raises, or returns another number of results, warns with the estimator and the error; each patch is
+    then run alone, so that one of them spoils no other.
+    """
+    sound = [patch for patch in patches if not isinstance(patch, Failure)]
+    results: Sequence[Estimate | Failure] | None = None
+    if isinstance(estimator, BatchEstimator) and len(sound) > 1:
+        results = _batch(estimator, sound, camera, priors)
+    if results is None:
+        results = [run(estimator, patch, camera, priors) for patch in sound]
+    following = iter(results)
+    return [patch if isinstance(patch, Failure) else next(following) for patch in patches]
+
+
+def _batch(
+    estimator: BatchEstimator, patches: Sequence[Patch], camera: Camera, priors: Priors
+) -> list[Estimate | Failure] | None:
+    """Run a batch and check its results; None, with a warning, where it fails as a whole."""
+    try:
+        results = list(estimator.estimate_batch(patches, camera, priors))
+        if len(results) != len(patches):
+            raise ValueError(f"{len(results)} results for {len(patches)} patches")
+        return [_checked(result, camera, patch.peak_px) for patch, result in zip(patches, results, strict=True)]
+    except Exception as error:
+        warnings.warn(
+            f"{type(estimator).__qualname__}.estimate_batch failed, and each highlight is estimated alone: "
+            f"{type(error).__name__}: {error}", RuntimeWarning, stacklevel=3,
+        )  # fmt: skip
+        return None
+
+
+def run_in_frame(
+    estimator: AnyEstimator, frame: Frame, patches: Sequence[Patch | Failure], priors: Priors = NO_PRIORS
+) -> FrameResults:
+    """Run an estimator on the patches of a frame or, if it is a `FrameEstimator`, on the frame.
+
+    Estimates of a frame go to patches: each to the one that holds the pixel it looks at, the nearest to the patch's
+    peak first, one a patch. A patch without any gets a Failure ``no_estimate``. Where `estimate_frame` raises, or one
+    of its estimates is malformed, its results are refused as a whole: every patch gets that Failure.
+    """
+    camera = frame.camera
+    if not isinstance(estimator, FrameEstimator):
+        return FrameResults(run_each(estimator, patches, camera, priors))
+    try:
+        returned = estimator.estimate_frame(frame, camera, priors)
+        results: Failure | list[Estimate] = returned if isinstance(returned, Failure) else _all_sound(returned, camera)
+    except Exception as error:
+        results = _estimator_error(error)
+    if isinstance(results, Failure):
+        return FrameResults([patch if isinstance(patch, Failure) else results for patch in patches])
+    return _assigned(results, patches)
+
+
+def _all_sound(returned: Sequence[object], camera: Camera) -> list[Estimate] | Failure:
+    """Return the estimates of a frame, or what is wrong with the first malformed one."""
+    estimates: list[Estimate] = []
+    for number, given in enumerate(returned):
+        result = _checked(given, camera)
+        if not isinstance(result, Failure) and not camera.contains(result.look_px):
+            result = Failure(Reason.ESTIMATOR_ERROR, f"look_px = {result.look_px.tolist()}: must lie in the frame")
+        if isinstance(result, Failure):
+            return Failure(result.reason, f"estimate {number}: {result.detail}")
+        estimates.append(result)
+    return estimates
+
+
+def _assigned(estimates: Sequence[Estimate], patches: Sequence[Patch | Failure]) -> FrameResults:
+    """Assign the estimates of a frame to its patches."""
+    # candidates: pairs of a patch and an estimate that looks into it, with the distance from the peak
+    pairs = []
+    for p, patch in enumerate(patches):
+        if not isinstance(patch, Failure):
+            gaps = [float(np.hypot(*(estimate.look_px - patch.peak_px))) for estimate in estimates]
+            pairs += [(gap, p, e) for e, gap in enumerate(gaps) if _holds(patch, estimates[e].look_px)]
+    # the nearest first, each patch and each estimate once
+    taken: dict[int, int] = {}
+    for _, p, e in sorted(pairs):
+        if p not in taken and e not in taken.values():
+            taken[p] = e
+    missing = Failure(Reason.NO_ESTIMATE, "the estimator has none in this region")
+    of_patches = [
+        estimates[taken[p]] if p in taken else patch if isinstance(patch, Failure) else missing
+        for p, patch in enumerate(patches)
+    ]
+    return FrameResults(of_patches, [each for e, each in enumerate(estimates) if e not in taken.values()])
+
+
+def _holds(patch: Patch, point: Array) -> bool:
+    height, width = patch.values.shape
+    x, y = point - patch.origin_px
+    return bool(0 <= x < width and 0 <= y < height)
+
+
+def _estimator_error(error: Exception) -> Failure:
+    return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+
+
+def _checked(result: object, camera: Camera, peak_px: Array | None = None) -> Estimate | Failure:
+    """Return an estimator's result, or a Failure where it is not what `Estimate` describes."""
+    if isinstance(result, Failure):
+        return result
+    if not isinstance(result, Estimate):
+        return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
+    return _malformed(result) or _facing_away(result, camera, peak_px) or result
+
+
+def _malformed(estimate: Estimate) -> Failure | None:
+    """Return what is wrong with the shape, type or value of an estimate's parts, or None."""
+    shapes = (
+        ("normal", estimate.normal, (3,)),
+        ("candidates", estimate.candidates, (max(len(estimate.candidates), 1), 3)),
+        ("look_px", estimate.look_px, (2,)),
+        ("covariance", estimate.covariance, (2, 2)),
+    )
+    for name, value, shape in shapes:
+        if name == "covariance" and value is None:
+            continue
+        if not isinstance(value, np.ndarray) or value.shape != shape:
+            return Failure(Reason.ESTIMATOR_ERROR, f"{name}: must be an array of shape {shape}")
+        if name != "look_px" and not np.isfinite(value).all():
+            return Failure(Reason.NOT_FINITE, f"{name} holds NaN or infinity")
+    for name, number in (("axis_ratio", estimate.axis_ratio), ("choice_margin", estimate.choice_margin)):
+        if number is not None and not np.isfinite(number):
+            return Failure(Reason.NOT_FINITE, f"{name} is {number}")
+    if estimate.region is not None and not np.isfinite(estimate.region.statistic(estimate.candidates)).all():
+        return Failure(Reason.NOT_FINITE, "region: the statistic of a candidate is not finite")
+    lengths = np.linalg.norm(np.concatenate([estimate.normal[None], estimate.candidates]), axis=1)
+    if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
+        return Failure(Reason.ESTIMATOR_ERROR, f"normal or candidate of length {lengths.max():g}: must be unit vectors")
+    if np.abs(estimate.candidates[0] - estimate.normal).max() > UNIT_TOLERANCE:
+        return Failure(Reason.ESTIMATOR_ERROR, "the first candidate must be the proposed normal")
+    if not isinstance(estimate.flags, tuple) or not all(isinstance(flag, str) for flag in estimate.flags):
+        return Failure(Reason.ESTIMATOR_ERROR, "flags: must be a tuple of text")
+    return None
+
+
+def _facing_away(estimate: Estimate, camera: Camera, peak_px: Array | None) -> Failure | None:
+    """Return a Failure where the camera sees the surface from behind, at the pixel looked at or else at the peak."""
+    look = estimate.look_px if peak_px is None or np.isfinite(estimate.look_px).all() else peak_px
+    if estimate.normal @ camera.unproject(look) >= 0:
+        return Failure(Reason.ESTIMATOR_ERROR, "the normal faces away from the camera")
+    return None

@@ -1,0 +1,39 @@
+"""Gaussian smoothing of a frame, normalised inside a view mask."""
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.geometry.arrays import Image, Mask
+
+
+def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
+    """Smooth a frame with a Gaussian.
+
+    Parameters
+    ----------
+    frame : array_like, shape (H, W) or (H, W, C)
+        Intensities.
+    sigma_px : float
+        Standard deviation, px; 0 leaves the frame as it is.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside a camera's view mask. Each smoothed value is then the weighted mean of those alone, so that
+        the dark outside does not lower the values at the mask's border; pixels outside become 0.
+
+    Returns
+    -------
+    ndarray of float32, same shape
+    """
+    image = np.ascontiguousarray(frame, dtype=np.float32)
+    if seen is None:
+        return _blurred(image, sigma_px)
+    inside = seen if image.ndim == 2 else seen[:, :, None]
+    weights = _blurred(seen.astype(np.float32), sigma_px).reshape(inside.shape)
+    blurred = _blurred(np.where(inside, image, np.float32(0)), sigma_px)
+    return np.asarray(np.divide(blurred, weights, where=inside, out=np.zeros_like(image)))
+
+
+def _blurred(image: Image, sigma_px: float) -> Image:
+    if sigma_px <= 0:
+        return image
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))

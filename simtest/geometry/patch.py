@@ -1,0 +1,275 @@
+"""A region of interest of a smoothed frame around one peak, and the isophotes in it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.errors import Failure, InputError, Reason
+from simtest.geometry.arrays import Array, Image, Mask
+from simtest.geometry.isophotes import IsophoteTracer
+from simtest.geometry.level_sets import LevelSet, Sensitivities
+
+MIN_PLATEAU_PX = 12
+"""Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A region of interest of a smoothed frame around one peak.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, w)
+        Smoothed intensities of the region.
+    origin_px : tuple of int
+        Column and row of the region's first pixel in the frame.
+    peak_px : ndarray, shape (2,)
+        Sub-pixel position of the peak in the frame, px (pixel centres at + 0.5).
+    peak_value : float
+        Smoothed intensity of the peak's pixel: isovalues are relative to it.
+    peak_pixel : tuple of int
+        Column and row of the peak's pixel in the region.
+    saturated : ndarray of bool, shape (h, w), optional
+        Where the sensor is clipped; None where that is not known.
+    seen : ndarray of bool, shape (h, w), optional
+        The pixels inside the camera's view mask; default all. An isophote that leaves them is not closed.
+    raw : ndarray, shape (h, w), optional
+        Intensities before smoothing, whose noise is independent from pixel to pixel.
+    noise : float, or ndarray of float32, shape (h, w), optional
+        Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
+    smoothing_px : float
+        Standard deviation of the Gaussian that the frame was smoothed with, px.
+    others_px : tuple of tuple of float
+        Peaks of the frame's other specularities, px.
+    tracer : IsophoteTracer, optional
+        Made from the fields above, unless it is one that was.
+    """
+
+    values: Image | Array
+    origin_px: tuple[int, int]
+    peak_px: Array
+    peak_value: float
+    peak_pixel: tuple[int, int]
+    saturated: Mask | None = None
+    seen: Mask | None = None
+    raw: Image | Array | None = None
+    noise: float | Image | None = None
+    smoothing_px: float = 0.0
+    others_px: tuple[tuple[float, float], ...] = ()
+    tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.
+        fresh = IsophoteTracer(self.values, self.peak_pixel, self.peak_value, self.seen, self.smoothing_px)
+        if self.tracer is None or not self.tracer.finds_the_same_as(fresh):
+            object.__setattr__(self, "tracer", fresh)
+
+    @classmethod
+    def cut(
+        cls,
+        smoothed: Image | Array,
+        box: tuple[int, int, int, int],
+        peak: tuple[int, int] | None = None,
+        origin_px: tuple[int, int] = (0, 0),
+        saturated: Mask | None = None,
+        seen: Mask | None = None,
+        raw: Image | Array | None = None,
+        noise: float | Image | None = None,
+        smoothing_px: float = 0.0,
+    ) -> "Patch | Failure":
+        """Cut a region out of a smoothed frame.
+
+        Parameters
+        ----------
+        smoothed : ndarray, shape (H, W)
+            The frame.
+        box : tuple of int
+            Column, row, width, height of the region; inside the frame.
+        peak : tuple of int, optional
+            Column and row of the peak's pixel; default the brightest of the region.
+        origin_px : tuple of int
+            Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        saturated : ndarray of bool, shape (H, W), optional
+            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
+        seen : ndarray of bool, shape (H, W), optional
+            The frame's pixels inside the camera's view mask; default all.
+        raw : ndarray, shape (H, W), optional
+            The frame before smoothing.
+        noise : float, or ndarray of float32, shape (H, W), optional
+            Standard deviation of the frame's noise before smoothing; None: not known.
+        smoothing_px : float
+            Standard deviation of the Gaussian that it was smoothed with, px.
+
+        Returns
+        -------
+        Patch or Failure
+            A Failure if the region holds values that are not finite, or no positive one above the others.
+
+        Raises
+        ------
+        InputError
+            If the box is empty or leaves the frame.
+        """
+        x, y, width, height = box
+        rows, columns = smoothed.shape
+        if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
+            raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
+        values = smoothed[y : y + height, x : x + width]
+        # NaN and infinity show at either end of the range, which costs less than a test of every value.
+        lowest, highest = float(values.min()), float(values.max())
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
+        if peak is None:
+            row, column = divmod(int(values.argmax()), values.shape[1])
+        else:
+            column, row = peak[0] - x, peak[1] - y
+        if seen is not None:
+            seen = seen[y : y + height, x : x + width]
+            lowest = float(values.min(where=seen, initial=np.inf))
+        corner = (x + origin_px[0], y + origin_px[1])
+        unsmoothed = None if raw is None else raw[y : y + height, x : x + width]
+        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
+        # peak: a parabola's apex, or the centroid of a clipped plateau
+        plateau = None if clipped is None else _plateau(clipped, row, column)
+        if clipped is None or plateau is None:
+            position = _parabolic_peak(values, row, column)
+        else:
+            position = np.argwhere(plateau)[:, ::-1].mean(axis=0)
+            # The clipped pixel nearest to the centroid: where falloff was divided away the plateau is slanted and
+            # highest at its rim, and its holes may be dark.
+            pixels = np.argwhere(plateau & clipped)[:, ::-1]
+            column, row = pixels[np.argmin(np.sum((pixels - position) ** 2, axis=1))]
+        value = float(values[row, column])
+        if value <= 0 or value <= lowest:
+            return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
+        if isinstance(noise, np.ndarray):
+            noise = noise[y : y + height, x : x + width]
+        pixel, position = (int(column), int(row)), position + PIXEL_CENTRE + corner
+        return cls(values, corner, position, value, pixel, clipped, seen, unsmoothed, noise, smoothing_px)
+
+    def crossings(self, isovalue: float) -> Array | Failure:
+        """Return the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
+
+        The isophote is the outer border of the region above t times the peak that holds the peak. Its points lie where
+        it crosses the lines between the centres of neighbouring pixels.
+
+        Parameters
+        ----------
+        isovalue : float
+            t in (0, 1), relative to the smoothed peak.
+
+        Returns
+        -------
+        ndarray, shape (N, 2), or Failure
+            In the frame, px. A pixel whose value is the level, where several lines cross, counts once.
+
+        Raises
+        ------
+        InputError
+            If t is outside (0, 1).
+        """
+        return self.crossings_of([isovalue])[0]
+
+    def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
+        """Return the points of several isophotes (see `crossings`), at little more than the cost of one."""
+        found = [self._isophotes.closed(t) for t in isovalues]
+        closed = [each for each in found if not isinstance(each, Failure)]
+        if not closed:
+            return [each for each in found if isinstance(each, Failure)]
+        traced = self._isophotes.crossings(closed)
+        points = iter(traced.each(traced.points + self._first_centre))
+        return [each if isinstance(each, Failure) else next(points) for each in found]
+
+    def arc(self, isovalue: float) -> Array:
+        """Return the seen part of an isophote that the region's border or the view cuts, shape (N, 2), in no order.
+
+        Points nearer to the cut than 1.5 times the smoothing's width are left out.
+        """
+        return self._isophotes.crossings([self._isophotes.cut(isovalue)]).points + self._first_centre
+
+    def sensitivities(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Sensitivities:
+        """Return how the points of `crossings`, or of `arc` where cut, move with the patch's values, in the same order.
+
+        Parameters
+        ----------
+        isovalues : sequence of float
+            Of isophotes that were found.
+        cut : sequence of bool
+            Whether each is an arc.
+
+        Returns
+        -------
+        Sensitivities
+            One isophote after the other.
+        """
+        traced = self._isophotes
+        found = [traced.cut(t) if arc else traced.closed(t) for t, arc in zip(isovalues, cut, strict=True)]
+        return traced.crossings([each for each in found if isinstance(each, LevelSet)]).sensitivities
+
+    def isophote(self, isovalue: float) -> Array | Failure:
+        """Return the points of `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.
+
+        Where the border meets itself, at a pixel whose value is the level, a point is passed more than once.
+        """
+        found = self._isophotes.closed(isovalue)
+        return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
+
+    @property
+    def _isophotes(self) -> IsophoteTracer:
+        assert self.tracer is not None
+        return self.tracer
+
+    @property
+    def _first_centre(self) -> Array:
+        """Centre of the region's first pixel, shape (2,), px."""
+        return np.array(self.origin_px) + PIXEL_CENTRE
+
+    def inside(self, isovalue: float, cut: bool = False) -> Mask:
+        """Return which of the region's pixels an isophote encloses, shape (h, w).
+
+        Where it does not close: all seen pixels, or with `cut` those that it encloses together with the cut.
+        """
+        found = self._isophotes.closed(isovalue)
+        if isinstance(found, Failure):
+            if cut:
+                return np.asarray(self._isophotes.cut(isovalue).inside[1:-1, 1:-1])
+            return np.ones(self.values.shape, dtype=bool) if self.seen is None else self.seen
+        mask = np.zeros(self.values.shape, dtype=bool)
+        height, width = found.inside.shape
+        x, y = found.corner
+        mask[y : y + height, x : x + width] = found.inside
+        return mask
+
+    def saturated_share(self, isovalue: float) -> float | None:
+        """Return the share of the pixels inside an isophote that are clipped; None where that is not known."""
+        if self.saturated is None:
+            return None
+        inside = self.inside(isovalue)
+        return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
+
+
+def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
+    """Return the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
+    if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
+        return None
+    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
+    if not whole[row, column]:
+        return None
+    labels, _ = ndimage.label(whole, np.ones((3, 3)))
+    plateau = np.asarray(labels == labels[row, column])
+    return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX and (plateau & clipped).any() else None
+
+
+def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
+    """Refine a peak's pixel (column, row) by a parabola along each axis; at the border the pixel itself is kept."""
+    position = [float(column), float(row)]
+    for axis, (index, line) in enumerate(((column, values[row, :]), (row, values[:, column]))):
+        if 0 < index < len(line) - 1:
+            before, here, after = (float(v) for v in line[index - 1 : index + 2])
+            bend = before - 2 * here + after
+            if bend < 0:
+                position[axis] += min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+    return np.array(position)

@@ -1,0 +1,73 @@
+"""Objects that installed packages register by name, found through entry-point groups."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from simtest.errors import InputError
+
+
+@dataclass(frozen=True)
+class PluginGroup:
+    """One entry-point group.
+
+    A name that two packages register is refused, unless the package is named too: "package:name", which is accepted for
+    every name.
+
+    Parameters
+    ----------
+    group : str
+        Of the entry points.
+    kind : str
+        What its members are called in messages.
+    """
+
+    group: str
+    kind: str
+
+    def names(self) -> list[str]:
+        """Return the names of all installed members, sorted; of a name that several packages register each full one."""
+        points = list(entry_points(group=self.group))
+        plain = [point.name for point in points]
+        return sorted(p.name if plain.count(p.name) == 1 else f"{_package(p)}:{p.name}" for p in points)
+
+    def load(self, name: str) -> Any:
+        """Import a member.
+
+        Raises
+        ------
+        InputError
+            If the name is unknown, several packages register it, or its package cannot be imported.
+        """
+        found = self._registered(name)
+        if not found:
+            raise InputError(f"{self.kind} {name!r}: not installed; allowed: {', '.join(self.names())}")
+        if len(found) > 1:
+            full = " or ".join(sorted(f"{_package(point)}:{point.name}" for point in found))
+            raise InputError(f"{self.kind} {name!r}: registered by {len(found)} packages; name one of them: {full}")
+        try:
+            return found[0].load()
+        except Exception as error:
+            raise InputError(f"{self.kind} {name!r}: {found[0].value} cannot be imported ({error})") from error
+
+    def distributions(self, names: Sequence[str]) -> dict[str, str]:
+        """Return package and version of each installed name, by "kind NAME"."""
+        found = {name: self._registered(name) for name in names}
+        dists = {name: points[0].dist for name, points in found.items() if points}
+        return {f"{self.kind} {name}": f"{dist.name} {dist.version}" if dist else "" for name, dist in dists.items()}
+
+    def _registered(self, name: str) -> list[EntryPoint]:
+        package, _, plain = name.rpartition(":")
+        points = [point for point in entry_points(group=self.group) if point.name == plain]
+        return [point for point in points if not package or _normalised(package) == _normalised(_package(point))]
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else ""
+
+
+def _normalised(package: str) -> str:
+    """Return a package's name as indexes compare it: my_core, My-Core and my.core are one."""
+    return re.sub(r"[-_.]+", "-", package).lower()
