@@ -15,7 +15,7 @@ from simtest.geometry.isocurves import (
 )
 from simtest.spec.paper import PaperSetting, paper_from_dict
 from simtest.validation.paper.bound import cramer_rao_bound
-from simtest.validation.paper.protocol import (
+from simtest.validation.paper.slanted_view import (
     draw_light,
     picture,
     plane_from_image,

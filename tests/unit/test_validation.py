@@ -14,15 +14,14 @@ from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.rendering.frames import TrueHighlight
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
-from simtest.simulation.rendered_view import view
-from simtest.simulation.true_highlights import JudgedHighlight
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
-from simtest.validation.metrics import SCHEMA, RowContext, rows, table
 from simtest.validation.realisation import realise
+from simtest.validation.results_table import SCHEMA, RowContext, rows, table
 from simtest.validation.runner import run_experiment
 from simtest.validation.statistics import figures, mean_interval, summarise
 
@@ -31,8 +30,11 @@ NORTH = np.array([0.0, 0.0, -1.0])
 
 
 def truth_at(x, y, normal=NORTH, light=0):
-    highlight = TrueHighlight(light, np.array([x, y]), np.array([0, 0, 10.0]), normal, 10.0, 0.2, 0.5, True, 1.0)
-    return JudgedHighlight(highlight, 50.0, "")
+    return TrueHighlight(
+        light=light, bp_px=np.array([x, y]), position=np.array([0, 0, 10.0]), normal=normal,
+        direction_min=np.array([1.0, 0.0, 0.0]), distance=10.0, kd_min=0.2, kd_max=0.5, lit=True, radiance=1.0,
+        peak_snr=50.0, why_not="",
+    )  # fmt: skip
 
 
 def detection(x, y, width, height, peak, estimates=None):
@@ -376,12 +378,12 @@ def test_a_realisation_alone_gives_the_rows_of_the_whole_run(whole, index):
     scene, drawn = case.scene(described, 3)
     session = Session(scene)
     estimators = load_estimators(described.estimators)
-    made = realise(session, described, case, 3, view(session, scene), drawn, estimators)
+    made = realise(session, described, case, 3, render_view(session, scene), drawn, estimators)
     alone = table(made.rows, swept_example(expand(described)))
     in_run = whole.results.filter((pl.col("setting") == case.setting) & (pl.col("realisation") == 3))
     assert len(alone) == 3
     assert sorted_rows(alone).equals(sorted_rows(in_run))
-    other = realise(session, described, case, 2, view(session, scene), drawn, estimators)
+    other = realise(session, described, case, 2, render_view(session, scene), drawn, estimators)
     assert other.frame.tobytes() != made.frame.tobytes()
 
 
@@ -400,7 +402,7 @@ def test_what_drowns_in_noise_is_missed():
     (case,) = expand(described)
     scene, drawn = case.scene(described, 0)
     session = Session(scene)
-    made = realise(session, described, case, 0, view(session, scene), drawn, load_estimators(["cone_axis"]))
+    made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
     statuses = [row.get("status") for row in made.rows if row.get("true_id") is not None]
     assert statuses == ["missed"]
     assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)
