@@ -115,6 +115,13 @@ def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     assert [j.why_not for j in judged] == ["in shadow", ""]
 
 
+def test_the_former_way_to_a_true_highlight_still_works_and_warns():
+    radiance = np.ones((60, 80), dtype=np.float32)
+    (truth,) = judge([spot(40.0, lit=True)], radiance, NoiseModel(), 1.0)
+    with pytest.warns(DeprecationWarning, match="use the highlight itself"):
+        assert truth.highlight.normal is truth.normal
+
+
 def test_mahalanobis_distance_is_that_of_the_tangent_plane():
     rng = np.random.default_rng(1)
     normal = rng.normal(size=3)
@@ -191,8 +198,8 @@ def test_false_detections_that_failed_are_counted():
         },
         schema_overrides={"true_id": pl.Int64, "error_deg": pl.Float64, "mahalanobis2": pl.Float64},
     )  # fmt: skip
-    assert figures(rows)["n_false"] == 2
-    assert figures(rows)["n"] == 0
+    assert figures(rows).n_false == 2
+    assert figures(rows).n == 0
 
 
 @pytest.mark.render

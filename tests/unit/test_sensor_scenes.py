@@ -292,7 +292,8 @@ def test_rows_of_a_dark_frame_are_failures(tmp_path, isolated, sigma):
         run = run_experiment(experiment, tmp_path / "run")
     assert len(caught) == 1
     assert run.results["status"].to_list() == ["no_light"] * 9
-    (figures,) = {json.dumps(f) for f in run.summary["experiments"]["dark"]["settings"]["plane"].values()}
+    summary = json.loads((run.folder / "summary.json").read_text())
+    (figures,) = {json.dumps(f) for f in summary["experiments"]["dark"]["settings"]["plane"].values()}
     assert json.loads(figures)["n_failed_by_reason"] == {"no_light": 3}
 
 

@@ -46,7 +46,7 @@ def paper_rows(
     Returns
     -------
     polars.DataFrame
-        Columns of `SCHEMA` and of the swept parameters, in the order of the realisations.
+        Columns of `SCHEMA` and of the swept parameters that are not null, in the order of the realisations.
     """
     pipeline = pipeline_with(setting, estimators)
     made = pipeline.realise(from_integer(seed) for seed in seeds)
@@ -63,9 +63,9 @@ def paper_rows(
         own = replace(shared, estimator=name, error_law_deg=law_deg).to_row()
         columns = {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}
         table = pl.DataFrame(columns, schema_overrides=SCHEMA)
-        constant = {key: pl.lit(value) for key, value in own.items() if key not in columns}
+        constant = {key: pl.lit(value) for key, value in own.items() if value is not None}
         tables.append(table.with_columns(**constant))
-    return pl.concat(tables, how="vertical_relaxed").sort("realisation", maintain_order=True)
+    return pl.concat(tables, how="diagonal_relaxed").sort("realisation", maintain_order=True)
 
 
 @lru_cache(maxsize=2)
