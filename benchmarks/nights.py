@@ -46,11 +46,11 @@ def night_of(rows: pl.DataFrame, started: datetime = FIRST, profile: str = "full
 
 def _of_place(place: tuple[Any, ...], rows: pl.DataFrame) -> list[dict[str, Any]]:
     found = figures(rows)
-    n = found["n"] or 1
-    failed = sum(found["n_failed_by_reason"].values())
-    values = found | {"failed_rate": failed / n, "missed_rate": found["n_missed"] / n}
-    low, high = found["ci95_deg"]
-    common = {**dict(zip(PLACE, place, strict=True)), "kind": "setting", "n": found["n"]}
+    n = found.n or 1
+    failed = sum(found.n_failed_by_reason.values())
+    values = vars(found) | {"failed_rate": failed / n, "missed_rate": found.n_missed / n}
+    low, high = found.ci95_deg
+    common = {**dict(zip(PLACE, place, strict=True)), "kind": "setting", "n": found.n}
     return [
         common | {"quantity": name, "unit": unit, "value": values[name], "low": low if name == "mean_deg" else None,
                   "high": high if name == "mean_deg" else None}

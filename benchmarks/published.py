@@ -21,9 +21,10 @@ from simtest.spec import load_experiment
 from simtest.spec.paper import PaperSetting
 from simtest.validation.cases import Case, expand
 from simtest.validation.execution import PAPER_CHUNK
-from simtest.validation.paper.pipeline import kernel_radius
-from simtest.validation.paper.protocol import draw_light, picture
+from simtest.validation.paper.published_pipeline import kernel_radius
 from simtest.validation.paper.rows import paper_rows, pipeline_with
+from simtest.validation.paper.slanted_view import draw_light, picture
+from simtest.validation.results_table import ResultRow
 
 WORKERS = 2
 CONICS, POINTS = 1000, 100
@@ -63,7 +64,7 @@ def figures() -> list[Figure]:
 def _ratio(name: str, setting: PaperSetting, rounds: int = 15) -> Figure:
     """Compare the rows of one chunk of realisations with their floor, in this process."""
     seeds = list(range(PAPER_CHUNK))
-    common = {"experiment": "bench", "label": "", "setting": ""}
+    common = ResultRow(experiment="bench", label="", setting="")
     times = in_turns(
         {
             "rows": lambda: paper_rows(setting, common, range(PAPER_CHUNK), seeds, ("circle_pose",)),

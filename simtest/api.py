@@ -151,17 +151,17 @@ def sample_views(
         If the rendering backend cannot be used.
     """
     from simtest.simulation.view_files import ViewWriter
-    from simtest.simulation.viewpoints import along_path, candidates, place_key, sample_views
+    from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
     if not 1 <= count <= MAX_VIEWS:
         raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    places = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
+    viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
     writer = ViewWriter(Path(out), film=along is not None)
-    sampled = sample_views(described, count, places, variant, progress, writer.add, along is not None)
+    sampled = sample_views(described, count, viewpoints, variant, progress, writer.add, along is not None)
     writer.close()
-    write_json(Path(out) / "views.json", sampled.as_dict(place_key(described)))
+    write_json(Path(out) / "views.json", sampled.to_json(viewpoint_key(described)))
     return sampled
 
 

@@ -21,8 +21,9 @@ from simtest.estimators.protocol import Estimate
 from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.rendering import Session, TrueHighlight
-from simtest.simulation.rendered_view import view
+from simtest.rendering import Session
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import load_scene
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2
@@ -75,14 +76,14 @@ def _highlights(
         values = {"surface.path": "colon", "surface.viewpoint": viewpoint, "sensor.seed": viewpoint}
         scene = load_scene("anatomy", values | ({"rig.lights": list(lights)} if lights else {}))
         session = session or Session(scene)
-        seen = view(session, scene)
+        seen = render_view(session, scene)
         specularities = reconstruct(seen.frame(viewpoint), seen.calibration, {})
-        truths = [truth for truth in seen.truths if truth.isolated]
+        truths = [truth for truth in seen.highlights if truth.isolated]
         for i, j in match(specularities, truths).items():
             patch = specularities[i].patch
             if isinstance(patch, Patch):
                 found += 1
-                yield patch, seen.calibration, truths[j].highlight
+                yield patch, seen.calibration, truths[j]
         viewpoint += 1
 
 

@@ -18,7 +18,7 @@ from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.toml_output import toml_value
 from simtest.surfaces.generate import load_anatomy, make_mesh
@@ -61,20 +61,18 @@ def spots(recipe: Path) -> list[Observation]:
             "registration study",
         )
         session = session or Session(scene)
-        seen = view(session, scene)
+        seen = render_view(session, scene)
         found = reconstruct(seen.frame(viewpoint), seen.calibration, estimators)
-        truths = [truth for truth in seen.truths if truth.isolated]
+        truths = [truth for truth in seen.highlights if truth.isolated]
         camera_from_model = np.linalg.inv(session.surface.model_from_camera)
         made = []
         for i, j in match(found, truths).items():
-            normals = {TRUTH: truths[j].highlight.normal[None]}
+            normals = {TRUTH: truths[j].normal[None]}
             for name, result in found[i].estimates.items():
                 if isinstance(result, Estimate):
                     normals[name] = result.candidates
             if len(normals) == 1 + len(ESTIMATORS):
-                made.append(
-                    Observation(truths[j].highlight.bp_px, normals, session.camera, camera_from_model, viewpoint)
-                )
+                made.append(Observation(truths[j].bp_px, normals, session.camera, camera_from_model, viewpoint))
         views.append(made)
     views.sort(key=len, reverse=True)
     taken: list[Observation] = []

@@ -22,16 +22,16 @@ def doctor(*, as_json: Annotated[bool, Parameter(name="--json", negative="")] = 
 
     report = examine(variant)
     if as_json:
-        print(json.dumps(report, indent=2))
-        return 0 if report["can_render"] else 1
-    print(f"variant     {report['variant']}")
-    for candidate in report["candidates"]:
-        print(f"libLLVM     {candidate['path']}  ({candidate['origin']}): {candidate['verdict']}")
-    if report["library"]:
-        print(f"in use      {report['library']}")
-    for package, version in report["versions"].items():
+        print(json.dumps(report.to_json(), indent=2))
+        return 0 if report.can_render else 1
+    print(f"variant     {report.variant}")
+    for candidate in report.candidates:
+        print(f"libLLVM     {candidate.path}  ({candidate.origin}): {candidate.verdict}")
+    if report.library:
+        print(f"in use      {report.library}")
+    for package, version in report.versions.items():
         print(f"{package:<11} {version}")
-    print(f"rendering   {'works' if report['can_render'] else 'does not work'}")
-    if report["problem"]:
-        print(f"problem     {report['problem']}")
-    return 0 if report["can_render"] else 1
+    print(f"rendering   {'works' if report.can_render else 'does not work'}")
+    if report.problem:
+        print(f"problem     {report.problem}")
+    return 0 if report.can_render else 1

@@ -17,7 +17,7 @@ def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Varia
     from simtest import api
     from simtest.cli.progress import progress_bar
     from simtest.runtime.files import refuse_file
-    from simtest.simulation.labelled_frame import write_frame
+    from simtest.simulation.frame_files import write_frame
     from simtest.spec import parse_settings
 
     refuse_file(out)

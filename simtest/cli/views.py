@@ -39,7 +39,7 @@ def views(
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
         sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends)
-    with_one = sum(number > 0 for number in sampled.highlights)
+    with_one = sum(view.isolated_highlights > 0 for view in sampled.views)
     print(f"{with_one} of {sampled.tried} views show an isolated highlight")
     for reason, number in sampled.rejected.items():
         print(f"left out: {number} ({reason})")

@@ -10,7 +10,7 @@ import polars as pl
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import samples
 from simtest.runtime.files import write_atomically
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
 TABLES = (SAMPLES, HIGHLIGHTS, ESTIMATES)

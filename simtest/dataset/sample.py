@@ -19,13 +19,13 @@ from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
 from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.labelled_frame import describe_highlight
-from simtest.simulation.rendered_view import View, view
-from simtest.simulation.true_highlights import JudgedHighlight, region_of
+from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
 from simtest.validation.matching import match
-from simtest.validation.metrics import RowContext, rows
+from simtest.validation.metrics import MISSED, rows
+from simtest.validation.results_table import ResultRow
 
 Array = npt.NDArray[Any]
 
@@ -106,14 +106,14 @@ class Maker:
         picture = seen.frame(drawn.scene.sensor.seed)
         specularities = reconstruct(picture, seen.calibration, self._estimators) if seen.full_scale > 0 else []
         meta = self._describe(index, drawn, seen) | {"attempt": attempt}
-        meta["highlights"] = [_highlight(truth) for truth in seen.truths]
+        meta["highlights"] = [_highlight(truth) for truth in seen.highlights]
         meta["detections"] = [_detection(specularity) for specularity in specularities]
         meta["estimates"] = self._estimates(index, drawn, seen, specularities)
         images = self._images(drawn, seen, frame, picture)
         meta["depth_scale_mm"] = depth_scale_mm(images["depth"])
         return Sample(index, meta, images)
 
-    def _choose(self, index: int) -> tuple[Drawn, int, View, Frame]:
+    def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
         """Draw until the frame shows enough isolated highlights, judged by one ray a pixel and direct light."""
         dataset = self.plan.dataset
         attempt, drawn = 0, self.plan.draw(index)
@@ -122,13 +122,13 @@ class Maker:
             drawn = self.plan.draw(index, attempt)
         session = self._at(drawn)
         frame = session.frame()
-        return drawn, attempt, view(session, drawn.scene, frame.radiance), frame
+        return drawn, attempt, render_view(session, drawn.scene, frame.radiance), frame
 
     def _shows_enough(self, drawn: Drawn) -> bool:
         quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
         scene = drawn.scene.model_copy(update={"render": quick})
-        seen = view(self._at(replace(drawn, scene=scene)), scene)
-        return sum(truth.isolated for truth in seen.truths) >= self.plan.dataset.highlights
+        seen = render_view(self._at(replace(drawn, scene=scene)), scene)
+        return sum(truth.isolated for truth in seen.highlights) >= self.plan.dataset.highlights
 
     def _at(self, drawn: Drawn) -> Session:
         if self._session is not None and drawn.anatomy != self._anatomy:
@@ -142,7 +142,7 @@ class Maker:
         self._session.update(drawn.scene)
         return self._session
 
-    def _describe(self, index: int, drawn: Drawn, seen: View) -> dict[str, Any]:
+    def _describe(self, index: int, drawn: Drawn, seen: RenderedView) -> dict[str, Any]:
         scene, anatomy = drawn.scene, drawn.anatomy
         return {
             "key": sample_key(index),
@@ -160,22 +160,25 @@ class Maker:
         }  # fmt: skip
 
     def _estimates(
-        self, index: int, drawn: Drawn, seen: View, specularities: list[Specularity]
+        self, index: int, drawn: Drawn, seen: RenderedView, specularities: list[Specularity]
     ) -> list[dict[str, Any]]:
         """Give the rows of results.parquet; true_id is the highlight's place in the list of all."""
         session = self._at(drawn)
-        counted = [i for i, truth in enumerate(seen.truths) if truth.isolated]
-        truths = [seen.truths[i] for i in counted]
-        common = {"experiment": self.plan.dataset.name, "label": drawn.scene.surface.label, "realisation": index,
-                  "setting": self.plan.split(index), "seed": drawn.scene.sensor.seed}  # fmt: skip
-        context = RowContext(session, common)
-        made = rows(context, specularities, truths, match(specularities, truths), list(self._estimators))
+        counted = [i for i, truth in enumerate(seen.highlights) if truth.isolated]
+        truths = [seen.highlights[i] for i in counted]
+        common = ResultRow(experiment=self.plan.dataset.name, label=drawn.scene.surface.label, realisation=index,
+                           setting=self.plan.split(index), seed=drawn.scene.sensor.seed)  # fmt: skip
+        made = rows(session, common, specularities, truths, match(specularities, truths), list(self._estimators))
+        estimates = []
         for row in made:
-            if row.get("true_id") is not None:
-                row["true_id"] = counted[row["true_id"]]
-        return [{key: _plain(value) for key, value in row.items() if _plain(value) is not None} for row in made]
+            columns = row.to_row() | {"true_id": None if row.true_id is None else counted[row.true_id]}
+            if row.status == MISSED:
+                # Shards list a missed highlight's status before its estimator.
+                columns["estimator"] = columns.pop("estimator")
+            estimates.append({key: _plain(value) for key, value in columns.items() if _plain(value) is not None})
+        return estimates
 
-    def _images(self, drawn: Drawn, seen: View, frame: Frame, picture: Array) -> dict[str, Array]:
+    def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame, picture: Array) -> dict[str, Array]:
         radiance, scale = seen.radiance, seen.full_scale or 1.0
         images = {"image": _bytes(picture, drawn.scene.sensor.encodes), **self._truth(drawn, frame)}
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
@@ -211,26 +214,21 @@ def _colour(image: Array) -> Array:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def _instances(seen: View, mask: Array | None) -> Array:
+def _instances(seen: RenderedView, mask: Array | None) -> Array:
     """Give the isolated highlights' regions at half height, by 1 + their place in the list."""
     light = seen.light if seen.light.ndim == 2 else seen.light.mean(axis=2, dtype=np.float32)
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, mask)
     numbers = np.zeros(light.shape, dtype=np.uint8)
-    for i, truth in enumerate(seen.truths[:MAX_INSTANCES]):
-        component = region_of(truth.highlight, smoothed, mask) if truth.isolated else None
+    for i, truth in enumerate(seen.highlights[:MAX_INSTANCES]):
+        component = region_of(truth, smoothed, mask) if truth.isolated else None
         if component is not None:
             height, width = component.mask.shape
             numbers[component.y : component.y + height, component.x : component.x + width][component.mask] = i + 1
     return numbers
 
 
-def _highlight(judged: JudgedHighlight) -> dict[str, Any]:
-    direction = judged.highlight.direction_min
-    return {
-        **describe_highlight(judged),
-        "direction_min": None if direction is None else direction.tolist(),
-        "peak_snr": _plain(judged.peak_snr),
-    }
+def _highlight(truth: TrueHighlight) -> dict[str, Any]:
+    return {**truth.to_json(), "direction_min": truth.direction_min.tolist(), "peak_snr": _plain(truth.peak_snr)}
 
 
 def _detection(specularity: Specularity) -> dict[str, Any]:

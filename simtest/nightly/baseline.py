@@ -19,7 +19,7 @@ from simtest.nightly.storage import (
     told_in_one_line,
 )
 from simtest.runtime.resources import shown
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 
 LOG = "log.jsonl"
 MAX_REASON = 1000

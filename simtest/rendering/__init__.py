@@ -1,7 +1,13 @@
-"""The only package that imports Mitsuba: backend, Phong reflectance, sessions, radiance and ground truth."""
+"""The only package that imports Mitsuba.
 
-from simtest.rendering.frames import Frame, Labels, Radiance, TrueHighlight, TruthMaps
+`backend` chooses libLLVM and variant. `session` holds the scene, which `shapes`, `materials`, `phong` and `emission`
+describe to Mitsuba; `rays`, `integrate`, `direct` and `indirect` trace its radiance. Ground truth comes from
+`shape_labels` (the rendered shape), `exact_points` (the smooth surface) and `highlights` (the points where the normal
+bisects light and camera). `frames` defines the records; `mitsuba_export` writes a scene for Mitsuba.
+"""
+
+from simtest.rendering.frames import Frame, HighlightPoint, Labels, Radiance, TruthMaps
 from simtest.rendering.integrate import Progress
 from simtest.rendering.session import Session
 
-__all__ = ["Frame", "Labels", "Progress", "Radiance", "Session", "TrueHighlight", "TruthMaps"]
+__all__ = ["Frame", "HighlightPoint", "Labels", "Progress", "Radiance", "Session", "TruthMaps"]

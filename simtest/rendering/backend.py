@@ -14,14 +14,14 @@ import signal
 import subprocess
 import sys
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
 from simtest.errors import BackendError
-from simtest.runtime.files import write_json
+from simtest.runtime.files import Json, write_json
 
 DEFAULT_VARIANT = "llvm_ad_mono"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -30,7 +30,7 @@ PIP_PACKAGE = "karellen-llvm-core"
 PROBE_TIMEOUT_S = 120
 
 UNTRIED = "could not be tried"
-"""Begins a verdict that says nothing about the library (no time, no memory): it is not remembered."""
+"""Beginning of a verdict on the attempt, not on the library (no time, no memory): it is not cached."""
 
 # The kernel holds a `max`: libLLVM 15 compiles everything up to it and then aborts the process.
 _PROBE = """
@@ -70,7 +70,7 @@ class Candidate:
 
 
 def requested_variant(variant: str | None = None) -> str:
-    """Give the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default."""
+    """Return the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default."""
     return variant or os.environ.get(VARIANT_VARIABLE) or DEFAULT_VARIANT
 
 
@@ -97,7 +97,7 @@ def _packaged_library() -> str | None:
 
 
 def _system_libraries() -> list[str]:
-    """Give the system's libLLVM files, the newest version first, each file once."""
+    """Return the system's libLLVM files, the newest version first, each file once."""
     folders = ["/usr/lib", "/usr/lib64", "/usr/local/lib", *map(str, Path("/usr/lib").glob("*-linux-gnu"))]
     folders += map(str, Path("/usr/lib").glob("llvm-*/lib"))
     versions: dict[str, tuple[int, ...]] = {}
@@ -114,18 +114,7 @@ def _system_libraries() -> list[str]:
 
 
 def probe(candidate: Candidate) -> Candidate:
-    """Try a library in a child process; the verdict is cached per file (path, size, time of change).
-
-    Parameters
-    ----------
-    candidate : Candidate
-        An untried library.
-
-    Returns
-    -------
-    Candidate
-        With its verdict.
-    """
+    """Try a library in a child process; return it with the verdict, cached per file (path, size, time of change)."""
     path = Path(candidate.path)
     if path.is_dir():
         verdict = "is a folder; must be the file libLLVM.so itself"
@@ -139,7 +128,7 @@ def probe(candidate: Candidate) -> Candidate:
         verdict = cache.get(key) or _run_probe(str(path))
         if cache.get(key) != verdict and not verdict.startswith(UNTRIED):
             _write_cache({**cache, key: verdict})
-    return Candidate(candidate.origin, candidate.path, verdict)
+    return replace(candidate, verdict=verdict)
 
 
 def _run_probe(path: str) -> str:
@@ -182,15 +171,7 @@ def _write_cache(cache: dict[str, str]) -> None:
 
 
 def choose_library() -> tuple[Candidate | None, list[Candidate]]:
-    """Try the candidates in order until one survives.
-
-    Returns
-    -------
-    chosen : Candidate or None
-        The first that works.
-    tried : list of Candidate
-        All that were tried, with verdicts.
-    """
+    """Try the candidates in order; return the first that works, if any, and all that were tried, with verdicts."""
     tried = []
     for candidate in candidates():
         tried.append(probe(candidate))
@@ -200,7 +181,7 @@ def choose_library() -> tuple[Candidate | None, list[Candidate]]:
 
 
 def load(variant: str | None = None) -> Any:
-    """Give the mitsuba module with its variant set; every use of the renderer goes through here.
+    """Return the mitsuba module with its variant set; every use of the renderer goes through here.
 
     Parameters
     ----------
@@ -218,6 +199,7 @@ def load(variant: str | None = None) -> Any:
         If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
+    # Library: chosen before Dr.Jit is imported, checked afterwards.
     if _drjit_loaded():
         if name.startswith("llvm"):
             _check_library_in_memory()
@@ -225,6 +207,7 @@ def load(variant: str | None = None) -> Any:
         _set_library(needed=name.startswith("llvm"))
     import mitsuba
 
+    # Variant.
     usable = [v for v in mitsuba.variants() if re.fullmatch(r"(llvm|cuda)_ad_(mono|rgb)", v)]
     if name not in usable:
         raise BackendError(f"variant {name!r}: cannot be used; allowed: {', '.join(usable)}")
@@ -233,7 +216,7 @@ def load(variant: str | None = None) -> Any:
             mitsuba.set_variant(name)
             if threads := os.environ.get("SIMTEST_THREADS"):
                 _limit_threads(threads)
-            # The first use tells: a GPU variant is accepted without a GPU.
+            # Use it once: without a GPU a GPU variant fails here, not when it is set.
             mitsuba.Float(0.0) + 1.0
         except (ImportError, RuntimeError) as error:
             cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
@@ -242,7 +225,7 @@ def load(variant: str | None = None) -> Any:
 
 
 def release_memory() -> None:
-    """Give back what scenes that are gone have held: Dr.Jit keeps freed arrays for the next ones."""
+    """Free the memory of scenes that are gone: Dr.Jit keeps freed arrays for the next ones."""
     import drjit
 
     gc.collect()
@@ -258,12 +241,12 @@ def _limit_threads(threads: str) -> None:
 
 
 def _drjit_loaded() -> bool:
-    """Tell whether Dr.Jit has been imported, and has loaded its libLLVM: then there is nothing left to choose."""
+    """Return whether Dr.Jit has been imported and has loaded its libLLVM, so that nothing is left to choose."""
     return "drjit" in sys.modules
 
 
 def _set_library(needed: bool) -> None:
-    """Tell Dr.Jit which libLLVM to load, whatever the variant: it does so once, when it is imported."""
+    """Set the libLLVM that Dr.Jit loads, whatever the variant: it does so once, when it is imported."""
     chosen, tried = choose_library()
     if chosen is None:
         if needed:
@@ -277,11 +260,11 @@ def _set_library(needed: bool) -> None:
 
 
 _chosen: set[str] = set()
-"""The library that this process told Dr.Jit to load, once it did."""
+"""The library that this process chose for Dr.Jit, once it did."""
 
 
 def _check_library_in_memory() -> None:
-    """Refuse a libLLVM that something else made Dr.Jit load and that would end the process.
+    """Raise `BackendError` if something else made Dr.Jit load a libLLVM that would end the process.
 
     Where simtest chose the library, others may be in memory too: Mesa's software renderer brings its own.
     """
@@ -297,7 +280,7 @@ def _check_library_in_memory() -> None:
 
 
 def _mapped_libraries() -> list[str]:
-    """Give the libLLVM files that are mapped into this process; none where the system does not tell."""
+    """Return the libLLVM files that are mapped into this process; none where the system does not list them."""
     try:
         maps = Path("/proc/self/maps").read_text()
     except OSError:
@@ -306,36 +289,54 @@ def _mapped_libraries() -> list[str]:
 
 
 def library_in_use() -> str | None:
-    """Give the libLLVM that this process was told to use, or None."""
+    """Return the libLLVM that this process was told to use, or None."""
     return os.environ.get(LIBRARY_VARIABLE) or None
 
 
 def no_library_message(tried: list[Candidate]) -> str:
-    """Say in one line why no library works and the three ways to mend it."""
+    """Return one line: why no library works, and the three ways to mend it."""
     causes = "; ".join(f"{c.path} ({c.origin}): {c.verdict}" for c in tried) or "none found"
     return f"no usable libLLVM: {causes}. To mend it: {MENDING}"
 
 
-def describe(variant: str | None = None) -> dict[str, Any]:
-    """Give what `simtest doctor` reports: variant, candidates with verdicts, the choice, versions.
+@dataclass(frozen=True)
+class BackendReport:
+    """State of the backend, as `simtest doctor` reports it.
 
     Parameters
     ----------
-    variant : str, optional
-        See `requested_variant`.
-
-    Returns
-    -------
-    dict
-        JSON-ready.
+    variant : str
+        Mitsuba variant.
+    library : str or None
+        The libLLVM that would be used.
+    candidates : list of Candidate
+        Libraries that were tried, with verdicts.
+    versions : dict
+        Version by package.
+    problem : str or None
+        Why it cannot render, one line.
     """
+
+    variant: str
+    library: str | None
+    candidates: list[Candidate]
+    versions: dict[str, str]
+    problem: str | None
+
+    @property
+    def can_render(self) -> bool:
+        """Whether no problem was found."""
+        return self.problem is None
+
+    def to_json(self) -> Json:
+        """Return what `simtest doctor --json` prints."""
+        return {**asdict(self), "can_render": self.can_render}
+
+
+def library_report(variant: str | None = None) -> BackendReport:
+    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
     name = requested_variant(variant)
     chosen, tried = choose_library() if name.startswith("llvm") else (None, [])
-    versions = {p: importlib.metadata.version(p) for p in ("mitsuba", "drjit")}
-    return {
-        "variant": name,
-        "library": chosen.path if chosen else None,
-        "candidates": [asdict(c) for c in tried],
-        "versions": versions,
-        "problem": no_library_message(tried) if name.startswith("llvm") and chosen is None else None,
-    }
+    versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
+    problem = no_library_message(tried) if name.startswith("llvm") and chosen is None else None
+    return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)

@@ -3,35 +3,21 @@
 import json
 import subprocess
 import sys
-from typing import Any
+from dataclasses import replace
 
 from simtest.rendering import backend
 
 RENDER_TIMEOUT_S = 180
 
 
-def examine(variant: str | None = None) -> dict[str, Any]:
-    """Examine the rendering backend; this process loads nothing.
-
-    Parameters
-    ----------
-    variant : str, optional
-        See `simtest.rendering.backend.requested_variant`.
-
-    Returns
-    -------
-    dict
-        JSON-ready: variant, library, candidates with verdicts, versions, can_render, and problem (one line, or None).
-    """
-    report = backend.describe(variant)
-    if report["problem"] is None:
-        report["problem"] = _try_rendering(report["variant"])
-    report["can_render"] = report["problem"] is None
-    return report
+def examine(variant: str | None = None) -> backend.BackendReport:
+    """Examine the rendering backend (see `simtest.rendering.backend.requested_variant`); this process loads nothing."""
+    report = backend.library_report(variant)
+    return replace(report, problem=_try_rendering(report.variant)) if report.can_render else report
 
 
 def _try_rendering(variant: str) -> str | None:
-    """Render a plane in a child process; gives the problem, or None."""
+    """Render a plane in a child process; return the problem, or None."""
     command = [sys.executable, "-m", "simtest.rendering.backend_check", variant]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S)

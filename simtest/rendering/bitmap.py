@@ -1,4 +1,4 @@
-"""Writing radiance with Mitsuba's own image library."""
+"""Reads and writes OpenEXR files with Mitsuba's own image library."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def read_bitmap(path: Path, variant: str | None = None) -> FloatImage:
     Raises
     ------
     InputError
-        If it is none.
+        If the file is not an image.
     """
     mi = backend.load(variant)
     try:

@@ -1,6 +1,6 @@
-"""How lights emit, as Dr.Jit expressions, and as a Mitsuba emitter for the integrators that follow bounces.
+"""Emission of the lights: as Dr.Jit expressions for direct light, and as a Mitsuba emitter for further bounces.
 
-Both use one function, so that direct light and inter-reflections come from the same lights.
+Both call `factor`, so that direct light and inter-reflections come from the same lights.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from simtest.rendering import lobes
-from simtest.rendering.spectrum import spectrum
+from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
 from simtest.spec.falloff import CosineProfile, TableProfile
 from simtest.spec.rig import LightSpec
 
@@ -19,8 +19,8 @@ PLUGIN = "simtest_light"
 
 
 @dataclass(frozen=True)
-class Kind:
-    """What of a light is compiled into the kernel; all else is a parameter.
+class LightKind:
+    """What of a light is compiled into the kernel; everything else is a parameter.
 
     Parameters
     ----------
@@ -40,35 +40,21 @@ class Kind:
     plain: bool
 
 
-def kind_of(light: LightSpec) -> Kind:
-    """Give the kind of a light."""
+def kind_of(light: LightSpec) -> LightKind:
+    """Return the kind of a light."""
     plain = light.is_isotropic and len(set(light.colour)) == 1
     match light.profile:
         case TableProfile():
-            return Kind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain)
+            return LightKind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain)
         case CosineProfile():
             uniform = light.profile.power == 0
-            return Kind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain)
+            return LightKind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain)
 
 
-def parameters(mi: Any, light: LightSpec, place: Any, axis: Any) -> dict[str, Any]:
-    """Give the values of the emitter's parameters by name.
-
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    light : LightSpec
-        The light.
-    place, axis : ndarray, shape (3,)
-        In the model frame; mm and unit.
-
-    Returns
-    -------
-    dict
-    """
+def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
+    """Return the emitter's parameters by name; position, mm, and unit axis, shape (3,), are in the model frame."""
     values = {
-        "position": mi.Point3f(*place.tolist()),
+        "position": mi.Point3f(*position.tolist()),
         "axis": mi.Vector3f(*axis.tolist()),
         "intensity": mi.Spectrum(spectrum(mi, [light.power * c for c in light.colour])),
         "exponent": mi.Float(light.profile.power if isinstance(light.profile, CosineProfile) else 0.0),
@@ -81,17 +67,17 @@ def parameters(mi: Any, light: LightSpec, place: Any, axis: Any) -> dict[str, An
     return values
 
 
-def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
-    """Give the emission into unit directions away from a light, relative to the axis.
+def factor(mi: Any, kind: LightKind, values: MitsubaDict, away: Any) -> Any:
+    """Compute the emission into unit directions away from a light, relative to that along its axis.
 
     Parameters
     ----------
     mi : module
         mitsuba with the variant set.
-    kind : Kind
+    kind : LightKind
         The light's.
-    values : dict
-        See `parameters`.
+    values : MitsubaDict
+        Its `parameters`.
     away : mitsuba.Vector3f
         Unit directions.
 
@@ -105,6 +91,7 @@ def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
         return mi.Float(1)
     axis = values["axis"]
     value = mi.Float(1)
+    # Angular profile.
     if kind.profile == "cosine":
         log_cosine, ahead = lobes.log_cosine(away, axis)
         value = dr.select(ahead, dr.exp(values["exponent"] * log_cosine), 0)
@@ -113,6 +100,7 @@ def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
         angle = dr.atan2(dr.norm(dr.cross(axis, away)), dr.dot(axis, away))
         if kind.profile == "table":
             value = _interpolate(mi, values["angles"], values["values"], angle, kind.entries)
+        # Cut-off, with a linear edge where it is soft.
         if kind.spot:
             inside, edge = values["rim"] - angle, values["edge"]
             soft = dr.clip(inside / dr.maximum(edge, 1e-12), 0, 1)
@@ -121,7 +109,7 @@ def factor(mi: Any, kind: Kind, values: dict[str, Any], away: Any) -> Any:
 
 
 def _interpolate(mi: Any, knots: Any, values: Any, x: Any, entries: int) -> Any:
-    """Interpolate a table linearly; the last value holds beyond it."""
+    """Interpolate a table linearly; beyond its end the last value holds."""
     import drjit as dr
 
     upper = dr.binary_search(1, entries - 1, lambda i: dr.gather(mi.Float, knots, i) < x)
@@ -130,19 +118,18 @@ def _interpolate(mi: Any, knots: Any, values: Any, x: Any, entries: int) -> Any:
     return dr.lerp(dr.gather(mi.Float, values, upper - 1), dr.gather(mi.Float, values, upper), share)
 
 
-def emitter_dict(kind: Kind) -> dict[str, Any]:
-    """Describe a light of a kind to `mi.load_dict`; its parameters are set afterwards."""
+def emitter_dict(kind: LightKind) -> MitsubaDict:
+    """Describe a light of a kind to `mi.load_dict`; `emitter_values` sets its parameters afterwards."""
     if kind.plain:
         return {"type": "point", "intensity": {"type": "uniform", "value": 1.0}}
     return {"type": PLUGIN, "profile": kind.profile, "entries": kind.entries, "spot": kind.spot}
 
 
-def emitter_values(mi: Any, kind: Kind, light: LightSpec, place: Any, axis: Any) -> dict[str, Any]:
-    """Give what to write into the emitter that `emitter_dict` describes, by parameter (see `parameters`)."""
-    if not kind.plain:
-        values = parameters(mi, light, place, axis)
-        return {name: value for name, value in values.items() if name not in ("angles", "values") or kind.entries}
-    return {"position": mi.Point3f(*place.tolist()), "intensity.value": light.power * light.colour[0]}
+def emitter_values(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
+    """Return the values for the emitter that `emitter_dict` describes, by parameter path (see `parameters`)."""
+    if kind_of(light).plain:
+        return {"position": mi.Point3f(*position.tolist()), "intensity.value": light.power * light.colour[0]}
+    return parameters(mi, light, position, axis)
 
 
 @cache
@@ -161,8 +148,8 @@ def _make_class(mi: Any, variant: str) -> Any:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.kind = Kind(props["profile"], props["entries"], props["spot"], False)
-            self.parts: dict[str, Any] = {
+            self.kind = LightKind(props["profile"], props["entries"], props["spot"], False)
+            self.parts: MitsubaDict = {
                 "position": mi.Point3f(0), "axis": mi.Vector3f(0, 0, 1), "intensity": mi.Spectrum(1),
                 "exponent": mi.Float(0), "rim": mi.Float(dr.pi), "edge": mi.Float(0),
             }  # fmt: skip

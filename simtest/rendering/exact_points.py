@@ -1,11 +1,15 @@
-"""From a ray tracer's hits to exact points of the smooth surface, in double precision."""
+"""Exact points of the smooth surface, in double precision, from a ray tracer's hits."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from simtest.rendering.frames import Array, TruthMaps
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
+
+_OF_POINTS = ("position", "normal", "k_min", "k_max", "direction_min", "direction_max")
+"""Truth maps that are named as in `SurfacePoints`."""
 
 
 def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
@@ -35,12 +39,14 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
         return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
     import drjit as dr
 
+    # Rays that exist.
     asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
     # No NaN may enter the renderer.
     ray = mi.Ray3f(
         mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),
         mi.Vector3f(_columns(np.where(asked[:, None], directions, [0.0, 0.0, 1.0]))),
     )
+    # Hits: what the exact solution starts from, and the normals of the rendered shape.
     preliminary = scene.ray_intersect_preliminary(ray, False, mi.Bool(asked))
     si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(asked))
     valid = si.is_valid()
@@ -54,6 +60,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
     )
     shading, geometric = (np.array(n, dtype=np.float64).T for n in normals)
     if shape.kind == "mesh":
+        # A triangle may be seen from behind.
         with np.errstate(invalid="ignore"):
             geometric = geometric * np.where(np.einsum("ij,ij->i", geometric, directions) > 0, -1.0, 1.0)[:, None]
     for normal in (shading, geometric):
@@ -64,7 +71,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
 def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
     """Make `RayHits` from single-precision values, shapes (N,), (N,) and (N, 2); a NaN distance is a miss."""
     missed = np.isnan(distance)
-    # What a miss left in its place may be no number: it is dropped before it is converted.
+    # The values of a miss may not be numbers: replace them before the conversion.
     return RayHits(
         np.where(missed, np.float32(np.inf), distance).astype(np.float64),
         np.where(missed, 0, face).astype(np.int64),
@@ -73,39 +80,24 @@ def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
 
 
 def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-    """Give the exact points on rays of the model frame, shape (N, 3), in the camera frame."""
+    """Compute the exact points, in the camera frame, on rays of the model frame, shape (N, 3)."""
     exact = surface.points(np.asarray(origins), directions, hits)
     rotation = surface.model_from_camera[:3, :3]
-    return SurfacePoints(
-        distance=exact.distance,
+    return replace(
+        exact,
         position=(exact.position - surface.model_from_camera[:3, 3]) @ rotation,
         normal=exact.normal @ rotation,
-        k_min=exact.k_min,
-        k_max=exact.k_max,
         direction_min=exact.direction_min @ rotation,
         direction_max=exact.direction_max @ rotation,
-        valid=exact.valid,
     )
 
 
 def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tuple[int, int]) -> TruthMaps:
     """Arrange points and the renderer's normals, all of H W rays in the camera frame, as maps of `size` (H, W)."""
-
-    def image(values: Array) -> Array:
-        return values.reshape(*size, *values.shape[1:])
-
-    return TruthMaps(
-        depth=image(points.distance),
-        position=image(points.position),
-        normal=image(points.normal),
-        shading_normal=image(shading),
-        geometric_normal=image(geometric),
-        k_min=image(points.k_min),
-        k_max=image(points.k_max),
-        direction_min=image(points.direction_min),
-        direction_max=image(points.direction_max),
-        mask=points.valid.reshape(size),
-    )
+    maps = {"depth": points.distance, "shading_normal": shading, "geometric_normal": geometric}
+    maps |= {name: getattr(points, name) for name in _OF_POINTS}
+    images = {name: values.reshape(*size, *values.shape[1:]) for name, values in maps.items()}
+    return TruthMaps(**images, mask=points.valid.reshape(size))
 
 
 def _columns(values: Array) -> Any:

@@ -1,4 +1,4 @@
-"""What a session gives: radiance, ground-truth maps and the true highlights."""
+"""Records that a session returns: radiance, labels, ground-truth maps and highlight points."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Radiance:
-    """Linear radiance, relative units (power per steradian over mm^2), split by its way.
+    """Linear radiance, relative units (power per steradian over mm^2), split by light path.
 
     Parameters
     ----------
     specular, diffuse, indirect : ndarray of float32, shape (H, W) or (H, W, 3)
-        Direct light off the specular lobe, off the diffuse base, and light of more than one bounce. Two
-        dimensions in mono variants.
+        Direct light off the specular lobe, direct light off the diffuse base, and light of more than one bounce.
+        Two dimensions in mono variants.
     """
 
     specular: FloatImage
@@ -132,7 +132,7 @@ class TruthMaps:
 
 
 @dataclass(frozen=True)
-class TrueHighlight:
+class HighlightPoint:
     """A surface point where the normal bisects the directions to a light and to the camera.
 
     Parameters
@@ -141,8 +141,8 @@ class TrueHighlight:
         Index of the light in the rig.
     bp_px : ndarray, shape (2,)
         Sub-pixel position in the image.
-    position, normal : ndarray, shape (3,)
-        Camera frame; mm and unit.
+    position, normal, direction_min : ndarray, shape (3,)
+        Camera frame: point, mm, unit normal, and unit principal direction of the smaller curvature.
     distance : float
         d, mm.
     kd_min, kd_max : float
@@ -151,22 +151,20 @@ class TrueHighlight:
         Whether the light reaches the point.
     radiance : float
         Radiance at the nearest pixel.
-    direction_min : ndarray, shape (3,), optional
-        Unit principal direction of the smaller curvature, camera frame.
     """
 
     light: int
     bp_px: Array
     position: Array
     normal: Array
+    direction_min: Array
     distance: float
     kd_min: float
     kd_max: float
     lit: bool
     radiance: float
-    direction_min: Array | None = None
 
     @property
     def min_gain(self) -> float:
-        """Least abs(1 + d k): near 0 the spot is a streak or a ring."""
+        """Least abs(1 + d k): near 0 the highlight is a streak or a ring."""
         return min(abs(1 + self.kd_min), abs(1 + self.kd_max))

@@ -1,6 +1,6 @@
-"""True highlights: sub-pixel points where the normal bisects the directions to the light and to the camera.
+"""Highlight points: where the normal bisects the directions to a light and to the camera, sub-pixel.
 
-The misfit w between normal and bisector is a two-vector field over the image; its zeros are found by Newton steps
+The misfit w between normal and bisector is a two-vector field over the image. Newton steps find its zeros, starting
 from the pixels whose own step lands next to them (theory.md sections 3 and 6).
 """
 
@@ -12,12 +12,12 @@ import numpy as np
 
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.rendering.frames import Array, Radiance, TrueHighlight
+from simtest.rendering.frames import Array, HighlightPoint, Radiance
 from simtest.spec.scene import Scene
 from simtest.surfaces.model import SurfacePoints
 
 MIN_GAIN = 0.05
-"""Where abs(1 + d k) is smaller the point is no point but a streak; seeds there are not followed."""
+"""Where abs(1 + d k) is smaller the highlight is a streak, not a point: such seeds are dropped."""
 
 NEWTON_STEPS = 30
 DIFFERENCE_PX = 0.05
@@ -30,28 +30,28 @@ NEAR_CELLS = 2.0
 """A seed's own Newton step is shorter than this."""
 
 ROUGH_CELLS, STEEP = 8.0, 0.15
-"""Exact points are found where the misfit of the rendered shape makes the step shorter than this, or changes by more
-within a cell, as at an edge that hides something: there any step may be short."""
+"""Exact points are solved where the misfit of the rendered shape makes the step shorter than this, or changes by more
+within a cell, as at an occluding edge: there any step may be short."""
 
 
 class Caster(Protocol):
-    """What the search needs of a rendering session."""
+    """The part of a rendering session that the search needs."""
 
     scene: Scene
     camera: Camera
 
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Give the exact points on the rays of pixels (see `Session.cast`)."""
+        """Return the exact points on the rays of pixels (see `Session.cast`)."""
 
     def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
-        """Give points and normals of the rendered shape on the rays of pixels (see `Session.cast_rendered`)."""
+        """Return points and normals of the rendered shape on the rays of pixels (see `Session.cast_rendered`)."""
 
     def lit(self, positions: Array, light: int) -> Any:
-        """Tell which points a light reaches (see `Session.lit`)."""
+        """Return which points a light reaches (see `Session.lit`)."""
 
 
 def misfit(position: Array, normal: Array, light: Array) -> Array:
-    """Give the normal minus the bisector of the directions to light and camera, across the sightline.
+    """Compute the normal minus the bisector of the directions to light and camera, across the sightline.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ def misfit(position: Array, normal: Array, light: Array) -> Array:
     return np.stack([np.sum(first * gap, axis=1), np.sum(second * gap, axis=1)], axis=1)
 
 
-def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight]:
-    """Find the true highlights of all lights in view.
+def find(session: Caster, radiance: Radiance, stride: int) -> list[HighlightPoint]:
+    """Find the highlight points of all lights in view.
 
     Parameters
     ----------
@@ -85,30 +85,33 @@ def find(session: Caster, radiance: Radiance, stride: int) -> list[TrueHighlight
     radiance : Radiance
         Of the same frame.
     stride : int
-        Distance of the seeds' grid, px.
+        Spacing of the seeds' grid, px.
 
     Returns
     -------
-    list of TrueHighlight
+    list of HighlightPoint
         The brightest first.
     """
     camera = session.camera
-    places = session.scene.rig.true_mm()
-    grid = _seed_grid(session, stride, places)
+    lights = session.scene.rig.true_mm()
+    pixels, points = _seed_grid(session, stride, lights)
     found = []
-    for index, place in enumerate(places):
-        seeds = _seeds(grid[0], grid[1], place, stride)
-        solutions = _newton(session, seeds, place)
+    for index, light in enumerate(lights):
+        # Candidates: pixels of the grid whose own Newton step is short.
+        seeds = _seeds(pixels, points, light, stride)
+        # Refine on the exact surface.
+        solutions = _newton(session, seeds, light)
+        # Reject what left the frame and what was found twice.
         solutions = _distinct(solutions[camera.contains(solutions)])
         if len(solutions):
             found += _describe(session, radiance, solutions, index)
     return sorted(found, key=lambda highlight: -highlight.radiance)
 
 
-def _seed_grid(session: Caster, stride: int, places: Array) -> tuple[Array, SurfacePoints]:
-    """Give pixel centres on a grid, shape (h, w, 2), with exact points, flattened: those that seeds may come of.
+def _seed_grid(session: Caster, stride: int, lights: Array) -> tuple[Array, SurfacePoints]:
+    """Return pixel centres on a grid, shape (h, w, 2), with their exact points, flattened, where there may be seeds.
 
-    The others' are NaN. Exact points cost tens of times what those of the rendered shape do, and seeds are few.
+    Elsewhere the points are NaN: an exact point costs tens of times one of the rendered shape, and seeds are few.
     """
     camera = session.camera
     pixels = camera.pixel_centres()[stride // 2 :: stride, stride // 2 :: stride]
@@ -118,34 +121,34 @@ def _seed_grid(session: Caster, stride: int, places: Array) -> tuple[Array, Surf
     if min(height, width) >= 3:
         position, normal = session.cast_rendered(centres)
         asked[:] = False
-        for place in places:
-            asked |= _may_be_near(misfit(position, normal, place).reshape(height, width, 2))
+        for light in lights:
+            asked |= _may_be_near(misfit(position, normal, light).reshape(height, width, 2))
     chosen = asked.ravel()
     found = session.cast(centres[chosen])[0]
     return pixels, SurfacePoints(**{f.name: _spread(getattr(found, f.name), chosen) for f in fields(found)})
 
 
 def _spread(values: Any, chosen: Any) -> Any:
-    """Give rows their places among all; the others' are NaN, or False."""
+    """Spread rows over the chosen indices of a longer table; the others are NaN, or False."""
     table = np.full((len(chosen), *values.shape[1:]), False if values.dtype == bool else np.nan, dtype=values.dtype)
     table[chosen] = values
     return table
 
 
 def _may_be_near(w: Array) -> Any:
-    """Tell on which pixels of a grid exact points are needed to know its seeds, shape (h, w)."""
+    """Return on which pixels of a grid, shape (h, w), the seeds depend on exact points."""
     along_x, along_y, step_x, step_y = _newton_steps(w)
     with np.errstate(invalid="ignore"):
         short = np.hypot(step_x, step_y) < ROUGH_CELLS
         smooth = (np.abs(along_x) < STEEP).all(axis=-1) & (np.abs(along_y) < STEEP).all(axis=-1)
-    there = np.isfinite(w).all(axis=-1)
-    # The triangles' misfit is off by less than a cell's, and a step takes those beside its pixel.
+    on_surface = np.isfinite(w).all(axis=-1)
+    # Pixels around: the triangles' misfit may be off by up to a cell, and a step reads its neighbours.
     around = np.ones((5, 5), np.uint8)
-    return cv2.dilate((there & (short | ~smooth)).astype(np.uint8), around) > 0
+    return cv2.dilate((on_surface & (short | ~smooth)).astype(np.uint8), around) > 0
 
 
 def _newton_steps(w: Array) -> tuple[Array, Array, Array, Array]:
-    """Give the misfit's change per cell, twice shape (h, w, 2), and the step to its zero, cells, twice shape (h, w)."""
+    """Return the misfit's change per cell along x and y, (h, w, 2) each, and the steps to its zero, cells, (h, w)."""
     along_y, along_x = np.asarray(np.gradient(w, axis=0)), np.asarray(np.gradient(w, axis=1))
     determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -155,7 +158,7 @@ def _newton_steps(w: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> Array:
-    """Give the grid points whose own Newton step lands within two cells, shape (N, 2), px."""
+    """Return where the Newton steps of grid points lead, shape (N, 2), px, for steps shorter than two cells."""
     height, width = pixels.shape[:2]
     if min(height, width) < 3:
         return np.empty((0, 2))
@@ -169,7 +172,7 @@ def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> A
 
 
 def _newton(session: Caster, seeds: Array, light: Array) -> Array:
-    """Refine seeds to zeros of the misfit; gives those that converged, shape (M, 2), px."""
+    """Refine seeds to zeros of the misfit; return those that converged, shape (M, 2), px."""
     position = seeds.copy()
     step_length = np.full(len(position), np.inf)
     offsets = DIFFERENCE_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -179,6 +182,7 @@ def _newton(session: Caster, seeds: Array, light: Array) -> Array:
             break
         stencil = (position[active, None, :] + offsets).reshape(-1, 2)
         points = session.cast(stencil)[0]
+        # Jacobian from central differences.
         w = misfit(points.position, points.normal, light).reshape(-1, 5, 2)
         along_x = (w[:, 1] - w[:, 2]) / (2 * DIFFERENCE_PX)
         along_y = (w[:, 3] - w[:, 4]) / (2 * DIFFERENCE_PX)
@@ -188,11 +192,12 @@ def _newton(session: Caster, seeds: Array, light: Array) -> Array:
         step = np.full((len(active), 2), np.nan)
         step[solvable] = -np.linalg.solve(J[solvable], w[solvable, 0, :, None])[..., 0]
         length = np.linalg.norm(step, axis=1)
-        # A seed may be the very place already.
+        # Limit the step; a seed may be the solution already, and its step 0.
         with np.errstate(invalid="ignore", divide="ignore"):
             step *= np.minimum(1.0, MAX_STEP_PX / length)[:, None]
         position[active] += step
         step_length[active] = length
+        # Drop what left the surface or cannot be solved.
         keep = np.isfinite(position).all(axis=1)
         position, step_length = position[keep], step_length[keep]
     return position[step_length < CONVERGED_PX]
@@ -211,24 +216,24 @@ def _distinct(points: Array) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[TrueHighlight]:
+def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[HighlightPoint]:
     points, _, _ = session.cast(solutions)
     lit = session.lit(points.position, light)
     total = radiance.intensity
     columns = np.clip(solutions[:, 0].astype(int), 0, session.camera.width - 1)
     rows = np.clip(solutions[:, 1].astype(int), 0, session.camera.height - 1)
     return [
-        TrueHighlight(
+        HighlightPoint(
             light=light,
             bp_px=solutions[i],
             position=points.position[i],
             normal=points.normal[i],
+            direction_min=points.direction_min[i],
             distance=float(points.distance[i]),
             kd_min=float(points.distance[i] * points.k_min[i]),
             kd_max=float(points.distance[i] * points.k_max[i]),
             lit=bool(lit[i]),
             radiance=float(total[rows[i], columns[i]]),
-            direction_min=points.direction_min[i],
         )
         for i in np.flatnonzero(points.valid)
     ]

@@ -1,8 +1,8 @@
 """Hits on analytic shapes in double precision.
 
 Mitsuba's rays are single precision. At a silhouette the hit moves by the ray's rounding over the cosine of view, and
-the cosine of the light there is small itself: together a relative error of the radiance of 1e-4 and more, though the
-light is direct and the surface has a formula. So the hit is solved again from the ray as the camera gives it.
+the cosine of the light is small there too: together a relative error of the radiance of 1e-4 and more, although the
+light is direct and the surface has a formula. So the hit is solved again from the camera's own ray.
 """
 
 from typing import Any
@@ -15,18 +15,18 @@ _ROUND = {"sphere": (1.0, 1.0, 1.0), "cylinder": (1.0, 1.0, 0.0)}
 """Weights of the squared coordinates, whose sum is 1 on Mitsuba's unit shape."""
 
 SAME_HIT = 1e-2
-"""A solution farther than this from Mitsuba's hit, relative to the distance, is another one: Mitsuba's is kept."""
+"""A solution farther than this from Mitsuba's hit, relative to the distance, is another point: Mitsuba's is kept."""
 
 
 class Refinement:
-    """Solves hits on one shape again.
+    """Solves the hits on one shape again.
 
     Parameters
     ----------
     mi : module
         mitsuba with the variant set.
     shape : Shape
-        What is hit; hits on a mesh are left as they are.
+        The shape that was hit; hits on a mesh are left as they are.
     """
 
     def __init__(self, mi: Any, shape: Shape) -> None:
@@ -56,6 +56,7 @@ class Refinement:
         import drjit as dr
 
         mi = self.mi
+        # Solve on the unit shape.
         o, d = self._turn @ origin + self._shift, self._turn @ direction
         if self.shape.kind == "plane":
             t = -o.z / d.z
@@ -65,6 +66,7 @@ class Refinement:
             t = self._root(weights, o, d, mi.Float64(si.t))
             gradient = weights * (o + t * d)
         normal = dr.normalize(self._normals @ gradient) * (-1.0 if self.shape.flip else 1.0)
+        # Replace Mitsuba's values where the solution is the same hit.
         found = si.is_valid() & dr.isfinite(t) & (dr.abs(mi.Float(t) - si.t) < SAME_HIT * si.t)
         position = origin + t * direction
         si.p = dr.select(found, mi.Point3f(position), si.p)
@@ -73,12 +75,12 @@ class Refinement:
         si.wi = si.to_local(-mi.Vector3f(direction))
 
     def _root(self, weights: Any, o: Any, d: Any, near: Any) -> Any:
-        """Give the solution of |o + t d|^2 = 1, in the weighted norm, that is nearest to a distance; NaN for none."""
+        """Solve |o + t d|^2 = 1, in the weighted norm, for the t nearest to a distance; NaN where there is none."""
         import drjit as dr
 
         a, b, c = (dr.sum(weights * p * q) for p, q in ((d, d), (o, d), (o, o)))
         c -= 1
-        # The form without cancellation gives one root by q/a and the other by c/q.
+        # Without cancellation: one root is q/a, the other c/q.
         q = -(b + dr.copysign(dr.sqrt(b * b - a * c), b))
         first, second = q / a, c / q
         return dr.select(dr.abs(first - near) < dr.abs(second - near), first, second)

@@ -1,4 +1,4 @@
-"""Light of more than one bounce: one bounce is sampled, Mitsuba's path integrator follows it."""
+"""Light of more than one bounce: the first bounce is sampled here, Mitsuba's path integrator follows it."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ class Bounces:
         self._integrator = mi.load_dict({"type": "path", "max_depth": path_depth - 1, "rr_depth": path_depth})
 
     def radiance(self, si: Any, count: int, block: int, sample: int) -> Any:
-        """Give the radiance that surface points send back after two bounces and more.
+        """Sample the radiance that surface points send back after two or more bounces.
 
         Parameters
         ----------
@@ -34,7 +34,7 @@ class Bounces:
         count : int
             How many there are.
         block, sample : int
-            Their places in the frame and in each pixel: each pair has random numbers of its own.
+            Index of the launch in the frame and of the sample in each pixel: each pair has its own random numbers.
 
         Returns
         -------
@@ -46,7 +46,7 @@ class Bounces:
         sampler = mi.load_dict({"type": "independent"})
         branch = np.random.SeedSequence(self.seed, spawn_key=(sample, block))
         salt = mi.UInt32(int(branch.generate_state(1)[0]))
-        # Opaque: a seed in the kernel would compile it again for each sample.
+        # Opaque: a literal seed would compile another kernel for each sample.
         dr.make_opaque(salt)
         sampler.seed(salt, count)
         bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), si.is_valid())

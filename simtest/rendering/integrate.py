@@ -1,7 +1,7 @@
 """Traces a frame: one ray through each pixel's centre, or several samples a pixel, in launches of bounded size.
 
-A frame of one sample goes row by row, so that nothing has to be sorted; its labels come out of the same kernel. Several
-samples go in tiles of 4 x 4 pixels and are summed in registers, so that memory does not grow with their number.
+A frame of one sample is traced row by row, so that nothing has to be sorted; the same kernel computes its labels.
+Several samples are traced in tiles of 4 x 4 pixels and summed in registers: memory does not grow with their number.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,21 +15,21 @@ from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import FloatImage, Radiance
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
-from simtest.rendering.labels import ShapeLabels
+from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
-from simtest.rendering.spectrum import channels
+from simtest.rendering.shape_labels import ShapeLabels
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
 
 LANES = 2**22
-"""Pixels of one launch: they bound the memory. Another number gives bounces other noise, and changes nothing else."""
+"""Pixels of one launch: they bound the memory. Another number changes the noise of bounces, and nothing else."""
 
 RAYS = 2**24
-"""Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between two."""
+"""Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between launches."""
 
 SUMMED = 64
-"""Samples of a pixel that are summed in single precision; above that, sums are added in double precision."""
+"""Samples of a pixel that are summed in single precision; these sums are added in double precision."""
 
 Sums = npt.NDArray[np.float64]
 
@@ -62,10 +62,7 @@ class Tracer:
     refinement: Refinement
 
     def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Any]:
-        """Trace pixel positions; gives rays, hits and surface points.
-
-        With `bent` the points know the derivatives of their normals.
-        """
+        """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
         flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
@@ -74,7 +71,7 @@ class Tracer:
         return rays, preliminary, si
 
     def _parts(self, si: Any, bounces: Bounces | None, count: int, block: int, sample: int) -> list[Any]:
-        """Give the channels of direct light off the lobe and the base and, with bounces, of theirs."""
+        """Compute the channels of direct light off the lobe and off the base and, if asked for, of further bounces."""
         specular, diffuse = self.light.radiance(self.scene, self.material, si)
         parts = [*specular, *diffuse]
         if bounces is not None:
@@ -86,23 +83,12 @@ class Tracer:
     def centres(
         self, bounces: Bounces | None, radiance: bool, labels: ShapeLabels | None, progress: Progress | None = None
     ) -> tuple[list[FloatImage], list[FloatImage]]:
-        """Trace the ray through each pixel's centre.
-
-        Parameters
-        ----------
-        bounces : Bounces, optional
-            Further bounces.
-        radiance : bool
-            Whether to compute the radiance.
-        labels : ShapeLabels, optional
-            Whose labels to give beside it.
-        progress : callable, optional
-            Told after each launch.
+        """Trace the ray through each pixel's centre; `progress` is called after each launch.
 
         Returns
         -------
         parts, labels : list of ndarray of float32, shape (H, W)
-            Channels of the radiance and of the labels; empty where not asked for.
+            Channels of the radiance, with bounces if there are any, and of the labels; empty where not asked for.
         """
         camera = self.sightlines.camera
         pixels = camera.width * camera.height
@@ -111,14 +97,15 @@ class Tracer:
         for block, (first, count) in enumerate(_blocks(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
             rays, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
+            # Radiance and labels of one launch go into one kernel.
             parts = self._parts(si, bounces, count, block, 0) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
-                rotation = self.sightlines.camera_from_model
-                parts = parts + labels.trace(preliminary, si, rays, rotation)
+                parts = parts + labels.trace(preliminary, si, rays, self.sightlines.camera_from_model)
             rows.append(_evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
+        # Launches, row after row, become maps.
         shape = (camera.height, camera.width)
         maps = [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
                 for pieces in zip(*rows, strict=True)]  # fmt: skip
@@ -129,27 +116,14 @@ class Tracer:
     def mean(
         self, samples: int, seed: int, bounces: Bounces | None, progress: Progress | None = None
     ) -> list[FloatImage]:
-        """Give the mean radiance over the pixels' area.
+        """Compute the channels, shape (H, W) each, of the mean radiance over the pixels' area.
 
-        Parameters
-        ----------
-        samples : int
-            For each pixel.
-        seed : int
-            Of their places.
-        bounces : Bounces, optional
-            Further bounces.
-        progress : callable, optional
-            Told after each launch.
-
-        Returns
-        -------
-        list of ndarray of float32, shape (H, W)
-            Channels of the radiance.
+        `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
         """
         height, width = self.sightlines.tiled_size
         camera, total = self.sightlines.camera, height * width * samples
         blocks: list[npt.NDArray[np.float32]] = []
+        # Trace: sums over the samples of each block of pixels.
         for block, (first, count) in enumerate(_blocks(height * width)):
             lanes = self.sightlines.lanes(first, count, True, seed)
             sums: Sums | None = None
@@ -164,11 +138,12 @@ class Tracer:
                     progress(first * samples + count * stop, total, "rendering")
             assert sums is not None
             blocks.append((sums / samples).astype(np.float32))
+        # Arrange: from tiles to rows, without what lies beyond the frame.
         maps = untile(np.concatenate(blocks, axis=1), (height, width))
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
 
     def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
-        """Cut a pixel's samples into the runs of single launches."""
+        """Split a pixel's samples into the runs of single launches."""
         looped = bounces is None and self.sightlines.in_kernel
         step = max(1, min(SUMMED, RAYS // count)) if looped else 1
         for start in range(0, samples, step):
@@ -191,7 +166,7 @@ class Tracer:
         return sums
 
     def _single(self, lanes: Lanes, number: int, bounces: Bounces | None, count: int, block: int) -> list[Any]:
-        """Trace one sample of each pixel."""
+        """Trace the sample of one number of each pixel."""
         import drjit as dr
 
         which = self.mi.UInt32(number)
@@ -201,22 +176,22 @@ class Tracer:
 
 
 def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
-    """Cut a number of pixels into runs: first, count."""
+    """Split a number of pixels into runs: first, count."""
     for first in range(0, pixels, LANES):
         yield first, min(LANES, pixels - first)
 
 
 def _evaluate(values: list[Any], count: int) -> list[FloatImage]:
-    """Compute all channels in one kernel; a constant one is spread out."""
+    """Compute all channels in one kernel; a constant one is broadcast."""
     import drjit as dr
 
-    # Together: each alone would trace the rays again.
+    # Together: evaluated one by one, each would trace the rays again.
     dr.eval(values)
     return [np.broadcast_to(np.array(value, dtype=np.float32), (count,)) for value in values]
 
 
 def as_radiance(parts: list[FloatImage]) -> Radiance:
-    """Make a `Radiance` from channels: of the lobe, of the base and, if there are any, of further bounces."""
+    """Make a `Radiance` from the channels of the lobe, of the base and, if there are any, of further bounces."""
     width = 1 if len(parts) in (2, 3) else 3
 
     def image(first: int) -> FloatImage:

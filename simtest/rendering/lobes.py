@@ -4,11 +4,10 @@ from typing import Any
 
 
 def log_cosine(first: Any, second: Any) -> tuple[Any, Any]:
-    """Give log cos(beta), and whether beta is below 90 deg.
+    """Compute log cos(beta), and whether beta is below 90 deg.
 
-    With t = tan(beta/2) = |a - b|/|a + b|, log cos(beta) = -2 artanh(t^2). The cosine itself, by a dot product, has
-    lost the digits that count next to 1: its k-th power's relative error would be k eps, while this form's is
-    sqrt(k) eps within the lobe.
+    With t = tan(beta/2) = |a - b|/|a + b|, log cos(beta) = -2 artanh(t^2). A dot product loses the digits that matter
+    next to 1: the relative error of its k-th power would be k eps, that of this form is sqrt(k) eps within the lobe.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""From a scene's reflectance to Mitsuba BSDFs: the full one and its diffuse base alone."""
+"""Mitsuba BSDFs of a scene's reflectance: the full one and its diffuse base alone."""
 
 from typing import Any
 
-from simtest.rendering.spectrum import spectrum
+from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
 from simtest.spec.reflectance import (
     PhongReflectance,
     PrincipledReflectance,
@@ -13,7 +13,7 @@ from simtest.spec.reflectance import (
 AnyReflectance = PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance
 
 
-def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> dict[str, Any]:
+def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> MitsubaDict:
     """Describe a reflectance to `mi.load_dict`.
 
     Parameters
@@ -23,11 +23,7 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
     phong_plugin : str
         Name under which the Phong plugin is registered.
     diffuse_only : bool
-        Give the same material without its specular part: the difference of the two is the specular radiance.
-
-    Returns
-    -------
-    dict
+        Leave out the specular part. The difference between both radiances is the specular one.
     """
     specular = 0.0 if diffuse_only else 1.0
     base = {"type": "rgb", "value": [reflectance.diffuse * c for c in reflectance.colour]}
@@ -71,14 +67,14 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
 
 
 def parts_alone(reflectance: AnyReflectance) -> bool:
-    """Tell whether Mitsuba's components 0 and 1 of the BSDF are the lobe and the base."""
+    """Return whether components 0 and 1 of the BSDF are the lobe and the base."""
     return isinstance(reflectance, PhongReflectance)
 
 
-def parameter_updates(mi: Any, reflectance: AnyReflectance) -> dict[str, Any]:
-    """Give all that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
+def parameter_updates(mi: Any, reflectance: AnyReflectance) -> MitsubaDict:
+    """Return the values that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
 
-    Of the whole BSDF and of its diffuse base alike, but for Phong's lobe, which has no base of its own.
+    The paths hold for the whole BSDF and for its diffuse base; Phong's lobe has no base of its own.
     """
     base = spectrum(mi, [reflectance.diffuse * c for c in reflectance.colour])
     match reflectance:

@@ -1,4 +1,4 @@
-"""A scene as a Mitsuba XML file with its mesh, that Mitsuba itself loads and renders to the same picture."""
+"""Writes a scene as a Mitsuba XML file with its mesh, which Mitsuba itself loads and renders to the same picture."""
 
 import math
 import re
@@ -15,6 +15,7 @@ from simtest.geometry.camera import Camera
 from simtest.rendering import backend, phong
 from simtest.rendering.frames import Array
 from simtest.rendering.materials import bsdf_dict
+from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.shapes import make_shape
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically
@@ -26,7 +27,7 @@ from simtest.surfaces import Shape, SurfaceModel, make_surface
 SCENE_FILE, MESH_FILE = "scene.xml", "surface.ply"
 
 SAMPLES = 64
-"""Samples a pixel where a single ray through its centre cannot do: several lights, or light that bounces."""
+"""Samples a pixel where one ray through its centre is not enough: several lights, or light that bounces."""
 
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's cameras look along z too, but with x to the left and y up."""
@@ -38,7 +39,7 @@ VIEW_MARGIN = 1.05
 """Half-size of an exported plane over the farthest point that is seen of it."""
 
 _CAMERA_KEYS = frozenset({"width", "height", "fx", "fy", "cx", "cy", "skew"})
-# A preset's lights stand in `lights`; the seed draws the places that are rendered.
+# A preset's lights stand in `lights`; the seed draws the positions that are rendered.
 _RIG_KEYS = frozenset(
     {"lights", "preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each", "seed", "emission_known"}
 )
@@ -48,7 +49,7 @@ _LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "di
 def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
     """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply.
 
-    The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) has no place in it.
+    The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
 
     Parameters
     ----------
@@ -72,6 +73,7 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     BackendError
         If the rendering backend cannot be used.
     """
+    # Check before anything is written.
     for key, value, why in _inexpressible(scene):
         raise InputError(f"scene {scene.name}: {key} = {value!r}: cannot be exported; {why}")
     mi = backend.load(variant)
@@ -94,7 +96,7 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
 
 
 def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
-    """Give the keys, values and reasons of what Mitsuba's perspective camera and point lights cannot do."""
+    """Yield key, value and reason of everything that Mitsuba's perspective camera and point lights cannot express."""
     camera = scene.camera
     if camera.fx != camera.fy:
         yield "camera.fx", camera.fx, f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
@@ -107,7 +109,7 @@ def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
 
 
 def _beyond(spec: Spec, known: frozenset[str], path: str, what: str) -> Iterator[tuple[str, Any, str]]:
-    """Give what a part of the scene sets beyond the keys that are exported: refused rather than left out."""
+    """Yield what a part of the scene sets beyond the exported keys: it is refused rather than left out."""
     for name, field in type(spec).model_fields.items():
         default = field.get_default(call_default_factory=True, validated_data={})
         value = getattr(spec, name)
@@ -138,7 +140,7 @@ def _cut_to_view(shape: Shape, surface: SurfaceModel, camera: Camera) -> Shape:
     return replace(shape, parameters={"to_model": np.diag([reach, reach, 1.0, 1.0])})
 
 
-def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> dict[str, Any]:
+def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
     camera = scene.camera.model()
     if shape.mesh:
         scale = float(np.linalg.norm(np.ptp(shape.mesh.vertices, axis=0)))
@@ -165,12 +167,12 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> dict[str, Any]
 
 
 def _through_centres(scene: Scene) -> bool:
-    """Tell whether one ray through each pixel's centre gives the picture: with one light that does not bounce."""
+    """Return whether one ray through each pixel's centre renders the picture: with one light that does not bounce."""
     effort = scene.render
     return effort.samples_per_pixel == 1 and effort.path_depth == 2 and len(scene.rig.lights) == 1
 
 
-def _sampler(scene: Scene) -> dict[str, Any]:
+def _sampler(scene: Scene) -> MitsubaDict:
     if _through_centres(scene):
         # One stratum without jitter: the ray through the pixel's centre.
         return {"type": "stratified", "sample_count": 1, "jitter": False}
@@ -178,15 +180,15 @@ def _sampler(scene: Scene) -> dict[str, Any]:
     return {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": scene.render.seed}
 
 
-def _lights(scene: Scene, surface: SurfaceModel) -> dict[str, Any]:
+def _lights(scene: Scene, surface: SurfaceModel) -> MitsubaDict:
     pose = surface.model_from_camera
     return {
         f"light_{i}": {
             "type": "point",
-            "position": (pose[:3, :3] @ place + pose[:3, 3]).tolist(),
+            "position": (pose[:3, :3] @ position + pose[:3, 3]).tolist(),
             "intensity": {"type": "uniform", "value": light.power},
         }
-        for i, (light, place) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
+        for i, (light, position) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
     }
 
 
@@ -200,23 +202,25 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
         "surface": {"type": "ply", "filename": MESH_FILE, "bsdf": bsdf} if shape.mesh else make_shape(mi, shape, bsdf),
         **_lights(scene, surface),
     }
+    # Let Mitsuba write its XML.
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
     for node in state.nodes:
         if node.props.plugin_name() == plugin:
-            # Mitsuba does not know what a plugin written in Python is.
+            # Mitsuba does not know the kind of a plugin written in Python.
             node.type = mi.ObjectType.BSDF
     written = mi.parser.write_string(state, add_section_headers=True)
+    # Replace the transforms, add the comment at the head.
     root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    _place(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
+    _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
     if not shape.mesh:
-        _place(root, "shape", shape.parameters["to_model"])
+        _set_transform(root, "shape", shape.parameters["to_model"])
     root.insert(0, ET.Comment(_head(scene)))
     ET.indent(root, " " * 4)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _place(root: ET.Element, tag: str, world_from_local: Array) -> None:
-    """Give an object its transform as a matrix: Mitsuba's writer decomposes it, wrongly where it is anisotropic."""
+def _set_transform(root: ET.Element, tag: str, world_from_local: Array) -> None:
+    """Write an object's transform as a matrix: Mitsuba's writer decomposes it, wrongly where it is anisotropic."""
     element = root.find(tag)
     assert element is not None
     for written in element.findall("transform"):
@@ -227,7 +231,7 @@ def _place(root: ET.Element, tag: str, world_from_local: Array) -> None:
 
 
 def _head(scene: Scene) -> str:
-    """Give the comment at the file's head; XML allows no two hyphens in a row there."""
+    """Return the comment at the file's head, in which XML allows no two hyphens in a row."""
     lines = [
         f'Scene "{scene.name}", written by simtest {provenance.version()}. World: model frame of the surface, mm.',
         "Without the sensor: no noise, no exposure, linear radiance.",

@@ -10,19 +10,9 @@ PLUGIN = "simtest_phong"
 
 @cache
 def register(mi: Any, variant: str) -> str:
-    """Register the plugin for a variant, once.
+    """Register the plugin for a variant, once; return its name for `mi.load_dict`.
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    variant : str
-        Its name; the class is made anew for each, since its base is the variant's own.
-
-    Returns
-    -------
-    str
-        The plugin's name for `mi.load_dict`.
+    Each variant gets a class of its own, since the base class `mi.BSDF` is the variant's.
     """
     mi.register_bsdf(PLUGIN, lambda props: _make_class(mi, variant)(props))
     return PLUGIN
@@ -36,7 +26,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
         """Specular c cos^n(beta) plus a Lambertian base, beta between mirror direction and view [P75].
 
         As published, the specular radiance has no cosine of incidence: f cos(theta) = c cos^n(beta). The radiance stays
-        the same when light and camera change places; f itself is not reciprocal and grows without bound at grazing
+        the same when light and camera swap positions; f itself is not reciprocal and grows without bound at grazing
         light. The normalised form is f = c (n + 2)/(2 pi) cos^n(beta): reciprocal, of albedo c at normal incidence and
         less elsewhere, so it conserves energy where c plus the base's albedo are at most 1.
         """
@@ -59,18 +49,18 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             callback.put("diffuse_reflectance", self.base, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any = ()) -> None:
-            # Literal parameters would be baked into the kernel and recompile it at each change.
+            # Literal parameters would be baked into the kernel, and each change would recompile it.
             dr.make_opaque(self.exponent, self.specular)
 
         def _enabled(self, ctx: Any) -> tuple[bool, bool]:
-            """Tell whether the lobe and the base are asked for."""
+            """Return whether the lobe and the base are asked for."""
             return (
                 ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
                 ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
             )
 
         def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
-            """Give f cos(theta) and the sampling density of the enabled lobes."""
+            """Compute f cos(theta) and the sampling density of the enabled lobes."""
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
             active &= (cos_i > 0) & (cos_o > 0)
             value, density = mi.Spectrum(0), mi.Float(0)
@@ -81,7 +71,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
                 log_cosine, ahead = lobes.log_cosine(wo, mi.reflect(si.wi))
                 scale = (self.exponent + 2) * dr.inv_two_pi * cos_o if self.normalised else mi.Float(1)
                 value += dr.select(ahead, self.specular * scale * dr.exp(self.exponent * log_cosine), 0)
-                # How samples are drawn is no part of what is differentiated.
+                # Gradients must not flow through the choice of samples.
                 n = dr.detach(self.exponent)
                 density += dr.select(ahead, share * (n + 1) * dr.inv_two_pi * dr.exp(n * log_cosine), 0)
             if diffuse:
@@ -90,9 +80,9 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             return dr.select(active, value, 0), dr.select(active, density, 0)
 
         def _share(self, ctx: Any, si: Any, active: Any) -> Any:
-            """Share of the samples that go to the specular lobe: the lobe's part of the albedo at normal incidence.
+            """Return the share of samples for the lobe: its part of the albedo at normal incidence.
 
-            As published, samples above the surface then all weigh the same.
+            In the published form all samples above the surface then have the same weight.
             """
             glossy, diffuse = self._enabled(ctx)
             if not (glossy and diffuse):
@@ -104,14 +94,14 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             share = self._share(ctx, si, active)
-            # cos(beta) = u^(1/(n+1)) about the mirror direction, its sine without cancellation; u in (0, 1].
+            # Lobe: cos(beta) = u^(1/(n+1)) about the mirror direction, its sine without cancellation; u in (0, 1].
             slope = -dr.log(1 - sample2.x) / (dr.detach(self.exponent) + 1)
             cosine, sine = dr.exp(-slope), dr.sqrt(2 * dr.exp(-slope) * dr.sinh(slope))
             s, c = dr.sincos(dr.two_pi * sample2.y)
             glossy = mi.Frame3f(mi.reflect(si.wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
             chosen = sample1 < share
             bs = mi.BSDFSample3f()
-            # Cosine-weighted about the normal for the base.
+            # Base: cosine-weighted about the normal.
             bs.wo = dr.select(chosen, glossy, mi.warp.square_to_cosine_hemisphere(sample2))
             value, bs.pdf = self._values(ctx, si, bs.wo, mi.Bool(active))
             bs.eta = 1.0

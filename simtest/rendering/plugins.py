@@ -1,4 +1,4 @@
-"""Mitsuba plugins of simtest, for scenes that Mitsuba loads by itself (see docs/export.md).
+"""Mitsuba plugins of simtest, for scenes that Mitsuba loads without simtest (see docs/export.md).
 
 One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 
@@ -10,7 +10,7 @@ from simtest.rendering import emission, phong
 
 
 def register() -> None:
-    """Register the plugins for Mitsuba's active variant; again for another variant, twice does no harm.
+    """Register the plugins for Mitsuba's active variant; call it again after a change of variant, repeats do no harm.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Rays through pixels: where each sample lies, in which order pixels are traced, and their sightlines.
+"""Rays through pixels: the positions of the samples, the order in which pixels are traced, and their sightlines.
 
-The sightlines of a pinhole are made inside the kernel; those of any other camera come from its `unproject`.
+The kernel computes the sightlines of a pinhole itself; those of any other camera come from its `unproject`.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from simtest.geometry.camera import Camera
 from simtest.rendering.frames import Array
 
 TILE = 4
-"""Pixels along a side of the tiles in which several samples a pixel are traced: neighbours meet the same triangles."""
+"""Pixels along a side of the tiles in which several samples a pixel are traced: neighbours hit the same triangles."""
 
 # The additive recurrence of the plane's generalised golden ratio, as shares of 2^32: any number of first points
 # covers the pixel evenly.
@@ -21,7 +21,7 @@ _STEP_X, _STEP_Y = 0xC13FA9A9, 0x91E10DA5
 
 
 def is_pinhole(camera: Camera) -> bool:
-    """Tell whether a camera's sightlines are those of its matrix K, over the whole frame."""
+    """Return whether a camera's sightlines are those of its matrix K, over the whole frame."""
     x, y = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
     points = np.stack([x, y, np.ones_like(x)], axis=-1)
     rays = points @ np.linalg.inv(camera.K).T
@@ -101,7 +101,7 @@ class Sightlines:
         numbers = {"fx": 1 / camera.fx, "fy": 1 / camera.fy, "cx": camera.cx, "cy": camera.cy, "skew": camera.skew}
         self._numbers = {name: mi.Float64(value) for name, value in numbers.items()}
         mask = camera.view_mask
-        # In double precision, to tell as `Camera.seen` does.
+        # In double precision, to decide as `Camera.seen` does.
         self._mask = None if mask is None else [mi.Float64(v) for v in (mask.cx, mask.cy, mask.radius**2)]
         self._width, self._tiles = mi.UInt32(camera.width), mi.UInt32(-(-camera.width // TILE))
         dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
@@ -113,20 +113,9 @@ class Sightlines:
         return -(-self.camera.height // TILE) * TILE, -(-self.camera.width // TILE) * TILE
 
     def lanes(self, first: int, count: int, tiled: bool, seed: int) -> Lanes:
-        """Give a run of pixels, row by row or tile by tile.
+        """Return `count` pixels from `first` on: in tiles, which trace faster, or in rows, which need no sorting.
 
-        Parameters
-        ----------
-        first, count : int
-            The run.
-        tiled : bool
-            In tiles, which trace faster, or in rows, which need no sorting afterwards.
-        seed : int
-            Of the sample points; they hang on seed and pixel alone.
-
-        Returns
-        -------
-        Lanes
+        The sample points depend on seed and pixel alone.
         """
         import drjit as dr
 
@@ -145,33 +134,24 @@ class Sightlines:
         return Lanes(column, row, *mi.sample_tea_32(row * self._width + column, salt))
 
     def sample(self, lanes: Lanes, number: Any) -> tuple[Any, Any]:
-        """Give the position of the sample of a number within each pixel, px: evenly spread, uniform for each alone."""
+        """Return the position, px, of a pixel's sample by its number: uniform, and evenly spread over the numbers."""
         mi = self.mi
         x, y = lanes.shift_x + number * mi.UInt32(_STEP_X), lanes.shift_y + number * mi.UInt32(_STEP_Y)
-        # 24 bits are what single precision holds.
+        # Single precision holds 24 bits.
         share = 2.0**-24
         return mi.Float(lanes.column) + mi.Float(x >> 8) * share, mi.Float(lanes.row) + mi.Float(y >> 8) * share
 
     def centre(self, lanes: Lanes) -> tuple[Any, Any]:
-        """Give the centres of the pixels, px."""
+        """Return the centres of the pixels, px."""
         return self.mi.Float(lanes.column) + PIXEL_CENTRE, self.mi.Float(lanes.row) + PIXEL_CENTRE
 
     def rays(self, x: Any, y: Any) -> Rays:
-        """Give the rays of pixel positions.
-
-        Parameters
-        ----------
-        x, y : mitsuba.Float
-            px.
-
-        Returns
-        -------
-        Rays
-        """
+        """Return the rays through pixel positions x and y, mitsuba.Float, px."""
         import drjit as dr
 
         mi = self.mi
         active = mi.Bool(True)
+        # Sightlines, camera frame.
         if self.in_kernel:
             n = self._numbers
             b = (mi.Float64(y) - n["cy"]) * n["fy"]
@@ -179,10 +159,11 @@ class Sightlines:
             sightline = mi.Vector3d(a, b, 1) / dr.sqrt(a * a + b * b + 1)
         else:
             directions = self.camera.unproject(np.stack([np.array(x), np.array(y)], axis=-1).astype(np.float64))
-            seen = np.asarray(np.isfinite(directions).all(axis=-1))
+            imaged = np.asarray(np.isfinite(directions).all(axis=-1))
             # No NaN may enter the renderer.
-            directions = np.where(seen[:, None], directions, [0.0, 0.0, 1.0])
-            sightline, active = mi.Vector3d(np.ascontiguousarray(directions.T)), mi.Bool(seen)
+            directions = np.where(imaged[:, None], directions, [0.0, 0.0, 1.0])
+            sightline, active = mi.Vector3d(np.ascontiguousarray(directions.T)), mi.Bool(imaged)
+        # Round field of view.
         if self._mask is not None:
             cx, cy, squared = self._mask
             column, row = (mi.Float64(dr.floor(v)) + PIXEL_CENTRE for v in (x, y))
@@ -192,34 +173,22 @@ class Sightlines:
         return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
 
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
-        """Give origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
+        """Return origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
 
-        Outside the round field of view too; NaN where the camera has no sightline.
+        Positions outside the round field of view have rays too; NaN where the camera has no sightline.
         """
         directions = self.camera.unproject(points_px) @ self._pose[:3, :3].T
         return np.broadcast_to(self._pose[:3, 3], directions.shape), directions
 
     def in_view(self, points_px: Array) -> tuple[Array, Array]:
-        """Give origins and directions as `in_model` does; NaN outside the round field of view."""
+        """Return origins and directions as `in_model` does; NaN outside the round field of view."""
         origins, directions = self.in_model(points_px)
         mask = self.camera.view_mask
         return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
 
 
 def untile(values: Any, size: tuple[int, int]) -> Any:
-    """Sort channels from tiles into rows.
-
-    Parameters
-    ----------
-    values : ndarray, shape (..., N)
-        Tile by tile.
-    size : tuple of int
-        Height and width, px, whole tiles.
-
-    Returns
-    -------
-    ndarray, shape (..., height, width)
-    """
+    """Sort channels, shape (..., N), from tiles into rows, shape (..., height, width); the size is of whole tiles."""
     height, width = size
     lead = values.shape[:-1]
     cells = values.reshape(*lead, height // TILE, width // TILE, TILE, TILE)

@@ -1,4 +1,9 @@
-"""A rendering session: the Mitsuba scene is built once and updated from frame to frame."""
+"""A rendering session: the Mitsuba scene is built once and updated from frame to frame.
+
+A session goes through the same stages for every scene: load the surface, set the camera, build the Mitsuba scene if its
+structure is new, and write the values that may differ. Then it renders radiance and labels, and casts single rays for
+the ground truth.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,14 +13,14 @@ import numpy as np
 from simtest.rendering import backend, emission, highlights, phong
 from simtest.rendering import exact_points as exact
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import Array, FloatImage, Frame, Radiance, TrueHighlight, TruthMaps
+from simtest.rendering.frames import Array, FloatImage, Frame, HighlightPoint, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
-from simtest.rendering.labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
+from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.shapes import make_shape
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
@@ -42,7 +47,7 @@ class _Built:
 
 
 class Session:
-    """Renders scenes of like structure without rebuilding.
+    """Renders scenes of the same structure without rebuilding.
 
     Parameters
     ----------
@@ -73,20 +78,20 @@ class Session:
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
         self._labelled = labelled
-        self._built: _Built | None = None
         self._load_surface(scene)
         self._set_camera(scene)
+        self._built = self._build(self._structure())
         self.update(scene)
 
     @property
     def mi(self) -> Any:
-        """The mitsuba module, at this session's variant: it is one for all sessions, and another may have moved it."""
+        """The mitsuba module, set to this session's variant, which another session may have changed."""
         if self._mitsuba.variant() != self.variant:
             self._mitsuba.set_variant(self.variant)
         return self._mitsuba
 
     def update(self, scene: Scene) -> None:
-        """Move to another scene; only what changed is updated, and only another structure is rebuilt.
+        """Move to another scene; update only what changed, and rebuild only another structure.
 
         Parameters
         ----------
@@ -98,6 +103,7 @@ class Session:
         InputError
             As for the session itself; it then stays at its scene.
         """
+        # Surface, camera and lights: refused here if they are not sound.
         if scene.surface != self.scene.surface:
             self._load_surface(scene)
             self._set_camera(scene)
@@ -107,17 +113,16 @@ class Session:
             if scene.camera != self._camera_spec:
                 self._set_camera(scene)
         self.scene: Scene = scene
-        reflectance = scene.reflectance
-        material = (type(reflectance), getattr(reflectance, "normalised", None))
-        key = (self._shape.key, material, tuple(emission.kind_of(light) for light in scene.rig.lights))
-        if self._built is None or self._built.key != key:
+        key = self._structure()
+        if self._built.key != key:
             self._built = self._build(key)
         if self._labelled:
             self._shape_labels()
+        # Values.
         self._apply(self._built)
 
     def _load_surface(self, scene: Scene) -> None:
-        # A malformed surface raises here and leaves the session at its scene.
+        # A malformed surface raises here, and the session stays at its scene.
         surface = make_surface(scene.surface)
         check_camera(scene, surface)
         check_lights(scene, surface)
@@ -134,6 +139,12 @@ class Session:
     def _forget(self) -> None:
         self._truth: TruthMaps | None = None
         self._centre: list[FloatImage] = []
+
+    def _structure(self) -> tuple[Any, ...]:
+        """Return everything of the scene that is compiled into the kernels."""
+        reflectance = self.scene.reflectance
+        material = (type(reflectance), getattr(reflectance, "normalised", None))
+        return self._shape.key, material, tuple(emission.kind_of(light) for light in self.scene.rig.lights)
 
     def _build(self, key: tuple[Any, ...]) -> _Built:
         self.rebuilds += 1
@@ -152,16 +163,18 @@ class Session:
     def _apply(self, built: _Built) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
         parameters = built.parameters
+        # Shape.
         if "to_model" in self._shape.parameters:
             matrix = self._shape.parameters["to_model"]
             _set(parameters, "surface.to_world", self.mi.AffineTransform4f(matrix.tolist()))
+        # Lights, in the model frame.
         lights = self.scene.rig.lights
-        places = self.to_model(self.scene.rig.true_mm())
+        positions = self.to_model(self.scene.rig.true_mm())
         axes = np.array([light.axis for light in lights]) @ self.surface.model_from_camera[:3, :3].T
         for i, light in enumerate(lights):
-            values = emission.emitter_values(self.mi, emission.kind_of(light), light, places[i], axes[i])
-            for name, value in values.items():
+            for name, value in emission.emitter_values(self.mi, light, positions[i], axes[i]).items():
                 _set(parameters, f"light_{i}.{name}", value)
+        # Material: the whole and its base alone.
         for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
             _set(parameters, f"bsdf.{name}", value)
             if built.base is not None:
@@ -169,9 +182,7 @@ class Session:
         parameters.update()
         if built.base is not None:
             built.base_parameters.update()
-        self._light = DirectLight(self.mi, self.scene.rig, places, axes)
-
-    # Frames ------------------------------------------------------------------------------------------------------
+        self._light = DirectLight(self.mi, self.scene.rig, positions, axes)
 
     def to_model(self, points: Array) -> Array:
         """Transform points, shape (N, 3), from the camera frame to the model frame, mm."""
@@ -186,7 +197,7 @@ class Session:
         Parameters
         ----------
         progress : callable, optional
-            Told after each part of the work (see `simtest.rendering.integrate.Progress`); what it raises stops the
+            Called after each part of the work (see `simtest.rendering.integrate.Progress`); what it raises stops the
             frame and leaves the session as it was.
 
         Returns
@@ -198,9 +209,9 @@ class Session:
         return self._render(None, progress)[0]
 
     def frame(self, progress: Progress | None = None) -> Frame:
-        """Render the frame with the labels of the rendered shape; one pass where it has one sample a pixel.
+        """Render the frame with the labels of the rendered shape, in one pass where it has one sample a pixel.
 
-        The exact truth that `truth` gives afterwards starts from the same hits.
+        The exact truth that `truth` computes afterwards starts from the same hits.
 
         Parameters
         ----------
@@ -216,18 +227,16 @@ class Session:
         return Frame(radiance, as_labels(channels))
 
     def _shape_labels(self) -> ShapeLabels:
-        assert self._built is not None
         if self._built.labels is None:
             operators = self.surface.vertex_shape_operators()
             self._built.labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], operators)
         return self._built.labels
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
-        built, effort, tracer = self._built, self.scene.render, self._tracer()
-        assert built is not None
+        effort, tracer = self.scene.render, self._tracer()
         bounces = None
         if effort.path_depth > 2:
-            bounces = Bounces(self.mi, built.scene, effort.path_depth, effort.seed)
+            bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
         if effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         else:
@@ -237,15 +246,13 @@ class Session:
 
     def _tracer(self) -> Tracer:
         built = self._built
-        assert built is not None
         material = Material(built.scene.shapes()[0].bsdf(), built.base)
         refinement = Refinement(self.mi, self._shape)
         return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
 
     def _centre_hits(self) -> list[FloatImage]:
-        """Give the labels of a frame, or the same without curvatures, which need a mesh's shape operators."""
+        """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""
         if not self._centre:
-            assert self._built is not None
             labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)
             self._centre = self._tracer().centres(None, False, labels)[1]
         return self._centre
@@ -288,22 +295,18 @@ class Session:
         return position, shading @ self.surface.model_from_camera[:3, :3]
 
     def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays of the model frame (see `cast`); a direction of NaN hits nothing."""
+        """Cast rays of the model frame (see `cast`); a NaN direction hits nothing."""
         hits, shading, geometric = self._hits(origins, directions)
         rotation = self.surface.model_from_camera[:3, :3]
         return exact.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
 
     def _hits(self, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
-        assert self._built is not None
         return exact.trace_hits(self.mi, self._built.scene, self._shape, origins, directions)
 
     def truth(self, stride: int = 1) -> TruthMaps:
-        """Give the ground truth at the centre of every pixel, or of every `stride`-th along both axes.
+        """Return the ground truth at the centre of every pixel, or of every `stride`-th along both axes.
 
-        Returns
-        -------
-        TruthMaps
-            The full maps are kept while surface and camera stay.
+        The full maps are kept while surface and camera stay.
         """
         if stride != 1:
             return self._cast_maps(stride)
@@ -315,7 +318,7 @@ class Session:
         centres = self.camera.pixel_centres()[::stride, ::stride]
         pixels = centres.reshape(-1, 2)
         if stride == 1:
-            # As a frame's labels are, so that the truth does not depend on whether there was a frame.
+            # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
             hits, shading, geometric = as_hits(self._centre_hits())
             points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
@@ -323,33 +326,23 @@ class Session:
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])
 
     def lit(self, positions: Array, light: int) -> Any:
-        """Tell which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
-        place = self.scene.rig.true_mm()[light]
-        towards = positions - place
+        """Return which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
+        source = self.scene.rig.true_mm()[light]
+        towards = positions - source
         distance = np.linalg.norm(towards, axis=1)
         directions = towards / distance[:, None]
         emitted = self.scene.rig.lights[light].factor(directions) > 0
-        if is_at_camera(place):
+        # A light at the camera reaches all that is seen.
+        if is_at_camera(source):
             return emitted
         pose = self.surface.model_from_camera
-        origins = np.broadcast_to(self.to_model(place[None]), positions.shape)
+        origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
         hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)
-        # A blocker stands clearly before the point; the point's own triangle does not count.
+        # A blocker stands clearly in front of the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))
 
-    def highlights(self, radiance: Radiance) -> list[TrueHighlight]:
-        """Find the true highlights of every light in view.
-
-        Parameters
-        ----------
-        radiance : Radiance
-            The same frame's.
-
-        Returns
-        -------
-        list of TrueHighlight
-            The brightest first.
-        """
+    def highlights(self, radiance: Radiance) -> list[HighlightPoint]:
+        """Find the highlight points of every light in view, the brightest first, with the frame's radiance."""
         is_anatomy = isinstance(self.scene.surface, AnatomySurface)
         return highlights.find(self, radiance, stride=FINE_STRIDE_PX if is_anatomy else COARSE_STRIDE_PX)
 

@@ -1,14 +1,15 @@
-"""From a surface's shape to Mitsuba's."""
+"""Mitsuba's shape of a surface."""
 
 from typing import Any
 
 import numpy as np
 
+from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.surfaces import Shape, TriangleMesh
 
 
-def make_shape(mi: Any, shape: Shape, bsdf: dict[str, Any]) -> Any:
-    """Make what `mi.load_dict` takes for a shape.
+def make_shape(mi: Any, shape: Shape, bsdf: MitsubaDict) -> Any:
+    """Make a shape for `mi.load_dict`.
 
     Parameters
     ----------
@@ -16,12 +17,12 @@ def make_shape(mi: Any, shape: Shape, bsdf: dict[str, Any]) -> Any:
         mitsuba with the variant set.
     shape : Shape
         In the model frame.
-    bsdf : dict
+    bsdf : MitsubaDict
         Its material.
 
     Returns
     -------
-    dict or mitsuba.Mesh
+    MitsubaDict or mitsuba.Mesh
         The description of an analytic shape, or a mesh with the vertex normals given.
     """
     if shape.mesh is not None:
@@ -31,7 +32,7 @@ def make_shape(mi: Any, shape: Shape, bsdf: dict[str, Any]) -> Any:
     return {"type": plugin, "to_world": transform, "flip_normals": shape.flip, "bsdf": bsdf}
 
 
-def _make_mesh(mi: Any, mesh: TriangleMesh, bsdf: dict[str, Any]) -> Any:
+def _make_mesh(mi: Any, mesh: TriangleMesh, bsdf: MitsubaDict) -> Any:
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
     made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
@@ -39,7 +40,7 @@ def _make_mesh(mi: Any, mesh: TriangleMesh, bsdf: dict[str, Any]) -> Any:
     parameters["vertex_positions"] = _flat(mesh.vertices, np.float32)
     parameters["faces"] = _flat(mesh.faces, np.uint32)
     parameters.update()
-    # A change of positions makes Mitsuba compute normals from the triangles: the exact ones come after it.
+    # Mitsuba recomputes the normals from the triangles when positions change, so the exact ones are set afterwards.
     parameters["vertex_normals"] = _flat(mesh.normals, np.float32)
     parameters.update()
     return made

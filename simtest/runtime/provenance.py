@@ -82,7 +82,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def environment() -> dict[str, object]:
+def environment() -> dict[str, str | dict[str, str] | None]:
     """Give what a report prints of its origin."""
     return {
         "commit": commit(),

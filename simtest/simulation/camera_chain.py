@@ -1,4 +1,7 @@
-"""From radiance to a frame: point spread, vignetting, exposure, noise, saturation, response, quantisation."""
+"""The camera chain: point spread, vignetting, exposure, noise, saturation, response, quantisation.
+
+`collect` is the lens, `capture` the sensor. Images are float32, shape (H, W) or (H, W, 3).
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,25 +14,13 @@ from simtest.spec.sensor import Sensor
 Image = npt.NDArray[np.float32]
 
 MAX_COUNT = 1e15
-"""Beyond this many electrons shot noise is below the resolution of a float32 frame, and Poisson numbers end."""
+"""Beyond this many electrons shot noise is below the resolution of a float32 frame, and no Poisson numbers exist."""
 
 
 def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
-    """Give the light that reaches the sensor's pixels.
+    """Compute the light that reaches the sensor's pixels: linear radiance after the lens.
 
-    Parameters
-    ----------
-    radiance : ndarray of float32, shape (H, W) or (H, W, 3)
-        Linear radiance.
-    sensor : Sensor
-        Point spread and vignetting.
-    camera : Camera
-        Gives each pixel's angle from the optical axis.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-        Radiance after the lens. The frame is mirrored at its borders for the point spread.
+    The camera gives each pixel's angle from the optical axis. The point spread mirrors the frame at its borders.
     """
     light = smooth(radiance, sensor.point_spread_px)
     vignetting = sensor.vignetting.model()
@@ -40,7 +31,7 @@ def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
 
 
 def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Generator | None) -> Image:
-    """Give the sensor's frame.
+    """Compute the sensor's frame, as encoded: in [0, 1] where the sensor clips.
 
     Parameters
     ----------
@@ -51,21 +42,18 @@ def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Gene
     sensor : Sensor
         The sensor.
     rng : numpy.random.Generator or None
-        Gives shot noise, then read noise, then white noise; may be None where there is no noise.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-        As encoded, in [0, 1] where the sensor clips.
+        Draws shot noise, then read noise, then white noise; may be None where there is no noise.
 
     Raises
     ------
     ValueError
         If noise is asked for without a generator.
     """
+    # Electrons: shot and read noise.
     if sensor.full_well is not None:
         light = _electrons(expose(light, full_scale, 0.0, None), sensor.full_well, sensor.read_noise, rng)
         full_scale = 1.0
+    # White noise, then the sensor's values.
     frame = expose(light, full_scale, sensor.noise_sigma, rng)
     return encode(frame, sensor) if sensor.clips else frame
 
@@ -80,7 +68,7 @@ def encode(frame: npt.NDArray[np.float32], sensor: Sensor) -> Image:
 
 
 def _electrons(frame: Image, full_well: float, read_noise: float, rng: np.random.Generator | None) -> Image:
-    """Count electrons: Poisson numbers of the light's mean, plus the readout's normal noise; share of full scale."""
+    """Count electrons, Poisson about the light's mean, and add the normal noise of the readout; share of full scale."""
     if rng is None:
         raise ValueError("shot noise needs a generator")
     mean = np.maximum(frame.astype(float), 0.0) * full_well
@@ -93,21 +81,8 @@ def _electrons(frame: Image, full_well: float, read_noise: float, rng: np.random
 def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.random.Generator | None) -> Image:
     """Scale radiance to full scale 1 and add white Gaussian noise.
 
-    Parameters
-    ----------
-    radiance : ndarray of float32, shape (H, W) or (H, W, 3)
-        Linear radiance.
-    full_scale : float
-        Radiance that becomes 1. Where it is not positive, the frame is left at 0: no light reached the sensor.
-    noise_sigma : float
-        Standard deviation, share of full scale (theory.md section 0).
-    rng : numpy.random.Generator or None
-        May be None where there is no noise.
-
-    Returns
-    -------
-    ndarray of float32, same shape
-        Not clipped.
+    Where the full scale is not positive no light reached the sensor, and the signal is 0. `noise_sigma` is a share of
+    full scale (theory.md section 0); `rng` may be None where there is no noise. The frame is not clipped.
 
     Raises
     ------
@@ -124,6 +99,6 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
 
 
 def to_uint8(frame: Image) -> npt.NDArray[np.uint8]:
-    """Give the sRGB-encoded 8-bit picture of a linear frame, clipped to [0, 1]."""
+    """Return the sRGB-encoded 8-bit picture of a linear frame, clipped to [0, 1]."""
     linear = np.clip(np.nan_to_num(frame, nan=0.0), 0, 1)
     return np.asarray(np.round(255 * srgb_encode(linear)), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A rendered scene with its judged truth, exposed and ready for the camera's noise."""
+"""A rendered scene with its true highlights, exposed and ready for the camera's noise."""
 
 import warnings
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, NoiseModel
-from simtest.rendering import Radiance, Session, TrueHighlight
+from simtest.rendering import HighlightPoint, Radiance, Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.camera_chain import capture, collect
-from simtest.simulation.true_highlights import JudgedHighlight, judge
+from simtest.simulation.true_highlights import TrueHighlight, judge
 from simtest.spec import Scene
 
 Image = npt.NDArray[np.float32]
@@ -21,8 +21,8 @@ LEAST_SHARE = 1e-12
 
 
 @dataclass(frozen=True)
-class View:
-    """A rendered scene with its judged truth: what all noise realisations of a fixed scene share.
+class RenderedView:
+    """A rendered scene with its true highlights: everything that its noise realisations share.
 
     Parameters
     ----------
@@ -32,8 +32,8 @@ class View:
         Noise-free, before the lens.
     light : ndarray of float32, shape (H, W) or (H, W, 3)
         Noise-free radiance behind the lens: what reaches the sensor.
-    truths : list of JudgedHighlight
-        All true highlights, those included that do not count.
+    highlights : list of TrueHighlight
+        All of them, including those that do not count.
     full_scale : float
         Radiance behind the lens that becomes 1 (`Exposure`); 0 where no light reaches the sensor.
     calibration : Calibration
@@ -43,17 +43,17 @@ class View:
     scene: Scene
     radiance: Radiance
     light: Image
-    truths: list[JudgedHighlight]
+    highlights: list[TrueHighlight]
     full_scale: float
     calibration: Calibration
 
     def frame(self, seed: int) -> Image:
-        """Give the sensor's frame with the noise of a seed."""
+        """Return the sensor's frame with the noise of a seed."""
         return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed))
 
 
-def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> View:
-    """Render a scene and judge its true highlights.
+def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
+    """Move a session to a scene, render it and judge its highlights.
 
     Parameters
     ----------
@@ -66,24 +66,26 @@ def view(session: Session, scene: Scene, radiance: Radiance | None = None) -> Vi
 
     Returns
     -------
-    View
+    RenderedView
     """
     session.update(scene)
     if radiance is None:
         radiance = session.radiance()
+    # Lens.
     light = collect(radiance.total, scene.sensor, session.camera)
     mean = light if light.ndim == 2 else light.mean(axis=2, dtype=np.float32)
-    highlights, seen = session.highlights(radiance), session.camera.seen
-    full_scale = _full_scale(scene, mean, highlights, seen)
-    # Noise is independent in each channel; estimators see the channels' mean.
-    truths = judge(highlights, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
-    nearest = max((t.highlight for t in truths if t.highlight.lit), key=lambda h: h.radiance, default=None)
-    told = scene.calibration(None if nearest is None else nearest.distance)
-    return View(scene, radiance, light, truths, full_scale, told)
+    # Truth and exposure. Noise is independent in each channel; estimators see the channels' mean.
+    points, seen = session.highlights(radiance), session.camera.seen
+    full_scale = _full_scale(scene, mean, points, seen)
+    highlights = judge(points, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
+    # What reconstruction is told may include the distance of the brightest highlight.
+    brightest = max((h for h in highlights if h.lit), key=lambda h: h.radiance, default=None)
+    calibration = scene.calibration(None if brightest is None else brightest.distance)
+    return RenderedView(scene, radiance, light, highlights, full_scale, calibration)
 
 
-def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], seen: Mask | None) -> float:
-    """Give the radiance that becomes 1; 0, with a warning, where there is no light at all."""
+def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: Mask | None) -> float:
+    """Return the radiance that becomes 1; 0, with a warning, where there is no light at all."""
     exposure, peak = scene.sensor.exposure, float(light.max())
     if peak <= 0:
         warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=3)
@@ -100,13 +102,13 @@ def _full_scale(scene: Scene, light: Image, highlights: list[TrueHighlight], see
             )
             radiance = peak
     else:
-        # Which highlights are isolated is judged without noise first.
-        isolated = [j.highlight.bp_px for j in judge(highlights, light, NoiseModel(), peak, 1, seen) if j.isolated]
-        radiance = max((_nearest(light, place) for place in isolated), default=peak)
+        # The brightest isolated highlight; which ones are isolated is judged without noise first.
+        isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen) if h.isolated]
+        radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
     return radiance / exposure.gain
 
 
-def _nearest(light: Image, place: npt.NDArray[np.float64]) -> float:
-    """Give the light at the pixel that a place, px, lies in."""
-    column, row = (min(int(v), size - 1) for v, size in zip(place, light.shape[::-1], strict=True))
+def _light_at(light: Image, point_px: npt.NDArray[np.float64]) -> float:
+    """Return the light of the pixel that a point, px, lies in."""
+    column, row = (min(int(v), size - 1) for v, size in zip(point_px, light.shape[::-1], strict=True))
     return float(light[row, column])

@@ -1,5 +1,6 @@
-"""Which of a surface's true highlights are isolated, visible ones (theory.md section 6)."""
+"""Which of a surface's highlight points are isolated, visible highlights (theory.md section 6)."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,23 +11,24 @@ from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, 
 from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component
 from simtest.geometry import smooth
-from simtest.rendering import TrueHighlight
+from simtest.rendering import HighlightPoint
+from simtest.runtime.files import Json
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+Pixel = tuple[int, int]
+"""Row and column."""
 
 MAX_CLIMB_PX = 12
 """Smoothing moves a lopsided highlight's maximum away from its true BP, by no more than this."""
 
 
-@dataclass(frozen=True)
-class JudgedHighlight:
-    """A true highlight with the verdict.
+@dataclass(frozen=True, kw_only=True)
+class TrueHighlight(HighlightPoint):
+    """A highlight point with the verdict on whether it is a true isolated highlight.
 
     Parameters
     ----------
-    highlight : TrueHighlight
-        Where it is.
     peak_snr : float
         Peak above its surroundings over the standard deviation of the noise at the peak's level; inf without noise, 0
         where it has no closed isophote.
@@ -34,7 +36,6 @@ class JudgedHighlight:
         Empty for a true isolated highlight, else the first condition that it fails.
     """
 
-    highlight: TrueHighlight
     peak_snr: float
     why_not: str
 
@@ -43,20 +44,40 @@ class JudgedHighlight:
         """Whether it is a true isolated highlight."""
         return not self.why_not
 
+    @property
+    def highlight(self) -> "TrueHighlight":
+        """Itself: deprecated, from when the verdict stood around the highlight."""
+        warnings.warn("TrueHighlight.highlight is deprecated: use the highlight itself", DeprecationWarning, 2)
+        return self
+
+    def to_json(self) -> dict[str, Json]:
+        """Return position, normal, curvature and verdict."""
+        return {
+            "light": self.light,
+            "bp_px": self.bp_px.tolist(),
+            "position_mm": self.position.tolist(),
+            "normal": self.normal.tolist(),
+            "distance_mm": self.distance,
+            "kd_min": self.kd_min,
+            "kd_max": self.kd_max,
+            "isolated": self.isolated,
+            "why_not": self.why_not or None,
+        }
+
 
 def judge(
-    highlights: list[TrueHighlight],
+    points: list[HighlightPoint],
     light: Image,
     noise: NoiseModel,
     full_scale: float,
     channels: int = 1,
     seen: Mask | None = None,
-) -> list[JudgedHighlight]:
-    """Judge each true highlight by the noise-free frame.
+) -> list[TrueHighlight]:
+    """Judge each highlight point by the noise-free frame.
 
     Parameters
     ----------
-    highlights : list of TrueHighlight
+    points : list of HighlightPoint
         All points where the normal bisects light and camera.
     light : ndarray of float32, shape (H, W)
         Noise-free radiance behind the lens, mean of the channels.
@@ -71,30 +92,26 @@ def judge(
 
     Returns
     -------
-    list of JudgedHighlight
+    list of TrueHighlight
         In the same order.
     """
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
-    peaks = [_peak_pixel(smoothed, highlight) for highlight in highlights]
-    owners = _owners(highlights, peaks)
-
-    def sigma(peak: tuple[int, int]) -> float:
-        if full_scale <= 0:
-            return 0.0
-        return float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale
-
-    return [
-        _judge(h, (smoothed, seen), peak, owners.get(peak) is h, sigma(peak))
-        for h, peak in zip(highlights, peaks, strict=True)
-    ]
+    peaks = [_peak_pixel(smoothed, point) for point in points]
+    owners = _owners(points, peaks)
+    highlights = []
+    for point, peak in zip(points, peaks, strict=True):
+        sigma = float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale if full_scale > 0 else 0.0
+        snr, why_not = _verdict(point, smoothed, seen, peak, owners.get(peak) is point, sigma)
+        highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=why_not))
+    return highlights
 
 
-def region_of(highlight: TrueHighlight, smoothed: Image, seen: Mask | None = None) -> Component | None:
-    """Give the pixels above half height of the maximum that a true highlight makes.
+def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
+    """Return the pixels above half height of the maximum that a highlight point makes.
 
     Parameters
     ----------
-    highlight : TrueHighlight
+    point : HighlightPoint
         The highlight.
     smoothed : ndarray of float32, shape (H, W)
         Noise-free smoothed light.
@@ -106,53 +123,47 @@ def region_of(highlight: TrueHighlight, smoothed: Image, seen: Mask | None = Non
     Component or None
         None where a higher maximum lies in it.
     """
-    return half_height_component(smoothed, *_peak_pixel(smoothed, highlight), seen)
+    return half_height_component(smoothed, *_peak_pixel(smoothed, point), seen)
 
 
-def _owners(highlights: list[TrueHighlight], peaks: list[tuple[int, int]]) -> dict[tuple[int, int], TrueHighlight]:
-    """Give to each maximum of the smoothed frame the lit true BP nearest to it; smoothing may merge several."""
-    owners: dict[tuple[int, int], TrueHighlight] = {}
-    for highlight, peak in zip(highlights, peaks, strict=True):
-        if not highlight.lit:
+def _owners(points: list[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
+    """Assign each maximum of the smoothed frame to the nearest lit BP: smoothing may merge several highlights."""
+    owners: dict[Pixel, HighlightPoint] = {}
+    for point, peak in zip(points, peaks, strict=True):
+        if not point.lit:
             continue
-        place = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
-        rival = owners.setdefault(peak, highlight)
-        if np.hypot(*(highlight.bp_px - place)) < np.hypot(*(rival.bp_px - place)):
-            owners[peak] = highlight
+        centre = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
+        rival = owners.setdefault(peak, point)
+        if np.hypot(*(point.bp_px - centre)) < np.hypot(*(rival.bp_px - centre)):
+            owners[peak] = point
     return owners
 
 
-def _judge(
-    highlight: TrueHighlight,
-    frame: tuple[Image, Mask | None],
-    peak: tuple[int, int],
-    owns_peak: bool,
-    noise: float,
-) -> JudgedHighlight:
-    """Judge one true highlight by the smoothed frame and what of it is seen."""
-    smoothed, seen = frame
-    if not highlight.lit:
-        return JudgedHighlight(highlight, 0.0, "in shadow")
-    if not owns_peak:
-        return JudgedHighlight(highlight, 0.0, "part of a brighter one")
-    row, column = peak
-    component = half_height_component(smoothed, row, column, seen)
+def _verdict(
+    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, sigma: float
+) -> tuple[float, str]:
+    """Return peak SNR and the first condition that a highlight point fails; `sigma` is the noise at its peak."""
+    # Without a maximum of its own it has no SNR.
+    if not point.lit:
+        return 0.0, "in shadow"
+    component = half_height_component(smoothed, *peak, seen) if owns_peak else None
     if component is None:
-        return JudgedHighlight(highlight, 0.0, "part of a brighter one")
-    height = contrast(smoothed, component, float(smoothed[row, column]), seen)
-    snr = height / noise if noise > 0 else np.inf if height > 0 else 0.0
-    if highlight.min_gain <= HIGHLIGHT_MIN_GAIN:
-        return JudgedHighlight(highlight, snr, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}")
+        return 0.0, "part of a brighter one"
+    height = contrast(smoothed, component, float(smoothed[peak]), seen)
+    snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
+    # Shape, frame, noise: in the order of theory.md section 6.
+    if point.min_gain <= HIGHLIGHT_MIN_GAIN:
+        return snr, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
     if not component.closed:
-        return JudgedHighlight(highlight, snr, "isophote at t = 0.5 leaves the frame")
+        return snr, "isophote at t = 0.5 leaves the frame"
     if snr < HIGHLIGHT_CONTRAST_SIGMA:
-        return JudgedHighlight(highlight, snr, f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma")
-    return JudgedHighlight(highlight, snr, "")
+        return snr, f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma"
+    return snr, ""
 
 
-def _peak_pixel(smoothed: Image, highlight: TrueHighlight) -> tuple[int, int]:
-    """Give row and column of the local maximum that a climb from the true BP reaches."""
-    column, row = (int(v) for v in highlight.bp_px)
+def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
+    """Climb from the true BP to the local maximum."""
+    column, row = (int(v) for v in point.bp_px)
     row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
     for _ in range(MAX_CLIMB_PX):
         top, left = max(row - 1, 0), max(column - 1, 0)

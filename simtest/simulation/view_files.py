@@ -1,8 +1,7 @@
-"""Pictures of views: one each, a sheet of all of them, and a film of a sequence."""
+"""Writes pictures of views: one of each, a sheet of all of them, and a film of a sequence."""
 
 import math
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,8 +10,9 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.runtime.files import write_atomically
 from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.labelled_frame import encoded_png
-from simtest.simulation.rendered_view import View
+from simtest.simulation.frame_files import encoded_png
+from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.viewpoints import WrittenView
 
 FRAMES_PER_SECOND = 25.0
 SHEET_WIDTH = 1600
@@ -27,7 +27,7 @@ class ViewWriter:
     Parameters
     ----------
     folder : Path
-        Exists. Pictures of an earlier call go.
+        An existing folder; pictures of an earlier call are removed.
     film : bool
         Write film.avi too.
     """
@@ -35,29 +35,31 @@ class ViewWriter:
     def __init__(self, folder: Path, film: bool) -> None:
         self._folder = folder
         self._thumbnails: list[Picture] = []
-        self._film: Any = None
-        self._wanted = film
+        self._film: cv2.VideoWriter | None = None
+        self._film_wanted = film
         for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / "film.avi"):
             old.unlink(missing_ok=True)
 
-    def add(self, seen: View) -> dict[str, Any]:
-        """Write the frame of a view; gives what views.json says of it.
+    def add(self, view: RenderedView) -> WrittenView:
+        """Write the frame of a view.
 
-        Each has noise of its own, of seeds that count on from the scene's: a film's noise must not stand still.
+        Each has noise of its own, whose seeds count up from the scene's: a film's noise must not stand still.
         """
-        seed = seen.scene.sensor.seed + len(self._thumbnails)
-        frame = seen.frame(seed)
+        sensor = view.scene.sensor
+        seed = sensor.seed + len(self._thumbnails)
+        frame = view.frame(seed)
         name = f"view_{len(self._thumbnails):04d}.png"
-        data = encoded_png(frame, seen.scene.sensor)
+        data = encoded_png(frame, sensor)
         write_atomically(self._folder / name, lambda part: part.write_bytes(data))
-        shown = to_uint8(seen.scene.sensor.response.model().decode(frame).astype(np.float32))
+        # Film and sheet show sRGB, whatever the sensor's response.
+        shown = to_uint8(sensor.response.model().decode(frame).astype(np.float32))
         shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
-        if self._wanted:
+        if self._film_wanted:
             self._write(shown)
         width = SHEET_WIDTH // SHEET_COLUMNS
         small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
         self._thumbnails.append(np.asarray(small, dtype=np.uint8))
-        return {"picture": name, "sensor.seed": seed}
+        return WrittenView(name, seed)
 
     def _write(self, picture: Picture) -> None:
         if self._film is None:
@@ -69,7 +71,7 @@ class ViewWriter:
         self._film.write(picture)
 
     def close(self) -> list[Path]:
-        """Write what is left; gives sheet.png and film.avi, those of them that there are."""
+        """Finish the film and write the sheet; return sheet.png and film.avi where there are any."""
         if self._film is not None:
             self._film.release()
         if self._thumbnails:

@@ -1,19 +1,24 @@
-"""From an experiment to its cases: one scene each, in a fixed order, with a name that seeds hang on."""
+"""Expands an experiment into cases: one scene each, in a fixed order, under the name that its seeds depend on."""
 
 import itertools
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.files import Json
 from simtest.runtime.resources import find, shown
 from simtest.runtime.seeds import Stage, generator, integer
-from simtest.spec import AnatomySurface, Experiment, Group, Scene, apply_settings, read_toml, scene_from_dict
+from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_output import toml_value
 from simtest.surfaces.recipe import load_recipe
+from simtest.validation.results_table import Value
+
+Tables = dict[str, Any]
+"""A scene's tables, as read from TOML."""
 
 
 @dataclass(frozen=True)
@@ -28,37 +33,37 @@ class Case:
         Name of the setting within the experiment, unique together with the part.
     part : int
         Which of the setting's pooled values.
-    swept : dict
-        Value by key path of the swept and pooled parameters.
+    swept : mapping
+        Swept and pooled parameters by key path, as they stand in a column.
     data : dict
         The scene's tables.
     where : str
         The scene's file, for messages.
-    random : dict
-        Distribution by key path, drawn for each realisation.
+    random : mapping
+        Distributions by key path, drawn for each realisation.
     realisations : int
         How many.
     isolated : bool
         Whether isolated highlights alone count as true ones.
     source : str
         Name or path of the base scene, as the experiment gives it.
-    settings : dict
-        Value by key path of all that differs from the base scene, drawn values apart.
+    settings : mapping
+        Values by key path of all that differs from the base scene, except drawn ones.
     laws : tuple of str
-        Names of the laws that the page holds against the setting.
+        Names of the laws that the page compares with the setting's results.
     """
 
     label: str
     setting: str
     part: int
-    swept: dict[str, Any]
-    data: dict[str, Any]
+    swept: Mapping[str, Value]
+    data: Tables
     where: str
-    random: dict[str, Any]
+    random: Mapping[str, Uniform]
     realisations: int
     isolated: bool
     source: str
-    settings: dict[str, Any]
+    settings: Mapping[str, Json]
     laws: tuple[str, ...] = ()
 
     @property
@@ -67,24 +72,24 @@ class Case:
         return is_paper(self.data)
 
     def paper_setting(self) -> PaperSetting:
-        """Give the setting of the published protocol; raises `InputError` where a value does not fit."""
+        """Return the setting of the published protocol; raise `InputError` where a value does not fit."""
         return paper_from_dict(self.data, self.where)
 
-    def paper_columns(self) -> dict[str, Any]:
-        """Give every parameter of the published protocol by key path, swept or not, for the rows' columns."""
+    def paper_columns(self) -> dict[str, Value]:
+        """Return every parameter of the published protocol by key path, swept or not: columns of the rows."""
         return {f"paper.{name}": value for name, value in self.paper_setting().model_dump().items()}
 
     @property
     def name(self) -> str:
-        """The case's place in the seed tree."""
+        """Name of the case in the seed tree."""
         return f"{self.setting} | part {self.part}"
 
     def numbers(self) -> range:
         """Numbers of the realisations, running on over the parts of a setting."""
         return range(self.part * self.realisations, (self.part + 1) * self.realisations)
 
-    def scene(self, experiment: Experiment, realisation: int) -> tuple[Scene, dict[str, Any]]:
-        """Give the scene of a realisation and the values drawn for it.
+    def scene(self, experiment: Experiment, realisation: int) -> tuple[Scene, dict[str, float]]:
+        """Make the scene of a realisation; return it with the values drawn for it, by key path.
 
         Raises
         ------
@@ -95,6 +100,7 @@ class Case:
         drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
         data = apply_settings(self.data, drawn, self.where) if drawn else self.data
         scene = scene_from_dict(data, self.where)
+        # Seeds of what else is random: the renderer's samples, and the rig's deviations.
         if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
             seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
             scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
@@ -104,32 +110,26 @@ class Case:
         return scene, drawn
 
     def noise_seed(self, experiment: Experiment, realisation: int) -> int:
-        """Give the seed of a realisation's noise: the `seed` column, and ``sensor.seed`` of a scene made alone."""
+        """Return the seed of a realisation's noise: the `seed` column, and ``sensor.seed`` of a scene made alone."""
         return integer(experiment.seed, experiment.name, self.name, realisation, Stage.SENSOR)
 
-    def again(self, experiment: Experiment, realisation: int) -> str:
-        """Give the command that makes a realisation's frame again alone, less its --out."""
+    def reproduce_command(self, experiment: Experiment, realisation: int) -> str:
+        """Return the command that renders a realisation's frame alone."""
         scene, drawn = self.scene(experiment, realisation)
-        values = {**self.settings, **drawn, "sensor.seed": self.noise_seed(experiment, realisation)}
+        values: dict[str, Json] = {
+            **self.settings,
+            **drawn,
+            "sensor.seed": self.noise_seed(experiment, realisation),
+        }
         if scene.render.seed != self.data.get("render", {}).get("seed", 0):
             values["render.seed"] = scene.render.seed
         if scene.rig.is_drawn:
             values["rig.seed"] = scene.rig.seed
-        return f"simtest render {shlex.quote(self.source)} {set_options(values)}"
+        return f"simtest render {shlex.quote(self.source)} {_set_options(values)} --out frame"
 
 
 def expand(experiment: Experiment) -> list[Case]:
-    """List an experiment's cases.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        From a file.
-
-    Returns
-    -------
-    list of Case
-        In the order of the file.
+    """Return an experiment's cases, in the order of its groups.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def expand(experiment: Experiment) -> list[Case]:
 
 
 def _check(case: Case, experiment: Experiment) -> None:
-    """Raise `InputError` where a scene of a case would be malformed; a drawn range is tried at both ends."""
+    """Raise `InputError` if a scene of a case is malformed; drawn ranges are tried at both ends."""
     if case.is_paper:
         case.paper_setting()
         if case.random:
@@ -182,48 +182,46 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}
             settings = {**group.set, **values}
-            random, source = dict(group.random), group.scene
-            cases.append(
-                Case(
-                    label, setting, part, columns, data, str(path), random, count, group.isolated, source, settings,
-                    group.laws,
-                )
+            case = Case(
+                label, setting, part, columns, data, str(path), group.random, count, group.isolated, group.scene,
+                settings, group.laws,
             )  # fmt: skip
+            cases.append(case)
     return cases
 
 
-def _combinations(tables: tuple[Mapping[str, tuple[Any, ...]], ...]) -> list[dict[str, Any]]:
-    """Multiply tables out; within one table the lists vary together."""
+def _combinations(tables: tuple[Mapping[str, tuple[Json, ...]], ...]) -> list[dict[str, Json]]:
+    """Return all combinations of the tables' rows; within one table the lists vary together."""
     rows = [[dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)] for table in tables]
     return [{k: v for part in parts for k, v in part.items()} for parts in itertools.product(*rows)]
 
 
-def _short(path: str, among: Mapping[str, Any]) -> str:
-    """Give the last part of a key path, or all of it where that is not unique."""
+def _short(path: str, among: Iterable[str]) -> str:
+    """Return the last part of a key path, or all of it where that is not unique."""
     last = path.rsplit(".", 1)[-1]
     return last if sum(key.rsplit(".", 1)[-1] == last for key in among) == 1 else path
 
 
-def set_options(values: Mapping[str, Any]) -> str:
+def _set_options(values: Mapping[str, Json]) -> str:
     """Write values by key path as command-line options that read back the same."""
     return " ".join(f"--set {shlex.quote(f'{key}={_toml(value)}')}" for key, value in values.items())
 
 
-def _plain(value: Any) -> Any:
-    """Give a swept value as it stands in a column: numbers and text as they are, a table by its type."""
-    if isinstance(value, Mapping):
+def _plain(value: Json) -> Value:
+    """Return a swept value as it stands in a column: numbers and text as they are, a table by its type."""
+    if isinstance(value, dict):
         return str(value.get("type", _toml(value)))
-    return _toml(value) if isinstance(value, list | tuple) else value
+    return value if value is None or isinstance(value, bool | int | float | str) else _toml(value)
 
 
-def _toml(value: Any) -> str:
+def _toml(value: Json) -> str:
     """Write a value so that ``--set key=value`` reads it back: text stays bare."""
     return value if isinstance(value, str) else toml_value(value)
 
 
-def swept_example(cases: list[Case]) -> dict[str, Any]:
-    """Give an example value for each swept, pooled or drawn parameter: the columns that results gain."""
-    example: dict[str, Any] = {}
+def swept_example(cases: list[Case]) -> dict[str, Value]:
+    """Return an example value for each swept, pooled or drawn parameter: the columns that results gain."""
+    example: dict[str, Value] = {}
     for case in cases:
         example |= case.swept
         example |= dict.fromkeys(case.random, 0.0)

@@ -1,7 +1,7 @@
-"""The error ladder: the error that is left when each stage's input is replaced by the exact one.
+"""The error ladder: the error that remains when the input of each stage is replaced by the exact one.
 
-Scenes have closed forms, so every stage's exact input is known: the frame without noise, the isophote as it runs
-between the pixels, the cone of the isophote, the normal itself. The light is at the camera.
+The scenes have closed forms, so the exact input of every stage is known: the frame without noise, the isophote between
+the pixels, its cone, the normal itself. The light is at the camera.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -34,14 +34,14 @@ CAMERA = Camera(406, 406, 406.0, 406.0, 203.0, 203.0)
 
 CONTOUR_POINTS = 240
 REACH_PX = 110.0
-"""Isophotes run nearer to the peak than this."""
+"""Isophotes stay closer to the peak than this."""
 
 HALVINGS = 60
 
 
 @dataclass(frozen=True)
 class ClosedScene:
-    """A plane, or a cylinder that is convex towards the camera, of a Phong lobe that is lit from the camera.
+    """A plane, or a cylinder convex towards the camera, with a Phong lobe, lit from the camera.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class ClosedScene:
         return np.array([np.sin(tilt), 0.0, np.cos(tilt)])
 
     def _hit(self, sightlines: Array) -> tuple[Array, Array]:
-        """Give distance, mm, and cosine between normal and view along unit sightlines, shape (..., 3)."""
+        """Compute distance, mm, and cosine between normal and view along unit sightlines, shape (..., 3)."""
         along = sightlines @ self.sightline
         if not self.kd:
             return DISTANCE_MM / along, along
@@ -78,12 +78,12 @@ class ClosedScene:
         return np.where(under > 0, distance, np.inf), np.where(under > 0, cosine, 0.0)
 
     def radiance(self, sightlines: Array) -> Array:
-        """Give the radiance along unit sightlines, shape (..., 3): cos(2 theta)^n over the squared distance."""
+        """Compute the radiance along unit sightlines, shape (..., 3): cos(2 theta)^n over the squared distance."""
         distance, cosine = self._hit(sightlines)
         return np.asarray(np.maximum(2 * cosine**2 - 1, 0.0) ** EXPONENT / distance**2)
 
     def normal(self) -> Array:
-        """Give the normal at the brightest point from the surface's own gradient, unit, shape (3,)."""
+        """Compute the normal at the brightest point from the surface's own gradient, unit, shape (3,)."""
         point = self._hit(self.sightline)[0] * self.sightline
         if not self.kd:
             return -self.sightline
@@ -92,16 +92,17 @@ class ClosedScene:
         return np.asarray(out / np.linalg.norm(out))
 
     def frame(self) -> npt.NDArray[np.float32]:
-        """Give the noise-free frame, its peak 1, shape (H, W)."""
+        """Compute the noise-free frame, shape (H, W), with a peak of 1."""
         columns, rows = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (CAMERA.width, CAMERA.height)))
         value = self.radiance(CAMERA.unproject(np.stack([columns, rows], axis=-1)))
         return np.asarray(value / self.radiance(self.sightline), dtype=np.float32)
 
     def contour(self, isovalue: float) -> Array:
-        """Give points of the exact isophote, px, shape (N, 2): where the radiance is t times its peak."""
+        """Compute points of the exact isophote, px, shape (N, 2): where the radiance is t times its peak."""
         phase = np.linspace(0, 2 * np.pi, CONTOUR_POINTS, endpoint=False)
         directions = np.stack([np.cos(phase), np.sin(phase)], axis=1)
         peak, level = CAMERA.project(self.sightline), isovalue * self.radiance(self.sightline)
+        # Bisection along rays from the peak.
         low, high = np.zeros(CONTOUR_POINTS), np.full(CONTOUR_POINTS, REACH_PX)
         for _ in range(HALVINGS):
             middle = (low + high) / 2
@@ -110,8 +111,8 @@ class ClosedScene:
         return np.asarray(peak + low[:, None] * directions)
 
     def cone(self, isovalue: float) -> Array:
-        """Give the exact cone: axis the sightline, half-axes those of the isophote in the principal sections."""
-        # A plane's isophote is a circle about its normal; on the cylinder both sections are of one curvature.
+        """Compute the exact cone: its axis is the sightline, its half-axes are those of the principal sections."""
+        # A plane's isophote is a circle about its normal; each principal section of the cylinder is a circle or a line.
         across, along = laws.isophote_half_width(isovalue, EXPONENT, np.array([self.kd, 0.0]))
         y = np.array([0.0, 1.0, 0.0])
         x = np.cross(y, self.sightline)
@@ -128,23 +129,17 @@ SCENES = (
 
 @dataclass(frozen=True)
 class ExactPatch(Patch):
-    """A patch whose contours are not measured but given.
-
-    Parameters
-    ----------
-    scene : ClosedScene
-        Gives them.
-    """
+    """A patch whose contours are not traced but computed from a scene."""
 
     scene: ClosedScene = SCENES[0]
 
     def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
-        """Give the exact isophotes (see `Patch.crossings_of`)."""
+        """Compute the exact isophotes (see `Patch.crossings_of`)."""
         return [self.scene.contour(t) for t in isovalues]
 
     @classmethod
     def of(cls, patch: Patch, scene: ClosedScene) -> "ExactPatch":
-        """Give a patch's pixels with the exact contours and peak of a scene."""
+        """Make a patch with another's pixels and the exact contours and peak of a scene."""
         held = {field.name: getattr(patch, field.name) for field in fields(Patch) if field.init}
         fresh = {"peak_px": CAMERA.project(scene.sightline), "noise": None}
         return cls(**(held | fresh), scene=scene)
@@ -152,7 +147,7 @@ class ExactPatch(Patch):
 
 @dataclass(frozen=True)
 class _Ladder:
-    """An estimator with its last stage, which takes poses to candidates, shape (K, 3)."""
+    """An estimator, its isovalues, and its last stage, which turns poses into candidates, shape (K, 3)."""
 
     whole: Estimator
     isovalues: tuple[float, ...]
@@ -177,7 +172,7 @@ RUNGS = {
     "exact cone": "the cone of the fitted ellipse replaced by the exact one; what is left is the model's",
     "exact pose": "the pose's candidates replaced by the exact normal: nothing but rounding is left",
 }
-"""What is replaced at each rung, all that came before it included."""
+"""What is replaced at each rung, in addition to the rungs before it."""
 
 
 @dataclass(frozen=True)
@@ -187,9 +182,9 @@ class Rung:
     Parameters
     ----------
     scene, estimator, name : str
-        Where.
+        The rung's.
     errors_deg : ndarray, shape (n,)
-        Angle between the true normal and the better candidate; a realisation each, or one alone.
+        Angle between the true normal and the better candidate, for each realisation; one value without noise.
     failures : int
         Realisations without an answer, which are not among the errors.
     """
@@ -207,31 +202,20 @@ class Rung:
 
     @property
     def interval_deg(self) -> tuple[float | None, float | None]:
-        """95 % interval of the mean (Student's t); None for one error alone."""
+        """95 % interval of the mean (Student's t); None for a single error."""
         return mean_interval(self.errors_deg)
 
 
 def error_ladder(scenes: Sequence[ClosedScene] = SCENES, realisations: int = REALISATIONS, seed: int = 0) -> list[Rung]:
-    """Compute the ladder of each scene and estimator.
+    """Compute the ladder of each scene and estimator, with the rungs in the order of `RUNGS`.
 
-    Parameters
-    ----------
-    scenes : sequence of ClosedScene
-        Which.
-    realisations : int
-        Noisy frames of the first rung.
-    seed : int
-        Of their noise.
-
-    Returns
-    -------
-    list of Rung
-        Scene by scene, estimator by estimator, in the order of `RUNGS`.
+    The first rung takes `realisations` noisy frames, drawn with `seed`.
     """
     return [rung for scene in scenes for rung in _of_scene(scene, realisations, seed)]
 
 
 def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung]:
+    # Frames: noisy, smoothed, and as they are.
     clean = scene.frame()
     frames = []
     for number in range(realisations):
@@ -241,6 +225,7 @@ def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung
     smoothed, _ = _whole(clean, DEFAULT_SMOOTHING_PX)
     sharp, patch = _whole(clean, 0.0)
     exact = None if isinstance(patch, Failure) else ExactPatch.of(patch, scene)
+    # Rungs: the candidates that each replaced input leads to.
     for name, estimator in ESTIMATORS.items():
         steps: tuple[list[Array | None], ...] = (
             [found[name] for found in noisy], [smoothed[name]], [sharp[name]],
@@ -257,13 +242,13 @@ def _rung(scene: ClosedScene, estimator: str, name: str, found: Sequence[Array |
 
 
 def _whole(frame: npt.NDArray[np.float32], smoothing_px: float) -> tuple[dict[str, Array | None], Patch | Failure]:
-    """Reconstruct a frame as a user would; gives the candidates by estimator, and the patch.
+    """Reconstruct a frame as a user would; return the candidates by estimator, and the patch.
 
-    A frame without a peak is a fault of what is tested, and counts as one that nothing answers.
+    A frame without a peak is a fault of the tested code: it counts as one without an answer.
     """
     whole = (0, 0, CAMERA.width, CAMERA.height)
-    (spot,) = reconstruct(frame, CAMERA, list(ESTIMATORS), whole, smoothing_px)
-    return {name: _candidates(spot.estimates[name]) for name in ESTIMATORS}, spot.patch
+    (found,) = reconstruct(frame, CAMERA, list(ESTIMATORS), whole, smoothing_px)
+    return {name: _candidates(found.estimates[name]) for name in ESTIMATORS}, found.patch
 
 
 def _of_cones(estimator: _Ladder, scene: ClosedScene) -> Array | None:

@@ -1,23 +1,27 @@
-"""Keeps a few frames of a run with all that is needed to draw them: truth, isophotes, ellipses, normals."""
+"""Keeps a few frames of a run with everything that is needed to draw them: truth, isophotes, ellipses, normals."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, TypedDict
 
 import numpy as np
+import numpy.typing as npt
 
-from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.protocol import drawable
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import Session
-from simtest.runtime.files import write_atomically
-from simtest.simulation.rendered_view import View
-from simtest.spec import camera_table
+from simtest.runtime.files import Json, write_atomically
+from simtest.spec import Experiment, camera_table
 from simtest.validation.cases import Case
+from simtest.validation.matching import peak_px
 from simtest.validation.realisation import Realisation
+
+Vector = list[float]
 
 MAP_SIDE = 80
 """Truth maps are thinned to about this many samples along the longer side."""
@@ -26,136 +30,220 @@ CONTOUR_POINTS = 200
 """Contours are thinned to about this many points."""
 
 
+class DrawnTruth(NamedTuple):
+    """A true highlight: its number, BP, px (None behind the camera), normal and position, camera frame, and d k."""
+
+    id: int
+    bp_px: Vector | None
+    normal: Vector
+    position: Vector
+    kd_min: float
+    kd_max: float
+    isolated: bool
+
+
+class DrawnIsophote(TypedDict):
+    """A traced isophote: isovalue and thinned points, px."""
+
+    t: float
+    points: list[Vector]
+
+
+@dataclass(frozen=True)
+class DrawnEstimate:
+    """An estimator's answer at one detection; without `answered` it has none.
+
+    Parameters
+    ----------
+    specularity : int
+        Index of the detection.
+    true_id : int or None
+        Of the true highlight that it was matched to.
+    bp_px : list of float or None
+        The detection's peak, px.
+    estimator : str
+        Name.
+    """
+
+    specularity: int
+    true_id: int | None
+    bp_px: Vector | None
+    estimator: str
+    error_deg: float | None = None
+    error_oracle_deg: float | None = None
+    normal: Vector | None = None
+    candidates: list[Vector] = field(default_factory=list)
+    look_px: Vector | None = None
+    isophotes: list[DrawnIsophote] = field(default_factory=list)
+    curves: list[list[Vector]] = field(default_factory=list)
+    status: str = ""
+
+    def answered(
+        self, result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: npt.ArrayLike | None
+    ) -> "DrawnEstimate":
+        """Fill in the answer on a patch; `truth` is the true normal, shape (3,), where there is one."""
+        if isinstance(result, Failure):
+            return replace(self, status=str(result.reason))
+        made = replace(
+            self,
+            status="ok",
+            normal=result.normal.tolist(),
+            candidates=result.candidates.tolist(),
+            look_px=result.look_px.tolist() if np.isfinite(result.look_px).all() else None,
+            isophotes=[
+                {"t": t, "points": np.round(points[:: max(1, len(points) // CONTOUR_POINTS)], 2).tolist()}
+                for t, points in result.contours(patch)
+            ],
+            curves=[drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
+        )
+        if truth is None:
+            return made
+        normal = np.asarray(truth)
+        oracle = float(angle_deg(result.candidates, normal).min())
+        return replace(made, error_deg=float(angle_deg(result.normal, normal)), error_oracle_deg=oracle)
+
+
+class PublishedDetails(NamedTuple):
+    """What an item of the published protocol holds besides: setting, light, seed, outer region, peak of the patch."""
+
+    length_unit: str
+    paper: dict[str, Json]
+    light: Vector
+    seed: int
+    outer: list[int]
+    peak_value: float | None
+
+
+@dataclass(frozen=True)
+class GalleryMeta:
+    """Everything of a gallery item that is no picture.
+
+    Parameters
+    ----------
+    surface, setting, label : str
+        Of the case.
+    sigma : float
+        Noise, share of full scale.
+    command : str
+        Reproduces the item.
+    camera : Camera
+        Of the frame.
+    truth : sequence of DrawnTruth
+        The highlights that count.
+    estimates : sequence of DrawnEstimate
+        One for each detection and estimator.
+    lights : list of list of float, optional
+        Positions, camera frame, mm.
+    why : str, optional
+        Why the item is kept.
+    published : PublishedDetails, optional
+        For the published protocol.
+    """
+
+    surface: str
+    setting: str
+    label: str
+    sigma: float
+    command: str
+    camera: Camera
+    truth: Sequence[DrawnTruth]
+    estimates: Sequence[DrawnEstimate]
+    lights: list[Vector] | None = None
+    why: str | None = None
+    published: PublishedDetails | None = None
+
+    def to_json(self) -> dict[str, Json]:
+        """Return the item's `meta`."""
+        content = {name: value for name, value in vars(self).items() if value is not None and name != "published"}
+        return {
+            **content,
+            "camera": camera_table(self.camera),
+            "truth": [true._asdict() for true in self.truth],
+            "estimates": [vars(estimate) for estimate in self.estimates],
+            **(self.published._asdict() if self.published else {}),
+        }
+
+
 def save(
-    path: Path, session: Session, case: Case, seen: View, made: Realisation, command: str, why: str | None = None
+    path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation, why: str | None = None
 ) -> None:
-    """Write one gallery item.
+    """Write the gallery item of a realisation.
 
     Parameters
     ----------
     path : Path
         The .npz file.
     session : Session
-        At the view's scene.
+        At the realisation's scene.
+    experiment : Experiment
+        Of the case.
     case : Case
         Its setting.
-    seen : View
-        The rendered scene.
     made : Realisation
         The frame and the estimates.
-    command : str
-        Makes this item again.
     why : str, optional
         Why it is kept.
     """
-    camera = session.camera
+    camera, scene = session.camera, made.view.scene
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
-    meta = {
-        "surface": seen.scene.surface.label,
-        "setting": case.setting if not case.part else f"{case.setting} (part {case.part})",
-        "label": case.label,
-        "sigma": seen.scene.sensor.noise_sigma,
-        "command": command,
-        "camera": camera_table(camera),
-        "lights": np.asarray(seen.scene.rig.true_mm()).tolist(),
-        "truth": [_truth(j, judged) for j, judged in enumerate(made.truths)],
-        "estimates": [entry for i in range(len(made.specularities)) for entry in _estimates(i, made, camera)],
-    }
-    if why:
-        meta["why"] = why
-
+    meta = GalleryMeta(
+        surface=scene.surface.label,
+        setting=case.setting if not case.part else f"{case.setting} (part {case.part})",
+        label=case.label,
+        sigma=scene.sensor.noise_sigma,
+        command=case.reproduce_command(experiment, made.number),
+        camera=camera,
+        truth=[
+            DrawnTruth(j, h.bp_px.tolist(), h.normal.tolist(), h.position.tolist(), h.kd_min, h.kd_max, h.isolated)
+            for j, h in enumerate(made.truths)
+        ],
+        estimates=[estimate for i in range(len(made.specularities)) for estimate in _estimates(i, made, camera)],
+        lights=scene.rig.true_mm().tolist(),
+        why=why,
+    )
     # Pictures are encoded once more where they are drawn.
-    linear = seen.scene.sensor.response.model().decode(made.frame)
+    linear = scene.sensor.response.model().decode(made.frame)
     write_item(path, meta, linear, truth.position, truth.normal, curvature=truth.larger_curvature)
 
 
-def write_item(path: Path, meta: dict[str, Any], frame: Any, position: Any, normal: Any, **more: Any) -> None:
+def write_item(
+    path: Path,
+    meta: GalleryMeta,
+    frame: npt.ArrayLike,
+    position: npt.ArrayLike,
+    normal: npt.ArrayLike,
+    **pictures: npt.ArrayLike,
+) -> None:
     """Write the file of one gallery item.
 
     Parameters
     ----------
     path : Path
         The .npz file.
-    meta : dict
+    meta : GalleryMeta
         All that is no picture.
     frame : ndarray, shape (H, W) or (H, W, 3)
         Share of full scale.
     position, normal : ndarray, shape (h, w, 3)
         Thinned truth, camera frame; NaN where there is no surface.
-    **more : ndarray
+    **pictures : ndarray
         Further pictures.
     """
-    # Half precision is enough to look at; stored wider, since it is read back as it is.
+    # Half precision is enough to look at; the frame is stored wider, since it is read back as it is.
     content = {"frame": np.asarray(frame).astype(np.float16).astype(np.float32)}
     content |= {"position": np.asarray(position, np.float32), "normal": np.asarray(normal, np.float32)}
-    content |= {name: np.asarray(picture).astype(np.float16) for name, picture in more.items()}
-    text = np.array(json.dumps(meta, allow_nan=False))
-    write_atomically(path, lambda part: np.savez_compressed(part, **content, meta=text))  # type: ignore[arg-type]
+    halves = {name: np.asarray(picture).astype(np.float16) for name, picture in pictures.items()}
+    text = np.array(json.dumps(meta.to_json(), allow_nan=False))
+    write_atomically(path, lambda part: np.savez_compressed(part, allow_pickle=False, **content, **halves, meta=text))
 
 
-def _truth(j: int, judged: Any) -> dict[str, Any]:
-    highlight = judged.highlight
-    return {
-        "id": j,
-        "bp_px": highlight.bp_px.tolist(),
-        "normal": highlight.normal.tolist(),
-        "position": highlight.position.tolist(),
-        "kd_min": highlight.kd_min,
-        "kd_max": highlight.kd_max,
-        "isolated": judged.isolated,
-    }
-
-
-def _estimates(i: int, made: Realisation, camera: Camera) -> list[dict[str, Any]]:
-    specularity = made.specularities[i]
-    true_id = made.matched.get(i)
-    peak = [v + PIXEL_CENTRE for v in specularity.region.peak]
-    if not isinstance(specularity.patch, Failure):
-        peak = specularity.patch.peak_px.tolist()
-    normal = None if true_id is None else made.truths[true_id].highlight.normal
-    place = {"specularity": i, "true_id": true_id, "bp_px": peak}
+def _estimates(i: int, made: Realisation, camera: Camera) -> list[DrawnEstimate]:
+    """Return the answers at one detection."""
+    specularity, true_id = made.specularities[i], made.matched.get(i)
+    normal = None if true_id is None else made.truths[true_id].normal
     return [
-        place | {"estimator": name} | drawn(result, specularity.patch, camera, normal)
+        DrawnEstimate(i, true_id, peak_px(specularity).tolist(), name).answered(
+            result, specularity.patch, camera, normal
+        )
         for name, result in specularity.estimates.items()
     ]
-
-
-def drawn(result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: Any) -> dict[str, Any]:
-    """Give what a gallery item keeps of an estimator's answer.
-
-    Parameters
-    ----------
-    result : Estimate or Failure
-        The answer.
-    patch : Patch or Failure
-        What it looked at.
-    camera : Camera
-        Of the frame.
-    truth : ndarray, shape (3,), or None
-        The true normal, where there is one.
-    """
-    entry: dict[str, Any] = {
-        "error_deg": None, "error_oracle_deg": None, "normal": None, "candidates": [], "look_px": None,
-        "isophotes": [], "curves": [],
-    }  # fmt: skip
-    if isinstance(result, Failure):
-        return entry | {"status": str(result.reason)}
-    entry |= {"status": "ok"} | _drawn(result, patch, camera)
-    if truth is not None:
-        entry["error_deg"] = float(angle_deg(result.normal, truth))
-        entry["error_oracle_deg"] = float(angle_deg(result.candidates, truth).min())
-    return entry
-
-
-def _drawn(estimate: Estimate, patch: Patch | Failure, camera: Camera) -> dict[str, Any]:
-    isophotes = []
-    for t, points in estimate.contours(patch):
-        step = max(1, len(points) // CONTOUR_POINTS)
-        isophotes.append({"t": t, "points": np.round(points[::step], 2).tolist()})
-    return {
-        "normal": estimate.normal.tolist(),
-        "candidates": estimate.candidates.tolist(),
-        "look_px": estimate.look_px.tolist() if np.isfinite(estimate.look_px).all() else None,
-        "isophotes": isophotes,
-        "curves": [drawable(isophote.ellipse_px(camera)) for isophote in estimate.isophotes],
-    }

@@ -1,7 +1,12 @@
 """The closed-form laws that the renders confirm or refute (theory.md sections 3 and 4).
 
-All functions are vectorised over their arguments. d k is distance times signed curvature; angles in radians;
-half-axes are tangents of the half-angles of the back-projected cone.
+All functions are vectorised over their arguments. Angles are in radians; half-axes are tangents of the half-angles of
+the back-projected cone. Arguments that recur:
+
+- `kd`, `kd_min`, `kd_max`: d k, distance times signed (principal) curvature;
+- `isovalue`: t in (0, 1); `exponent`: n of a Phong lobe;
+- `lobe_curvature`: c = -(log f)''(0) of the reflectance, 4 n for Phong;
+- `position`, `light`: surface point and light in the camera frame, mm, shape (..., 3).
 """
 
 import numpy as np
@@ -12,55 +17,22 @@ from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 Array = npt.NDArray[np.float64]
 
 
-def gains(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> tuple[Array, Array]:
-    """Give the smaller and the larger of abs(1 + d k): by how much the normal turns per sightline angle.
+def axis_ratio(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:
+    """Compute the isophotes' axis ratio to second order: abs(1 + d k)_min / abs(1 + d k)_max (section 3, item 3).
 
-    Parameters
-    ----------
-    kd_min, kd_max : array_like
-        d times the principal curvatures.
-
-    Returns
-    -------
-    smaller, larger : ndarray
+    abs(1 + d k) is the angle by which the normal turns per angle of the sightline. The ratio lies in [0, 1].
     """
     first, second = np.abs(1 + np.asarray(kd_min, float)), np.abs(1 + np.asarray(kd_max, float))
-    return np.minimum(first, second), np.maximum(first, second)
-
-
-def axis_ratio(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:
-    """Give the isophotes' axis ratio to second order: abs(1 + d k)_min / abs(1 + d k)_max (section 3, item 3).
-
-    Parameters
-    ----------
-    kd_min, kd_max : array_like
-        d times the principal curvatures.
-
-    Returns
-    -------
-    ndarray
-        In [0, 1].
-    """
-    smaller, larger = gains(kd_min, kd_max)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(smaller / larger)
+        return np.asarray(np.minimum(first, second) / np.maximum(first, second))
 
 
 def isophote_half_axes(
     isovalue: npt.ArrayLike, lobe_curvature: npt.ArrayLike, kd_min: npt.ArrayLike, kd_max: npt.ArrayLike
 ) -> tuple[Array, Array]:
-    """Give the half-axes of an isophote, second order in the image angle (section 3, items 1 and 3).
+    """Compute the half-axes of an isophote, second order in the image angle (section 3, items 1 and 3).
 
     -log t = (c m^2 + 2 m) w^2 / 2 along a principal direction with m = 1 + d k; the 2 m is the falloff with 1/d^2.
-
-    Parameters
-    ----------
-    isovalue : array_like
-        t in (0, 1).
-    lobe_curvature : array_like
-        c = -(log f)''(0) of the reflectance; 4 n for Phong.
-    kd_min, kd_max : array_like
-        d times the principal curvatures.
 
     Returns
     -------
@@ -80,40 +52,28 @@ def isophote_half_axes(
 
 
 def isophote_half_width(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, kd: npt.ArrayLike) -> Array:
-    """Give the half-width of a Phong isophote across a circle, at any isovalue (section 3, item 3).
+    """Compute the half-width of a Phong isophote across a circle, at any isovalue (section 3, item 3).
 
-    Light and camera are at one place. With w the image angle and m = 1 + d k, the law of sines gives
+    The light is at the camera. With w the image angle and m = 1 + d k, the law of sines gives
     sin(theta) = abs(m) sin(w) for the angle theta between normal and view, and
     r = (m + 1) / (m cos(w) + cos(theta)) for the distance over d, so that
 
         log t = n log(1 - 2 m^2 sin^2 w) - 2 log r,
 
-    which `isophote_half_axes` holds to second order.
-
-    Parameters
-    ----------
-    isovalue : array_like
-        t in (0, 1).
-    exponent : array_like
-        n.
-    kd : array_like
-        d times the curvature of the principal section.
-
-    Returns
-    -------
-    ndarray
-        Tangent of the half-angle; inf where the isophote does not close.
+    which `isophote_half_axes` approximates to second order. `kd` is that of the principal section; the half-width is
+    inf where the isophote does not close.
     """
     t, n, m = np.broadcast_arrays(*(np.asarray(v, float) for v in (isovalue, exponent, 1 + np.asarray(kd, float))))
 
     def excess(squared_sine: Array) -> Array:
-        """Log radiance over t; falls from above 0."""
+        """Return log radiance over t, which falls from above 0."""
         cosine, normal = np.sqrt(1 - squared_sine), np.sqrt(1 - m**2 * squared_sine)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Each form where it has no cancellation.
             reach = np.where(m < 0, (m * cosine - normal) / (m - 1), (m + 1) / (m * cosine + normal))
             return np.asarray(n * np.log1p(-2 * m**2 * squared_sine) - 2 * np.log(reach) - np.log(t))
 
+    # Bisection for the squared sine of w.
     with np.errstate(divide="ignore"):
         high = np.minimum(1.0, 1 / (2 * m**2)) * (1 - 1e-12)
     open_ended, low = ~(excess(high) < 0), np.zeros_like(high)
@@ -125,7 +85,7 @@ def isophote_half_width(isovalue: npt.ArrayLike, exponent: npt.ArrayLike, kd: np
 
 
 _BISECTIONS = 60
-"""Halvings that leave nothing of an interval but rounding."""
+"""Halvings that narrow an interval down to rounding."""
 
 
 def axis_ratio_seen(
@@ -136,28 +96,12 @@ def axis_ratio_seen(
     smoothing_px: npt.ArrayLike = 0.0,
     pixel: npt.ArrayLike = 0.0,
 ) -> Array:
-    """Give the axis ratio of an isophote as it is traced: `axis_ratio` with its corrections (section 3, item 3).
+    """Compute the axis ratio of an isophote as it is traced: `axis_ratio` with its corrections (section 3, item 3).
 
     Falloff and finite isovalue are those of `isophote_half_width`. Smoothing by s and the linear interpolation between
     pixels widen both squared half-axes alike (section 4, smoothing): by -2 ln t s^2 + (-2 ln t - 1) v, v = 1/6 px^2.
-
-    Parameters
-    ----------
-    isovalue : array_like
-        t in (0, 1).
-    exponent : array_like
-        n of a Phong lobe.
-    kd_min, kd_max : array_like
-        d times the principal curvatures.
-    smoothing_px : array_like
-        s, px.
-    pixel : array_like
-        Angle of a pixel at the BP, rad; 0: a picture without pixels.
-
-    Returns
-    -------
-    ndarray
-        In (0, 1]; NaN where the isophote does not close.
+    `pixel` is the angle of a pixel at the BP, rad; 0: a picture without pixels. The ratio lies in (0, 1]; it is NaN
+    where the isophote does not close.
     """
     level = -2 * np.log(np.asarray(isovalue, float))
     s2 = np.asarray(smoothing_px, float) ** 2
@@ -169,17 +113,10 @@ def axis_ratio_seen(
 
 
 def circle_pose_error(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Give the error of circle pose on a curved surface (section 4): sin(error) = sqrt((1 - (b/a)^2)/(1 + b^2)).
+    """Compute the error of circle pose on a curved surface (section 4): sin(error) = sqrt((1 - (b/a)^2)/(1 + b^2)).
 
-    Parameters
-    ----------
-    a, b : array_like
-        Tangents of the cone's half-angles, a >= b.
-
-    Returns
-    -------
-    ndarray
-        Angle between either candidate and the true normal, rad; NaN where the isophote does not close.
+    a >= b are the half-axes. The error is the angle between either candidate and the true normal, rad; NaN where the
+    isophote does not close.
     """
     a, b = np.asarray(a, float), np.asarray(b, float)
     with np.errstate(invalid="ignore"):
@@ -187,36 +124,15 @@ def circle_pose_error(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 
 
 def offset_error(eps_over_d: npt.ArrayLike) -> Array:
-    """Give the sightline's error under light offset (section 4): about atan(eps_perp / d) / 2.
+    """Compute the sightline's error under light offset, rad (section 4): about atan(eps_perp / d) / 2.
 
-    Parameters
-    ----------
-    eps_over_d : array_like
-        Light offset perpendicular to the sightline over distance.
-
-    Returns
-    -------
-    ndarray
-        Angle, rad.
+    `eps_over_d` is the light offset perpendicular to the sightline, over the distance.
     """
     return np.asarray(np.arctan(np.asarray(eps_over_d, float)) / 2)
 
 
 def bisector_angle(position: npt.ArrayLike, light: npt.ArrayLike) -> Array:
-    """Give half the angle at a surface point between the light and the camera: the exact form of `offset_error`.
-
-    Parameters
-    ----------
-    position : array_like, shape (..., 3)
-        Surface point in the camera frame, mm.
-    light : array_like, shape (..., 3)
-        Light in the camera frame, mm.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Angle, rad.
-    """
+    """Compute half the angle between light and camera at a surface point, rad: the exact form of `offset_error`."""
     P = np.asarray(position, float)
     to_light = np.asarray(light, float) - P
     sine = np.linalg.norm(np.cross(-P, to_light), axis=-1)
@@ -230,7 +146,7 @@ def vignetting_shift(
     kd: npt.ArrayLike = 0.0,
     isovalue: npt.ArrayLike = 1.0,
 ) -> Array:
-    """Give the error that falloff cos^k about the optical axis leaves where it is not known (section 4).
+    """Compute the error that unknown falloff cos^k about the optical axis causes, rad (section 4).
 
     With w the image angle away from the axis and m = 1 + d k, equal in all directions,
     -log I = (c m^2 + 2 m) w^2 / 2 - k log(cos(phi + w)), so the peak moves towards the axis by
@@ -244,9 +160,9 @@ def vignetting_shift(
     power : array_like
         k; vignetting's and emission's add up.
     lobe_curvature : array_like
-        c = -(log f)''(0) of the reflectance; 4 n for Phong.
+        c.
     kd : array_like
-        d times the principal curvatures, equal.
+        d times both principal curvatures, which are equal.
     isovalue : array_like
         t in (0, 1]; 1 is the peak.
 
@@ -263,37 +179,18 @@ def vignetting_shift(
 
 
 def branch_point_error(ratio_error: npt.ArrayLike) -> Array:
-    """Give the tilt that circle pose makes of a small relative error of a round cone's axes (section 4): sqrt(2 delta).
+    """Compute the tilt, rad, that circle pose makes of a small error of a round cone's axes (section 4): sqrt(2 delta).
 
-    Parameters
-    ----------
-    ratio_error : array_like
-        delta = 1 - b/a of a cone that should be right-circular.
-
-    Returns
-    -------
-    ndarray
-        Angle, rad.
+    `ratio_error` is delta = 1 - b/a of a cone that should be right-circular.
     """
     return np.asarray(np.sqrt(2 * np.asarray(ratio_error, float)))
 
 
 def bisector_residual(position: npt.ArrayLike, light: npt.ArrayLike, distance_error: npt.ArrayLike) -> Array:
-    """Give the error of the bisector of light and camera where the distance is off (section 4).
+    """Compute the error of the bisector of light and camera for a wrong distance, rad (section 4).
 
-    Parameters
-    ----------
-    position : array_like, shape (..., 3)
-        Surface point in the camera frame, mm.
-    light : array_like, shape (..., 3)
-        Light in the camera frame, mm.
-    distance_error : array_like, shape (...)
-        Error of the distance, share of it, > -1.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Angle, rad: the difference of the angles between bisector and sightline, which all lie in one plane.
+    It is the difference of the angles between bisector and sightline, which all lie in one plane. `distance_error`,
+    shape (...), is a share of the distance, > -1.
     """
     P = np.asarray(position, float)
     moved = P * (1 + np.asarray(distance_error, float))[..., None]
@@ -301,21 +198,10 @@ def bisector_residual(position: npt.ArrayLike, light: npt.ArrayLike, distance_er
 
 
 def look_error(miss: npt.ArrayLike, kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:
-    """Give what a miss in the image costs against the normal where the estimate looks (section 4): abs((I + d S) w).
+    """Compute the error of a miss w against the normal where the estimate looks, rad (section 4): abs((I + d S) w).
 
-    Against the normal at the BP it costs abs(w).
-
-    Parameters
-    ----------
-    miss : array_like, shape (..., 2)
-        w along the principal directions of k_min and k_max, rad.
-    kd_min, kd_max : array_like, shape (...)
-        d times the principal curvatures.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Angle, rad.
+    Against the normal at the BP it is abs(w). `miss`, shape (..., 2), is w along the principal directions of k_min and
+    k_max, rad.
     """
     w = np.asarray(miss, float)
     return np.hypot((1 + np.asarray(kd_min, float)) * w[..., 0], (1 + np.asarray(kd_max, float)) * w[..., 1])

@@ -1,13 +1,12 @@
-"""What the laws of theory.md section 4 predict for an estimate at a true highlight."""
+"""Predictions of the laws of theory.md section 4 for an estimate at a true highlight."""
 
 import numpy as np
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import angle_deg
-from simtest.rendering import TrueHighlight
+from simtest.rendering import HighlightPoint
 from simtest.rendering.frames import Array
-from simtest.simulation.true_highlights import JudgedHighlight
 from simtest.spec.falloff import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.rig import is_at_camera
@@ -15,21 +14,20 @@ from simtest.spec.scene import Scene
 from simtest.validation import laws
 
 SAME_DEG = 1e-4
-"""Directions that differ by less are the same but for rounding."""
+"""Directions that differ by less are equal up to rounding."""
 
 EQUAL_KD = 1e-3
 """Principal curvatures times distance that differ by less are those of a plane or a sphere."""
 
 
-def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
-    """Give the error that theory.md section 4 predicts for an estimate, deg; None where it says nothing.
+def law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> float | None:
+    """Predict the error of an estimate, deg; None where no law of theory.md section 4 applies.
 
     With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
     vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
-    camera for those that take the reversed sightline for the normal; for others, which were told a distance, what its
-    error leaves.
+    camera for those that take the reversed sightline for the normal; for others, which were told a distance, the
+    effect of the distance's error.
     """
-    highlight = truth.highlight
     light = scene.rig.true_mm()[highlight.light]
     offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
     if power is None or (offset and power > 0):
@@ -37,7 +35,7 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
     if len(estimate.candidates) == 1:
         if offset:
             return _offset_law_deg(scene, estimate, highlight, light)
-        return _vignetting_law_deg(scene, estimate, truth, power) if power > 0 else None
+        return _vignetting_law_deg(scene, estimate, highlight, power) if power > 0 else None
     if offset or power > 0 or len(estimate.isophotes) != 1:
         return None
     a, b = laws.isophote_half_axes(
@@ -48,7 +46,7 @@ def law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float |
 
 
 def unknown_falloff(scene: Scene, light: int) -> float | None:
-    """Give k of the falloff cos^k about the optical axis that reconstruction is not told; None for another form."""
+    """Return k of the falloff cos^k about the optical axis that reconstruction is not told; None for another form."""
     sensor, emitter = scene.sensor, scene.rig.lights[light]
     parts = [] if sensor.vignetting_known else [sensor.vignetting]
     if scene.rig.known_emission() is None and not emitter.is_isotropic:
@@ -60,16 +58,15 @@ def unknown_falloff(scene: Scene, light: int) -> float | None:
 
 
 def _reverses_sightline(scene: Scene, estimate: Estimate) -> bool:
-    """Tell whether the proposed normal is the reversed sightline that the estimate looks along."""
+    """Return whether the proposed normal is the reversed sightline that the estimate looks along."""
     if not np.isfinite(estimate.look_px).all():
         return False
     sightline = scene.camera.model().unproject(estimate.look_px)
     return bool(angle_deg(estimate.normal, -sightline) < SAME_DEG)
 
 
-def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight, power: float) -> float | None:
-    """Give the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
-    highlight = truth.highlight
+def _vignetting_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint, power: float) -> float | None:
+    """Predict the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
     if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
         return None
     off_axis = np.arccos(highlight.position[2] / np.linalg.norm(highlight.position))
@@ -79,83 +76,69 @@ def _vignetting_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight
 
 
 def lobe_curvature(scene: Scene) -> float:
-    """Give c = -(log f)''(0) of a scene's lobe; a very narrow one stands in where it has no closed form."""
+    """Return c = -(log f)''(0) of a scene's lobe; that of a very narrow lobe where it has no closed form."""
     reflectance = scene.reflectance
     if isinstance(reflectance, PhongReflectance):
         return reflectance.lobe_curvature
     return 1e6
 
 
-def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: TrueHighlight, light: Array) -> float | None:
-    """Give the law of one candidate with a light beside the camera, deg."""
+def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint, light: Array) -> float | None:
+    """Predict the error of one candidate with a light beside the camera, deg."""
     if _reverses_sightline(scene, estimate):
         return float(np.degrees(laws.bisector_angle(highlight.position, light)))
-    # Which light a highlight is ascribed to, and which distance a rig of several was told, is another matter.
+    # With several lights the estimate may assume another light, and another distance, than the highlight's.
     told = scene.calibration(highlight.distance).priors.distance_mm
     if told is None or len(scene.rig.lights) > 1:
         return None
     return float(np.degrees(laws.bisector_residual(highlight.position, light, told.mean / highlight.distance - 1)))
 
 
-def axis_ratio_seen(scene: Scene, estimate: Estimate, truth: JudgedHighlight, smoothing_px: float) -> float | None:
-    """Give the axis ratio that an estimate which takes the isophotes as they are should find; None for others.
+def axis_ratio_seen(scene: Scene, estimate: Estimate, highlight: HighlightPoint, smoothing_px: float) -> float | None:
+    """Predict the axis ratio of an estimate that takes the isophotes as they are; None for others.
 
     For a Phong lobe without a base under a light at the camera, mean of the estimate's isovalues.
     """
-    highlight, reflectance = truth.highlight, scene.reflectance
+    reflectance = scene.reflectance
     isovalues = [isophote.isovalue for isophote in estimate.isophotes]
-    pure = isinstance(reflectance, PhongReflectance) and not reflectance.normalised and reflectance.diffuse == 0
-    if (
-        not (pure and isovalues)
-        or not is_at_camera(scene.rig.true_mm()[highlight.light])
-        or not _takes_ratio_as_seen(estimate)
-    ):
+    if not isinstance(reflectance, PhongReflectance) or reflectance.normalised or reflectance.diffuse != 0:
         return None
-    assert isinstance(reflectance, PhongReflectance)
-    seen = laws.axis_ratio_seen(
-        isovalues,
-        reflectance.exponent,
-        highlight.kd_min,
-        highlight.kd_max,
-        smoothing_px,
-        _pixel_angle(scene, highlight),
-    )
-    return float(seen.mean()) if np.isfinite(seen).all() else None
+    at_camera = is_at_camera(scene.rig.true_mm()[highlight.light])
+    if not (isovalues and at_camera and _takes_ratio_as_seen(estimate)):
+        return None
+    kd_min, kd_max = highlight.kd_min, highlight.kd_max
+    pixel = _pixel_angle(scene, highlight)
+    ratios = laws.axis_ratio_seen(isovalues, reflectance.exponent, kd_min, kd_max, smoothing_px, pixel)
+    return float(ratios.mean()) if np.isfinite(ratios).all() else None
 
 
 def _takes_ratio_as_seen(estimate: Estimate) -> bool:
-    """Tell whether an estimate's axis ratio is that of its cones."""
+    """Return whether an estimate's axis ratio is that of its cones."""
     poses = [isophote.pose() for isophote in estimate.isophotes]
     ratios = [pose.axis_ratio for pose in poses if not isinstance(pose, Failure)]
     return estimate.axis_ratio is not None and bool(np.isclose(np.mean(ratios), estimate.axis_ratio, atol=1e-9))
 
 
-def _pixel_angle(scene: Scene, highlight: TrueHighlight) -> float:
-    """Give the angle of a pixel at a BP, rad: the root of its solid angle."""
+def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
+    """Compute the angle of a pixel at a BP, rad: the root of its solid angle."""
     camera = scene.camera.model()
     steps = np.array([[0.5, 0.0], [0.0, 0.5]])
     ahead, behind = camera.unproject(highlight.bp_px + steps), camera.unproject(highlight.bp_px - steps)
     return float(np.sqrt(np.linalg.norm(np.cross(*(ahead - behind)))))
 
 
-def look_law_deg(scene: Scene, estimate: Estimate, truth: JudgedHighlight) -> float | None:
-    """Give abs((I + dS) w) of an estimate's own miss w in the image, deg (theory.md section 4).
+def look_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> float | None:
+    """Predict the error where an estimate looks: abs((I + dS) w) of its own miss w, deg (theory.md section 4).
 
-    For estimates that take the reversed sightline for the normal under a light at the camera.
+    For estimators that take the reversed sightline for the normal under a light at the camera; None for others.
     """
-    highlight = truth.highlight
     at_camera = is_at_camera(scene.rig.true_mm()[highlight.light])
     if not at_camera or not _reverses_sightline(scene, estimate):
         return None
     look = scene.camera.model().unproject(estimate.look_px)
     sightline = highlight.position / np.linalg.norm(highlight.position)
     across = look / (look @ sightline) - sightline
-    if highlight.direction_min is None:
-        if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
-            return None
-        miss = np.array([np.linalg.norm(across), 0.0])
-    else:
-        miss = np.array(
-            [across @ highlight.direction_min, across @ np.cross(highlight.normal, highlight.direction_min)]
-        )
+    # The miss along the principal directions.
+    first, second = highlight.direction_min, np.cross(highlight.normal, highlight.direction_min)
+    miss = np.array([across @ first, across @ second])
     return float(np.degrees(laws.look_error(miss, highlight.kd_min, highlight.kd_max)))

@@ -1,7 +1,7 @@
 """One realisation: render, expose, reconstruct, match, measure."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,12 +10,13 @@ from simtest.errors import Reason
 from simtest.estimators import AnyEstimator
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import View
-from simtest.simulation.true_highlights import JudgedHighlight
+from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.matching import match
-from simtest.validation.metrics import MISSED, RowContext, rows
+from simtest.validation.metrics import MISSED, rows
+from simtest.validation.results_table import ResultRow
 
 Image = npt.NDArray[np.float32]
 
@@ -26,28 +27,60 @@ class Realisation:
 
     Parameters
     ----------
-    rows : list of dict
+    number : int
+        Of the realisation.
+    view : RenderedView
+        The rendered scene.
+    rows : list of ResultRow
         Of the results' table.
     frame : ndarray of float32, shape (H, W) or (H, W, 3)
-        What the sensor gave, as encoded.
+        The sensor's frame, as encoded.
     specularities : list of Specularity
         Detections with estimates.
-    truths : list of JudgedHighlight
+    truths : list of TrueHighlight
         Those that count.
     matched : dict
         Index of the truth by index of the detection.
     """
 
-    rows: list[dict[str, Any]]
+    number: int
+    view: RenderedView
+    rows: list[ResultRow]
     frame: Image
     specularities: list[Specularity]
-    truths: list[JudgedHighlight]
+    truths: list[TrueHighlight]
     matched: dict[int, int]
 
 
+class Realiser:
+    """Makes realisations one after the other; session and view stay while the next one can use them.
+
+    Parameters
+    ----------
+    variant : str or None
+        Mitsuba variant.
+    """
+
+    def __init__(self, variant: str | None) -> None:
+        self._variant = variant
+        self._view: RenderedView | None = None
+
+    def make(
+        self, experiment: Experiment, case: Case, number: int, estimators: Mapping[str, AnyEstimator]
+    ) -> Realisation:
+        """Make one realisation of a case; `session` is then at its scene."""
+        scene, drawn = case.scene(experiment, number)
+        # A scene without drawn values is rendered once for all realisations.
+        if self._view is None:
+            self.session = Session(scene, self._variant)
+        if self._view is None or scene != self._view.scene:
+            self._view = render_view(self.session, scene)
+        return realise(self.session, experiment, case, number, self._view, drawn, estimators)
+
+
 def realise(
-    session: Session, experiment: Experiment, case: Case, number: int, seen: View, drawn: dict[str, Any],
-    estimators: dict[str, AnyEstimator],
+    session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, float],
+    estimators: Mapping[str, AnyEstimator],
 ) -> Realisation:  # fmt: skip
     """Make one realisation of a case.
 
@@ -61,11 +94,11 @@ def realise(
         The case.
     number : int
         Of the realisation.
-    seen : View
+    view : RenderedView
         The rendered scene.
-    drawn : dict
-        Values drawn for this realisation.
-    estimators : dict
+    drawn : mapping
+        Values drawn for this realisation, by key path.
+    estimators : mapping
         Estimator by name.
 
     Returns
@@ -73,22 +106,21 @@ def realise(
     Realisation
     """
     seed = case.noise_seed(experiment, number)
-    frame = seen.frame(seed)
-    dark = seen.full_scale <= 0
+    frame = view.frame(seed)
+    dark = view.full_scale <= 0
     # Without light whatever is found is noise; no highlight counts as isolated, and all count as failures.
-    specularities = [] if dark else reconstruct(frame, seen.calibration, estimators, isolated=case.isolated)
-    truths = [truth for truth in seen.truths if truth.isolated or not case.isolated or dark]
+    specularities = [] if dark else reconstruct(frame, view.calibration, estimators, isolated=case.isolated)
+    truths = [truth for truth in view.highlights if truth.isolated or not case.isolated or dark]
     matched = match(specularities, truths)
-    common = {
-        "experiment": experiment.name,
-        "label": case.label,
-        "setting": case.setting,
-        "realisation": number,
-        "seed": seed,
-        "laws": ",".join(case.laws) or None,
-        **case.swept,
-        **drawn,
-    }
+    common = ResultRow(
+        experiment=experiment.name,
+        label=case.label,
+        realisation=number,
+        setting=case.setting,
+        seed=seed,
+        laws=",".join(case.laws) or None,
+        swept={**case.swept, **drawn},
+    )
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
-    made = rows(RowContext(session, common), specularities, truths, matched, list(estimators), unfound)
-    return Realisation(made, frame, specularities, truths, matched)
+    made = rows(session, common, specularities, truths, matched, list(estimators), unfound)
+    return Realisation(number, view, made, frame, specularities, truths, matched)

@@ -1,4 +1,4 @@
-"""Runs an experiment: case by case, each kept as soon as it is done, so that a stopped run goes on."""
+"""Runs an experiment case by case; each finished case is kept, so that a stopped run can go on."""
 
 import hashlib
 import itertools
@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -22,7 +21,7 @@ from simtest.estimators.registry import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
-from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
@@ -48,16 +47,52 @@ class Run:
         Holds results.parquet, summary.json and gallery/.
     results : polars.DataFrame
         All rows.
-    summary : dict
-        As in summary.json.
     resumed : int
         Cases that an earlier, interrupted run had finished.
     """
 
     folder: Path
     results: pl.DataFrame
-    summary: dict[str, Any]
     resumed: int
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """How a run was made, as its summary.json tells.
+
+    Parameters
+    ----------
+    variant : str
+        Mitsuba variant.
+    llvm : str or None
+        The libLLVM in use.
+    fingerprint : str
+        Hash of everything that determines the results.
+    seed, realisations : int
+        The experiment's.
+    started : str
+        ISO 8601, UTC.
+    duration_s : float
+        Wall time.
+    command : str
+        How the run was called.
+    inputs : dict
+        SHA-256 by input file.
+    """
+
+    variant: str
+    llvm: str | None
+    fingerprint: str
+    seed: int
+    realisations: int
+    started: str
+    duration_s: float
+    command: str
+    inputs: dict[str, str]
+
+    def to_json(self) -> Json:
+        """Return the record with the environment that the run was made in."""
+        return {**provenance.environment(), **vars(self)}
 
 
 def run_experiment(
@@ -75,8 +110,8 @@ def run_experiment(
     experiment : Experiment
         What to run.
     folder : Path
-        Made if need be. A folder that holds something else than a run is refused; the same run, finished, is given
-        back as it is.
+        Made if need be. A folder that holds something other than a run is refused; the same run, finished, is
+        returned as it is.
     command : str
         How the run was called, for the report.
     variant : str, optional
@@ -109,47 +144,39 @@ def run_experiments(
 ) -> list[Run]:
     """Run several experiments as one piece of work, so that an engine's processes start once; see `run_experiment`.
 
-    Parameters
-    ----------
-    wanted : sequence of tuple
-        Each experiment with its folder.
-    command, variant, progress, engine
-        As of `run_experiment`.
-
-    Returns
-    -------
-    list of Run
-        In the same order.
+    `wanted` pairs each experiment with its folder; the runs are returned in the same order.
     """
     started, clock = datetime.now(UTC), time.monotonic()
-    # All that may be refused is refused before a folder is touched.
     # The variant is chosen here: a worker on another machine may have another environment.
     variant = backend.requested_variant(variant)
+    # Check: everything that may be refused is refused before a folder is touched.
     jobs = [_job(experiment, folder, variant) for experiment, folder in wanted]
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
+    # Run what is not finished.
     left = [job for job in jobs if job.folder not in finished]
     for job in left:
         _prepare(job.folder, job.digest)
     resumed = _work(left, variant, engine or make_engine(), progress)
+    # Write results and summaries.
     for job in left:
-        run = {
-            "variant": variant,
-            "llvm": backend.library_in_use(),
-            "fingerprint": job.digest,
-            "seed": job.experiment.seed,
-            "realisations": job.experiment.realisations,
-            "started": started.isoformat(timespec="seconds"),
-            "duration_s": round(time.monotonic() - clock, 1),
-            "command": command,
-            "inputs": _inputs(job.cases),
-        }
-        finished[job.folder] = _finish(job, run, resumed[job.folder])
+        record = RunRecord(
+            variant=variant,
+            llvm=backend.library_in_use(),
+            fingerprint=job.digest,
+            seed=job.experiment.seed,
+            realisations=job.experiment.realisations,
+            started=started.isoformat(timespec="seconds"),
+            duration_s=round(time.monotonic() - clock, 1),
+            command=command,
+            inputs=_inputs(job.cases),
+        )
+        finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
 
 
 @dataclass(frozen=True)
 class _Job:
-    """An experiment that is to be run in a folder."""
+    """An experiment with the folder that it is run in."""
 
     experiment: Experiment
     folder: Path
@@ -157,7 +184,7 @@ class _Job:
     digest: str
 
     def missing(self) -> list[int]:
-        """Places of the cases that are not done yet."""
+        """Return the indices of the cases that are not done yet."""
         return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
 
 
@@ -169,41 +196,43 @@ def _job(experiment: Experiment, folder: Path, variant: str) -> _Job:
     return _Job(experiment, folder, cases, digest)
 
 
-def _finish(job: _Job, run: dict[str, Any], resumed: int) -> Run:
-    """Put the parts of an experiment together."""
+def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
+    """Join the parts of an experiment, and write its results and summary."""
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
-    summary = _summary(job.experiment, results, run)
+    summary = _summary(job.experiment, results, record)
     write_atomically(folder / "results.parquet", results.write_parquet)
     write_json(folder / "summary.json", summary)
     # The parts go last: until the summary stands, a run that is stopped can go on.
     _remove(parts)
-    return Run(folder, results, summary, resumed)
+    return Run(folder, results, resumed)
 
 
-def _summary(experiment: Experiment, results: pl.DataFrame, run: dict[str, Any]) -> dict[str, Any]:
-    """Give the content of summary.json (design.md, section 3)."""
-    content = {
-        "title": experiment.title or experiment.name,
-        "description": experiment.description,
-        "settings": summarise(results),
+def _summary(experiment: Experiment, results: pl.DataFrame, record: RunRecord) -> Json:
+    """Return the content of summary.json."""
+    settings: dict[str, Json] = {
+        setting: {estimator: figures.to_json() for estimator, figures in by_estimator.items()}
+        for setting, by_estimator in summarise(results).items()
     }
-    return {"run": {**provenance.environment(), **run}, "experiments": {experiment.name: content}}
+    title = experiment.title or experiment.name
+    content: Json = {"title": title, "description": experiment.description, "settings": settings}
+    return {"run": record.to_json(), "experiments": {experiment.name: content}}
 
 
 def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: Progress | None) -> dict[Path, int]:
-    """Run the cases that are not done yet; gives how many of each folder were."""
+    """Run the cases that are not done yet; return how many of each folder were done before."""
     total = sum(case.realisations for job in jobs for case in job.cases)
     missing = {job.folder: job.missing() for job in jobs}
+    # Split the missing cases into parts, which an engine may run in any order.
     parts: list[tuple[_Job, int, Part]] = []
     for job in jobs:
         in_gallery, swept = _in_gallery(job.cases), swept_example(job.cases)
         for index in missing[job.folder]:
             item = job.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
             parts += [(job, index, part) for part in parts_of(job.experiment, job.cases[index], swept, item, variant)]
-    places = [(job.folder, index) for job, index, _ in parts]
-    waiting = Counter(places)
-    made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {place: {} for place in waiting}
+    case_of = [(job.folder, index) for job, index, _ in parts]
+    waiting = Counter(case_of)
+    made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {case: {} for case in waiting}
     done = total - sum(job.cases[index].realisations for job in jobs for index in missing[job.folder])
     name = parts[0][2].case.setting if parts else ""
 
@@ -216,10 +245,11 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     if progress and parts:
         progress(done, total, name)
     for number, rows in engine.run(make_rows, [part for *_, part in parts], step):
-        folder, index = place = places[number]
-        made[place][number] = rows
-        if len(made[place]) == waiting[place]:
-            rows = pl.concat([rows for _, rows in sorted(made.pop(place).items())])
+        folder, index = case = case_of[number]
+        made[case][number] = rows
+        # A case is kept once all its parts are there.
+        if len(made[case]) == waiting[case]:
+            rows = pl.concat([rows for _, rows in sorted(made.pop(case).items())])
             write_atomically(_part_file(folder / PARTS, index), rows.write_parquet)
         name = parts[min(number + 1, len(parts) - 1)][2].case.setting
     forget()
@@ -237,7 +267,7 @@ def _in_gallery(cases: list[Case]) -> set[int]:
 
 
 def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
-    """Give a hash of all that determines a run's results."""
+    """Return a hash of everything that determines a run's results."""
     return _hash(
         {
             "experiment": experiment.model_dump(mode="json"),
@@ -251,38 +281,25 @@ def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str
 
 
 def definition(experiment: Experiment, cases: list[Case]) -> str:
-    """Give a hash of what an experiment is: itself, its scenes, its input files; not of what runs it, nor from where.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    cases : list of Case
-        As `expand` gives them.
-
-    Returns
-    -------
-    str
-        SHA-256, hex.
-    """
+    """Return a hash of what an experiment is: itself, its scenes and its input files; not of code, versions, paths."""
     files = sorted((Path(name).name, digest) for name, digest in _inputs(cases).items())
     scenes = [case.data for case in cases]
     return _hash({"experiment": experiment.model_dump(mode="json"), "scenes": scenes, "inputs": files})
 
 
-def _hash(fingerprint: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).hexdigest()
+def _hash(content: Json) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _finished(folder: Path, digest: str, cases: int) -> Run | None:
-    """Give the run that a folder holds whole, if it is the same; warn where another one will be replaced."""
+    """Return the finished run that a folder holds, if it is the same; warn if another one will be replaced."""
     if (folder / PARTS).is_dir():
-        # Whatever stands beside the parts of a stopped run may be half of each.
+        # Beside the parts of a stopped run anything may be incomplete.
         return None
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         if summary["run"]["fingerprint"] == digest:
-            return Run(folder, pl.read_parquet(folder / "results.parquet"), summary, cases)
+            return Run(folder, pl.read_parquet(folder / "results.parquet"), cases)
     except (OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError):
         return None
     warnings.warn(f"{folder}: holds another run, or one of another version of simtest; it is replaced", stacklevel=5)
@@ -290,7 +307,7 @@ def _finished(folder: Path, digest: str, cases: int) -> Run | None:
 
 
 def _prepare(folder: Path, digest: str) -> None:
-    """Make the run's folder; keep the finished cases of an interrupted run of the same, drop those of another."""
+    """Make the run's folder; keep the finished cases of the same run, stopped, and drop those of another."""
     parts = folder / PARTS
     record = parts / "fingerprint.json"
     try:
@@ -306,7 +323,7 @@ def _prepare(folder: Path, digest: str) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that holds something else than a run; what a killed run was writing is removed."""
+    """Raise `InputError` if a folder holds something other than a run; remove what a killed run was writing."""
     try:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
@@ -318,7 +335,7 @@ def _check_folder(folder: Path) -> None:
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
-    # Folders of those names alone may be anyone's, and a run replaces them.
+    # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
         strangers = sorted(held)
     if strangers:
@@ -341,7 +358,7 @@ def _remove(folder: Path) -> None:
 
 
 def _inputs(cases: list[Case]) -> dict[str, str]:
-    """Give the hashes of the files that the cases were read from."""
+    """Return the hashes of the files that the cases were read from."""
     files = {Path(case.where) for case in cases}
     for case in cases:
         surface = case.data.get("surface", {})

@@ -1,6 +1,6 @@
-"""The worst cases of many results: which rows missed by most, and their frames made again from their seeds."""
+"""The worst cases of many results: the rows that missed by most, and their frames, reproduced from the seeds."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,18 +8,17 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.rendering import Session
-from simtest.simulation.rendered_view import view
 from simtest.spec import Experiment
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case, expand
-from simtest.validation.paper.item import save_realisation
-from simtest.validation.realisation import realise
+from simtest.validation.paper.gallery_item import save_realisation
+from simtest.validation.realisation import Realiser
+from simtest.validation.results_table import Value
 
 MOST = 8
 """Cases that are chosen."""
 
-_PLACE = ("experiment", "label", "surface", "setting", "estimator")
+_CELL = ("experiment", "label", "surface", "setting", "estimator")
 
 
 @dataclass(frozen=True)
@@ -46,18 +45,18 @@ class WorstCase:
 
 
 def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: int = MOST) -> list[WorstCase]:
-    """Choose the worst cases: of places that got worse, then of each estimator in turn.
+    """Choose the worst cases: first of the cells that got worse, then of each estimator in turn.
 
-    How bad a row is, is by how much the error of its better candidate exceeds what was expected: its law, or where
-    there is none the median of its setting and estimator. So the known failure of a model does not fill the gallery.
+    Rows are ranked by how far the error of the better candidate exceeds the expected one: that of the law, or else the
+    median of the setting and estimator. So the known failure of a model does not fill the gallery.
 
     Parameters
     ----------
     results : polars.DataFrame
         Rows of any experiments.
     worse : polars.DataFrame, optional
-        Columns that name places (experiment, label, surface, setting, estimator), the worst first; they have half of
-        the cases at most.
+        Columns that name cells (experiment, label, surface, setting, estimator), the worst first; they get at most half
+        of the cases.
     most : int
         Cases at most. A frame is chosen once.
 
@@ -65,28 +64,30 @@ def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: 
     -------
     list of WorstCase
     """
-    # A law that is no number says nothing; it would be sorted before all numbers.
+    # Excess over what is expected. A law that is not finite predicts nothing, and would be sorted before all numbers.
     results = results.with_columns(error_law_deg=pl.when(pl.col("error_law_deg").is_finite()).then("error_law_deg"))
-    expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_PLACE))
+    expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_CELL))
     answered = (pl.col("status") == "ok") & pl.col("true_id").is_not_null() & pl.col("error_oracle_deg").is_finite()
     rows = results.filter(answered).with_columns(
         expected=expected, excess=pl.col("error_oracle_deg") - expected, row=pl.int_range(pl.len())
     )
     rows = rows.sort("excess", "row", descending=[True, False])
+    # The worst row of each cell that got worse.
     queues: list[pl.DataFrame] = []
     if worse is not None:
-        places = worse.select(_PLACE).unique(maintain_order=True)
-        # Pooled comparisons and costs are of no frame: they must not take the room of those that are.
-        places = places.join(rows, on=_PLACE, how="semi", nulls_equal=True, maintain_order="left").head(most // 2)
-        queues += [rows.join(place, on=_PLACE, nulls_equal=True).head(1) for place in places.iter_slices(1)]
+        cells = worse.select(_CELL).unique(maintain_order=True)
+        # Pooled comparisons and costs have no frame: they must not displace cells that have.
+        cells = cells.join(rows, on=_CELL, how="semi", nulls_equal=True, maintain_order="left").head(most // 2)
+        queues += [rows.join(cell, on=_CELL, nulls_equal=True).head(1) for cell in cells.iter_slices(1)]
     chosen: dict[tuple[str, str, int], WorstCase] = {}
     _take(chosen, [queue for queue in queues if queue.height], most // 2)
+    # Then each estimator's worst rows, in turn.
     _take(chosen, [own for _, own in sorted(rows.group_by("estimator"), key=lambda item: str(item[0]))], most)
     return list(chosen.values())
 
 
 def _take(chosen: dict[tuple[str, str, int], WorstCase], queues: list[pl.DataFrame], most: int) -> None:
-    """Take from the queues in turn, the worst of each first, a frame once and a setting once for each estimator."""
+    """Take the worst row of each queue in turn; each frame once, and each setting once for each queue."""
     waiting = [(own.iter_rows(named=True), set[tuple[str, str]]()) for own in queues]
     while waiting and len(chosen) < most:
         left = []
@@ -103,7 +104,7 @@ def _take(chosen: dict[tuple[str, str, int], WorstCase], queues: list[pl.DataFra
         waiting = left
 
 
-def _why(row: dict[str, object]) -> str:
+def _why(row: Mapping[str, Value]) -> str:
     beside = "its law says" if row["error_law_deg"] is not None else "the setting's median is"
     return f"{row['estimator']} missed by {row['error_oracle_deg']:.3g}°; {beside} {row['expected']:.3g}°."
 
@@ -111,7 +112,7 @@ def _why(row: dict[str, object]) -> str:
 def save_worst(
     cases: Iterable[WorstCase], experiments: Iterable[Experiment], folder: Path, variant: str | None = None
 ) -> tuple[Path, ...]:
-    """Make the frames of worst cases again from their seeds, and keep them as gallery items.
+    """Reproduce the frames of worst cases from their seeds, and keep them as gallery items.
 
     Parameters
     ----------
@@ -137,7 +138,7 @@ def save_worst(
     by_name = {experiment.name: experiment for experiment in experiments}
     expanded: dict[str, list[Case]] = {}
     folder.mkdir(parents=True, exist_ok=True)
-    files, session = [], None
+    files, realiser = [], Realiser(variant)
     for i, worst in enumerate(cases):
         experiment = by_name.get(worst.experiment)
         if experiment is None:
@@ -147,11 +148,10 @@ def save_worst(
         case = _case(expanded[worst.experiment], worst)
         file = folder / f"worst-{i:02d}.npz"
         if case.is_paper:
-            names = {"label": case.label, "setting": case.setting, "why": worst.why}
-            seed = case.noise_seed(experiment, worst.realisation)
-            save_realisation(file, case.paper_setting(), experiment.estimators, seed, names)
+            save_realisation(file, experiment, case, worst.realisation, worst.why)
         else:
-            session = _save(file, session, experiment, case, worst, variant)
+            made = realiser.make(experiment, case, worst.realisation, load_estimators(experiment.estimators))
+            gallery.save(file, realiser.session, experiment, case, made, worst.why)
         files.append(file)
     return tuple(files)
 
@@ -163,17 +163,3 @@ def _case(cases: list[Case], worst: WorstCase) -> Case:
     raise InputError(
         f"experiment {worst.experiment}: has no realisation {worst.realisation} of the setting {worst.setting!r}"
     )
-
-
-def _save(
-    file: Path, session: Session | None, experiment: Experiment, case: Case, worst: WorstCase, variant: str | None
-) -> Session:
-    """Make one frame again and keep it; gives the session, which later frames use."""
-    scene, drawn = case.scene(experiment, worst.realisation)
-    session = session or Session(scene, variant)
-    seen = view(session, scene)
-    estimators = load_estimators(experiment.estimators)
-    made = realise(session, experiment, case, worst.realisation, seen, drawn, estimators)
-    command = f"{case.again(experiment, worst.realisation)} --out frame"
-    gallery.save(file, session, case, seen, made, command, worst.why)
-    return session

@@ -20,7 +20,7 @@ from simtest.geometry.patch import Patch
 from simtest.rendering import exact_points as exact
 from simtest.rendering.direct import DirectLight
 from simtest.rendering.session import Session
-from simtest.simulation.rendered_view import View
+from simtest.simulation.rendered_view import RenderedView
 from simtest.spec.scene import Scene
 from simtest.surfaces import analytic
 from simtest.validation.cases import Case
@@ -165,7 +165,7 @@ HARMLESS: dict[str, tuple[Mutation, ...]] = {
     ),
     "light off by 1e-7 of itself": (
         Mutation(
-            View.frame,
+            RenderedView.frame,
             _CAPTURE,
             _CAPTURE.replace(
                 "self.light", "(self.light * (1 + 1e-7 * np.cos(np.arange(self.light.size))).reshape(self.light.shape)"

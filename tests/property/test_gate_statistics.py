@@ -18,7 +18,7 @@ from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
 from simtest.nightly.gate.quantities import quantities
 from simtest.nightly.gate.records import OUTCOMES, Night
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 
 ERROR = quantities(Limits())["mean_deg"]
 probabilities = st.lists(st.floats(0, 1), min_size=1, max_size=6)

@@ -17,7 +17,7 @@ from simtest.geometry import Camera, ViewMask
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import load_scene, scene_from_dict
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2
@@ -43,7 +43,7 @@ def see():
     def made(**tables):
         key = str(tables)
         if key not in kept:
-            kept[key] = view(session, scene_from_dict(tables))
+            kept[key] = render_view(session, scene_from_dict(tables))
         return kept[key]
 
     return made
@@ -71,7 +71,7 @@ CLIPPED_SURFACES = {
 
 def clipped_estimates(see, name, count):
     seen = see(surface=CLIPPED_SURFACES[name], sensor=CLIPPED)
-    truth, made = seen.truths[0].highlight, []
+    truth, made = seen.highlights[0], []
     for number in range(count):
         (spot,) = reconstruct(seen.frame(number), seen.calibration, AXES, isolated=False)
         assert spot.patch.saturated_share(0.5) > 0.3
@@ -124,7 +124,7 @@ SIDES = 4
 
 def cut_through_the_peak(seen, frame, side):
     """Cut frame and camera off at the column or row of the true BP, so that half of each isophote is outside."""
-    camera, (column, row) = seen.calibration.camera, np.round(seen.truths[0].highlight.bp_px).astype(int)
+    camera, (column, row) = seen.calibration.camera, np.round(seen.highlights[0].bp_px).astype(int)
     height, width = frame.shape
     x0, x1 = {0: (0, column), 1: (column, width)}.get(side, (0, width))
     y0, y1 = {2: (0, row), 3: (row, height)}.get(side, (0, height))
@@ -134,7 +134,7 @@ def cut_through_the_peak(seen, frame, side):
 
 def check_halves(see, placed, count, estimators):
     seen = see(surface=placed, sensor={"noise_sigma": 0.05})
-    truth, errors = seen.truths[0].highlight, {key: [] for key in estimators}
+    truth, errors = seen.highlights[0], {key: [] for key in estimators}
     for number in range(count):
         made = found(*cut_through_the_peak(seen, seen.frame(number), number % SIDES), estimators) or {}
         for key, estimate in made.items():
@@ -166,7 +166,7 @@ def test_half_a_highlight_is_enough_in_two_hundred(see, placed):
 @pytest.mark.render
 def test_what_the_view_mask_cuts_is_fitted_too(see):
     seen = see(surface=surface("plane"), sensor={"noise_sigma": 0.02})
-    truth, camera = seen.truths[0].highlight, seen.calibration.camera
+    truth, camera = seen.highlights[0], seen.calibration.camera
     column = truth.bp_px[0]
     masked = replace(camera, view_mask=ViewMask(column - 150.0, camera.cy, 150.0))
     made = found(seen.frame(0), Calibration(masked))
@@ -183,7 +183,7 @@ def test_what_the_view_mask_cuts_is_fitted_too(see):
 def test_streaks_are_refused_or_flagged(see, kd):
     """Seen from near its axis a tube shows a streak: no estimate off by more than 2 deg goes without a flag."""
     seen = see(surface=surface("cylinder", kd), sensor={"noise_sigma": 0.02})
-    truth, kept = seen.truths[0].highlight, 0
+    truth, kept = seen.highlights[0], 0
     assert not reconstruct(seen.frame(0), seen.calibration, ALL)
     for number in range(1):
         made = found(seen.frame(number), seen.calibration, ALL)
@@ -221,7 +221,7 @@ def test_a_diffuse_base_with_texture_does_little(see):
     """Texture of 20 % under a lobe on a base of 30 %: the axis stays within 0.2 deg, and photometric says misfit."""
     seen = see(surface=surface("cylinder", 1.0), reflectance={"type": "phong", "exponent": 50.0, "diffuse": 0.3},
                sensor={"noise_sigma": 0.01})  # fmt: skip
-    truth, radiance = seen.truths[0].highlight, seen.radiance
+    truth, radiance = seen.highlights[0], seen.radiance
     y, x = np.mgrid[: radiance.specular.shape[0], : radiance.specular.shape[1]]
     base = radiance.diffuse * (1 + 0.2 * np.sin(x / 5.0) * np.cos(y / 7.0))
     light = radiance.specular + base
@@ -241,7 +241,7 @@ def test_a_light_beside_the_camera_is_told_by_the_rig_alone(see):
     """On a plane a light 1 mm aside leaves a lobe that fits as well as one at the camera, 2.8 deg off."""
     seen = see(surface=surface("plane", tilt_deg=10.0), sensor={"noise_sigma": 0.02},
                rig={"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]})  # fmt: skip
-    truth, frame = seen.truths[0].highlight, seen.frame(0)
+    truth, frame = seen.highlights[0], seen.frame(0)
     blind = found(frame, replace(seen.calibration, priors=Priors()), HALVES)
     near = found(frame, seen.calibration, HALVES)
     lights = seen.calibration.priors.lights_mm
@@ -274,13 +274,13 @@ def test_regions_cover_the_truth_on_a_generated_colon():
     for viewpoint in range(5000, 5060):
         scene = load_scene("anatomy", {"surface.path": "colon", "surface.viewpoint": viewpoint})
         session = session or Session(scene)
-        seen = view(session, scene)
-        truths = [truth for truth in seen.truths if truth.isolated]
+        seen = render_view(session, scene)
+        truths = [truth for truth in seen.highlights if truth.isolated]
         spots = reconstruct(seen.frame(viewpoint), seen.calibration, HALVES)
         for i, j in match(spots, truths).items():
             for key, estimate in spots[i].estimates.items():
                 if not isinstance(estimate, Failure):
-                    held[key].append(mahalanobis2(estimate, truths[j].highlight.normal) < 5.99)
+                    held[key].append(mahalanobis2(estimate, truths[j].normal) < 5.99)
     for key, values in held.items():
         assert len(values) > 35
         assert np.mean(values) >= binom.ppf(0.001, len(values), 0.93) / len(values), key

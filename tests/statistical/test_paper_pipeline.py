@@ -8,8 +8,8 @@ from skimage.measure import find_contours
 
 from simtest.errors import Failure
 from simtest.spec.paper import PaperSetting
-from simtest.validation.paper.pipeline import Pipeline, kernel_radius
-from simtest.validation.paper.protocol import draw_light, region_of_interest
+from simtest.validation.paper.published_pipeline import Pipeline, kernel_radius
+from simtest.validation.paper.slanted_view import draw_light, region_of_interest
 
 
 def generator(number):

@@ -14,12 +14,12 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.bound import cramer_rao_bound
-from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.published_pipeline import Pipeline
 
 ALPHA = 1e-3
 
@@ -79,7 +79,7 @@ SURFACES = {
 
 def frames(surface, count, **sensor):
     scene = scene_from_dict({"surface": SURFACES[surface], "sensor": {"noise_sigma": 0.05, **sensor}})
-    seen = view(Session(scene), scene)
+    seen = render_view(Session(scene), scene)
     return seen, [seen.frame(seed) for seed in range(count)]
 
 
@@ -87,7 +87,7 @@ def frames(surface, count, **sensor):
 @pytest.mark.parametrize("surface", SURFACES)
 def test_curved_surfaces_with_the_light_at_the_camera(surface):
     seen, noisy = frames(surface, 12)
-    truth, errors, ratios = seen.truths[0].highlight, [], []
+    truth, errors, ratios = seen.highlights[0], [], []
     for frame in noisy:
         (found,) = reconstruct(frame, seen.calibration, {"photometric": photometric})
         estimate = found.estimates["photometric"]
@@ -102,7 +102,7 @@ def test_curved_surfaces_with_the_light_at_the_camera(surface):
 def test_clipped_pixels_count_as_at_least_as_bright():
     """With the peak clipped the fit stays; taken at their value, the clipped pixels bend the fitted shape."""
     seen, noisy = frames("cylinder", 4, saturation=True, exposure={"gain": 2.0})
-    truth = seen.truths[0].highlight
+    truth = seen.highlights[0]
     for frame in noisy:
         (found,) = reconstruct(frame, seen.calibration, {"photometric": photometric})
         estimate = found.estimates["photometric"]

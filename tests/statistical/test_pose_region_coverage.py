@@ -8,7 +8,7 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
-from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.published_pipeline import Pipeline
 
 ALPHA = 0.01
 """Level of each family of tests, shared evenly by its members."""

@@ -6,7 +6,7 @@ import polars as pl
 
 from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
 

@@ -15,8 +15,7 @@ from simtest.spec import load_camera, load_experiment, load_scene, parse_setting
 from simtest.spec.surface import AnatomySurface
 from simtest.surfaces import make_surface
 from simtest.surfaces.recipe import load_recipe
-from simtest.validation import execution as work
-from simtest.validation import runner
+from simtest.validation import realisation, runner
 from simtest.validation.cases import expand
 
 
@@ -271,7 +270,7 @@ def no_rendering(monkeypatch):
     def touched(*_):
         pytest.fail("the renderer was used")
 
-    monkeypatch.setattr(work, "Session", touched)
+    monkeypatch.setattr(realisation, "Session", touched)
     monkeypatch.setattr(runner.backend, "load", touched)
 
 

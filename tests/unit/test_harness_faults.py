@@ -6,20 +6,19 @@ import shlex
 import numpy as np
 import polars as pl
 import pytest
+from simtest.estimators.execution_guard import run
 
 import simtest
 from simtest.api import reconstruct_picture
 from simtest.calibration import NoiseModel
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
-from simtest.estimators.execution_guard import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
-from simtest.rendering import Session
-from simtest.rendering.frames import TrueHighlight
+from simtest.rendering import HighlightPoint, Session
 from simtest.report import write_report
-from simtest.simulation.labelled_frame import write_frame
-from simtest.simulation.rendered_view import view
+from simtest.simulation.frame_files import write_frame
+from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import judge
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
 from simtest.validation.cases import expand
@@ -105,7 +104,8 @@ def test_realisations_reach_every_group():
 
 def spot(x, lit):
     place = np.array([0, 0, 10.0])
-    return TrueHighlight(0, np.array([x, 30.0]), place, np.array([0, 0, -1.0]), 10.0, 0.2, 0.5, lit, 1.0)
+    normal, along = np.array([0, 0, -1.0]), np.array([1.0, 0, 0])
+    return HighlightPoint(0, np.array([x, 30.0]), place, normal, along, 10.0, 0.2, 0.5, lit, 1.0)
 
 
 def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
@@ -113,6 +113,13 @@ def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     radiance = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 50).astype(np.float32)
     judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, NoiseModel(), 1.0)
     assert [j.why_not for j in judged] == ["in shadow", ""]
+
+
+def test_the_former_way_to_a_true_highlight_still_works_and_warns():
+    radiance = np.ones((60, 80), dtype=np.float32)
+    (truth,) = judge([spot(40.0, lit=True)], radiance, NoiseModel(), 1.0)
+    with pytest.warns(DeprecationWarning, match="use the highlight itself"):
+        assert truth.highlight.normal is truth.normal
 
 
 def test_mahalanobis_distance_is_that_of_the_tangent_plane():
@@ -146,8 +153,9 @@ def test_the_command_of_a_frame_makes_the_same_frame():
     case = expand(experiment)[1]
     scene, drawn = case.scene(experiment, 1)
     session = Session(scene)
-    made = realise(session, experiment, case, 1, view(session, scene), drawn, {})
-    name, *words = shlex.split(case.again(experiment, 1).removeprefix("simtest render "))
+    made = realise(session, experiment, case, 1, render_view(session, scene), drawn, {})
+    reproduce = case.reproduce_command(experiment, 1)
+    name, *words = shlex.split(reproduce.removeprefix("simtest render ").removesuffix(" --out frame"))
     alone = simtest.render(name, parse_settings([word for word in words if word != "--set"]))
     np.testing.assert_array_equal(alone.image, made.frame)
 
@@ -174,7 +182,9 @@ def test_colour_frames_are_judged_by_the_noise_of_their_mean():
             "camera": {"width": 80, "height": 80, "fx": 120, "fy": 120},
         }
     )
-    mono, colour = (view(Session(scene, variant), scene).truths[0] for variant in ("llvm_ad_mono", "llvm_ad_rgb"))
+    mono, colour = (
+        render_view(Session(scene, variant), scene).highlights[0] for variant in ("llvm_ad_mono", "llvm_ad_rgb")
+    )
     assert colour.peak_snr == pytest.approx(np.sqrt(3) * mono.peak_snr, rel=1e-3)
 
 
@@ -188,8 +198,8 @@ def test_false_detections_that_failed_are_counted():
         },
         schema_overrides={"true_id": pl.Int64, "error_deg": pl.Float64, "mahalanobis2": pl.Float64},
     )  # fmt: skip
-    assert figures(rows)["n_false"] == 2
-    assert figures(rows)["n"] == 0
+    assert figures(rows).n_false == 2
+    assert figures(rows).n == 0
 
 
 @pytest.mark.render

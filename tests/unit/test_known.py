@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simtest.estimators.execution_guard import run
 
 from simtest.calibration import Calibration, Priors
 from simtest.errors import Failure, InputError, Reason
@@ -13,7 +14,6 @@ from simtest.estimators.bisector import bisect, bisector
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
-from simtest.estimators.execution_guard import run
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth

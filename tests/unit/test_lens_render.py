@@ -16,7 +16,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.camera_chain import expose
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
 
 # A 140 degree fisheye: 70 deg from the axis lie 320 px away.
@@ -200,8 +200,8 @@ def test_normals_through_a_fisheye_equal_those_through_a_pinhole(session, kind, 
         scene = scene_from_dict(
             {"surface": tilted(kind, angle, pointed), "camera": camera, "reflectance": {"type": "phong"}}
         )
-        seen = view(session, scene)
-        (truth,) = [t.highlight for t in seen.truths if t.isolated]
+        seen = render_view(session, scene)
+        (truth,) = [t for t in seen.highlights if t.isolated]
         # The true BP: the surface's point on its pixel's ray, where the normal is the reversed sightline.
         np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
         assert angle_deg(truth.normal, -session.camera.unproject(truth.bp_px)) < 1e-6
@@ -220,8 +220,8 @@ def test_normals_through_a_fisheye_equal_those_through_a_pinhole(session, kind, 
 @pytest.mark.render
 def test_normals_through_a_barrel_lens_and_without_its_model(session):
     scene = scene_from_dict({"surface": tilted("plane", 20.0, False), "camera": BARREL})
-    seen = view(session, scene)
-    (truth,) = [t.highlight for t in seen.truths if t.isolated]
+    seen = render_view(session, scene)
+    (truth,) = [t for t in seen.highlights if t.isolated]
     np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
     frame = expose(seen.radiance.total, seen.full_scale, 0.0, from_integer(0))
     (found,) = reconstruct(frame, session.camera, ["cone_axis"])

@@ -1,5 +1,7 @@
 """The published protocol through the harness: contract, workers, bad input."""
 
+import json
+
 import polars as pl
 import pytest
 
@@ -9,7 +11,7 @@ from simtest.runtime.engines import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.paper import PaperSetting
 from simtest.validation.cases import expand
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import run_experiment
 
 SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3, "paper.smoothing_px": 2.0}
@@ -19,7 +21,7 @@ def test_an_estimator_with_a_covariance_has_its_coverage_in_the_results(tmp_path
     groups = [{"scene": "published", "set": SMALL}]
     estimators = ("circle_pose", "photometric")
     run = run_experiment(Experiment(name="pair", realisations=40, groups=groups, estimators=estimators), tmp_path)
-    (figures,) = run.summary["experiments"]["pair"]["settings"].values()
+    (figures,) = json.loads((run.folder / "summary.json").read_text())["experiments"]["pair"]["settings"].values()
     assert figures["circle_pose"]["coverage95"] is None
     assert 0.8 <= figures["photometric"]["coverage95"] <= 1.0
     rows = run.results.filter(pl.col("estimator") == "photometric")
@@ -49,7 +51,9 @@ def test_results_fit_the_contract(run):
     assert (first["paper.size"], first["paper.theta_deg"], first["paper.recentre"]) == (128.0, 58.0, True)
     law = run.results.group_by("setting", "estimator", maintain_order=True).agg(pl.col("error_law_deg").first())
     assert [value is not None for value in law["error_law_deg"]] == [True, False, True, False, False, False]
-    figures = run.summary["experiments"]["small"]["settings"]["noise, sigma=0.05"]
+    figures = json.loads((run.folder / "summary.json").read_text())["experiments"]["small"]["settings"][
+        "noise, sigma=0.05"
+    ]
     assert set(figures) == {"circle_pose", "cone_axis"}
     assert figures["circle_pose"]["n"] == 130
     assert figures["circle_pose"]["mean_oracle_deg"] < 3
@@ -120,6 +124,6 @@ def test_a_bad_number_of_workers_is_refused(workers, tmp_path):
 def test_a_setting_where_nothing_can_be_fitted_is_reported(tmp_path):
     groups = [{"scene": "published", "set": {**SMALL, "paper.theta_deg": 89.0}}]
     run = run_experiment(Experiment(name="steep", realisations=3, groups=groups), tmp_path)
-    (figures,) = run.summary["experiments"]["steep"]["settings"].values()
+    (figures,) = json.loads((run.folder / "summary.json").read_text())["experiments"]["steep"]["settings"].values()
     assert figures["circle_pose"]["n_ok"] == 0
     assert sum(figures["circle_pose"]["n_failed_by_reason"].values()) == 3

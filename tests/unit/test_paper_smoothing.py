@@ -7,7 +7,7 @@ from simtest.errors import Failure
 from simtest.geometry.vectors import angle_deg
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper import smoothing
-from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
 
 TOLERANCE = 0.2

@@ -266,11 +266,11 @@ def test_an_experiment_draws_the_position_errors_anew_for_each_realisation():
     rigs = [case.scene(experiment, number)[0].rig for number in (0, 1, 0)]
     assert rigs[0] == rigs[2] != rigs[1]
     assert rigs[0].seed == integer(3, "rigs", case.name, 0, Stage.RIG)
-    assert f"rig.seed={rigs[1].seed}" in case.again(experiment, 1)
+    assert f"rig.seed={rigs[1].seed}" in case.reproduce_command(experiment, 1)
     fixed = Experiment.model_validate({"name": "rigs", "groups": [{"scene": "plane"}], "seed": 3})
     (case,) = expand(fixed)
     assert case.scene(fixed, 0)[0] == case.scene(fixed, 1)[0]
-    assert "rig.seed" not in case.again(fixed, 1)
+    assert "rig.seed" not in case.reproduce_command(fixed, 1)
 
 
 # Presets -------------------------------------------------------------------------------------------------------------

@@ -15,6 +15,10 @@ from simtest.spec import load_scene
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
 
 
+def viewpoints_of(sampled):
+    return [view.viewpoint for view in sampled.views]
+
+
 def test_candidates_are_numbers_or_cover_the_path_evenly():
     assert candidates(load_scene("anatomy"), 3) == [0, 1, 2]
     places = sorted(candidates(load_scene("anatomy", {"surface.view": "wall"}), 40))
@@ -25,22 +29,22 @@ def test_candidates_are_numbers_or_cover_the_path_evenly():
 @pytest.mark.render
 def test_every_place_is_either_kept_or_counted():
     scene, told = load_scene("anatomy", SMALL), []
-    sampled = sample_views(scene, 3, range(12), tell=lambda *said: told.append(said))
+    sampled = sample_views(scene, 3, range(12), progress=lambda *said: told.append(said))
     assert sampled.tried == len(told)
-    assert len(sampled.places) == 3
-    assert min(sampled.highlights) >= 1
-    assert sampled.tried == sampled.places[-1] + 1
+    assert len(sampled.views) == 3
+    assert min(view.isolated_highlights for view in sampled.views) >= 1
+    assert sampled.tried == sampled.views[-1].viewpoint + 1
     few = sample_views(scene, 50, range(12))
     assert few.tried == 12
-    assert few.places[:3] == sampled.places
-    assert sum(few.rejected.values()) == 12 - len(few.places)
+    assert viewpoints_of(few)[:3] == viewpoints_of(sampled)
+    assert sum(few.rejected.values()) == 12 - len(few.views)
 
 
 @pytest.mark.render
 def test_a_view_into_the_noise_is_rejected_for_it(tmp_path):
     settings = {**SMALL, "sensor.noise_sigma": 0.3}
     sampled = api.sample_views("anatomy", tmp_path, 1, settings)
-    assert sampled.places == []
+    assert sampled.views == []
     assert set(sampled.rejected) - {NO_HIGHLIGHT}
     written = json.loads((tmp_path / "views.json").read_text())
     assert written == {"tried": 10, "accepted": [], "rejected": sampled.rejected}
@@ -59,7 +63,7 @@ def test_a_sequence_leaves_no_place_out_and_is_a_film(tmp_path):
     (tmp_path / "view_0007.png").write_text("of an earlier call")
     settings = {**SMALL, "surface.view": "path", "sensor.exposure.percentile": 99.5}
     sampled = api.sample_views("anatomy", tmp_path, 4, settings, along=(0.4, 0.43))
-    assert sampled.places == pytest.approx([0.4, 0.41, 0.42, 0.43])
+    assert viewpoints_of(sampled) == pytest.approx([0.4, 0.41, 0.42, 0.43])
     assert not sampled.rejected
     written = json.loads((tmp_path / "views.json").read_text())["accepted"]
     poses = np.array([view["model_from_camera"] for view in written])

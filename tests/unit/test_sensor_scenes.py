@@ -13,8 +13,8 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.simulation.labelled_frame import write_frame
-from simtest.simulation.rendered_view import view
+from simtest.simulation.frame_files import write_frame
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
 from simtest.validation.predicted import unknown_falloff
@@ -40,8 +40,8 @@ def session():
 
 def errors(session, described, seeds=(0,)):
     """Give each estimator's errors, deg, against the normal at the true BP."""
-    seen = view(session, described)
-    normal = seen.truths[0].highlight.normal
+    seen = render_view(session, described)
+    normal = seen.highlights[0].normal
     made = {name: [] for name in ESTIMATORS}
     for seed in seeds:
         (found,) = reconstruct(seen.frame(seed), seen.calibration)
@@ -107,8 +107,8 @@ def test_the_law_holds_on_spheres(session, side, radius):
     sensor = {"vignetting": {"type": "cosine", "power": 8.0}, "vignetting_known": False}
     ball = {"type": "sphere", "side": side, "radius_mm": radius}
     described = scene(sensor, tilt=20.0, size=400, focal=300.0, surface=ball)
-    seen = view(session, described)
-    truth = seen.truths[0].highlight
+    seen = render_view(session, described)
+    truth = seen.highlights[0]
     (found,) = reconstruct(seen.frame(0), seen.calibration)
     estimate = found.estimates["cone_axis"]
     phi = np.arccos(truth.position[2] / np.linalg.norm(truth.position))
@@ -183,9 +183,9 @@ def test_the_law_is_silent_on_emission_of_another_form(light, power):
 
 def test_full_scale_is_fixed_or_a_percentile_or_the_highlights(session):
     def full_scale(exposure):
-        return view(session, scene({"exposure": exposure})).full_scale
+        return render_view(session, scene({"exposure": exposure})).full_scale
 
-    light = view(session, scene()).light
+    light = render_view(session, scene()).light
     assert full_scale({"full_scale": 0.02}) == 0.02
     assert full_scale({"full_scale": 0.02, "gain": 4.0}) == 0.005
     assert full_scale({"percentile": 90.0}) == pytest.approx(float(np.percentile(light, 90)))
@@ -199,7 +199,7 @@ def test_a_percentile_without_light_falls_back_on_the_maximum(session):
     sharp = {"type": "phong", "exponent": 20000.0}
     described = scene({"exposure": {"percentile": 1.0}}, reflectance=sharp, tilt=20.0)
     with pytest.warns(UserWarning, match="percentile = 1") as caught:
-        seen = view(session, described)
+        seen = render_view(session, described)
     assert len(caught) == 1
     assert seen.full_scale == pytest.approx(float(seen.light.max()))
 
@@ -209,7 +209,7 @@ def test_a_percentile_of_all_but_darkness_falls_back_too(session):
     sharp = {"type": "phong", "exponent": 100.0}
     described = scene({"exposure": {"percentile": 50.0}}, reflectance=sharp, tilt=20.0)
     with pytest.warns(UserWarning, match="percentile = 50: .* 1e-12 of its maximum or less"):
-        seen = view(session, described)
+        seen = render_view(session, described)
     assert 0 < np.percentile(seen.light, 50.0) < 1e-12 * seen.light.max()
     assert seen.full_scale == pytest.approx(float(seen.light.max()))
 
@@ -228,7 +228,7 @@ def test_a_frames_description_holds_the_places_that_its_keys_do_not_show(tmp_pat
 def test_clipped_highlights_are_answered_and_flagged(session, gain):
     sensor = {"saturation": True, "exposure": {"gain": gain}, "noise_sigma": 0.02}
     described = scene(sensor, size=406, focal=406.0)
-    seen = view(session, described)
+    seen = render_view(session, described)
     assert seen.frame(0).max() == 1.0
     (found,) = reconstruct(seen.frame(0), seen.calibration)
     assert found.patch.saturated_share(0.5) == pytest.approx(math.log(gain) / math.log(2 * gain), abs=0.02)
@@ -239,11 +239,11 @@ def test_clipped_highlights_are_answered_and_flagged(session, gain):
 
 
 def test_peak_snr_is_that_of_the_peaks_level(session):
-    read = view(session, scene({"full_well": 400.0, "read_noise": 10.0})).truths[0].peak_snr
-    white = view(session, scene({"noise_sigma": 0.05})).truths[0].peak_snr
+    read = render_view(session, scene({"full_well": 400.0, "read_noise": 10.0})).highlights[0].peak_snr
+    white = render_view(session, scene({"noise_sigma": 0.05})).highlights[0].peak_snr
     # sqrt(400 + 100) electrons of 400; the smoothed peak is a little below full scale.
     assert read / white == pytest.approx(0.05 / (math.sqrt(500) / 400), rel=0.02)
-    assert view(session, scene()).truths[0].peak_snr == np.inf
+    assert render_view(session, scene()).highlights[0].peak_snr == np.inf
 
 
 # Darkness ------------------------------------------------------------------------------------------------------------
@@ -266,13 +266,13 @@ NO_LIGHT = {"vignetting": {"type": "table", "angle_deg": [0.0, 1e-6], "value": [
 )
 def test_a_dark_frame_is_zero_with_one_warning(session, sensor):
     with pytest.warns(UserWarning, match="no light reaches the sensor") as caught:
-        seen = view(session, scene({**NO_LIGHT, **sensor}))
+        seen = render_view(session, scene({**NO_LIGHT, **sensor}))
     assert len(caught) == 1
     assert seen.full_scale == 0
     np.testing.assert_array_equal(seen.light, 0)
     frame = seen.frame(0)
     np.testing.assert_array_equal(frame, 0)
-    assert not any(truth.isolated for truth in seen.truths)
+    assert not any(truth.isolated for truth in seen.highlights)
     assert reconstruct(frame, seen.calibration) == []
     (found,) = reconstruct(frame, seen.calibration, roi=(100, 100, 80, 80))
     for result in found.estimates.values():
@@ -292,7 +292,8 @@ def test_rows_of_a_dark_frame_are_failures(tmp_path, isolated, sigma):
         run = run_experiment(experiment, tmp_path / "run")
     assert len(caught) == 1
     assert run.results["status"].to_list() == ["no_light"] * 9
-    (figures,) = {json.dumps(f) for f in run.summary["experiments"]["dark"]["settings"]["plane"].values()}
+    summary = json.loads((run.folder / "summary.json").read_text())
+    (figures,) = {json.dumps(f) for f in summary["experiments"]["dark"]["settings"]["plane"].values()}
     assert json.loads(figures)["n_failed_by_reason"] == {"no_light": 3}
 
 
@@ -345,7 +346,7 @@ def test_pictures_read_back_as_the_frame(tmp_path, sensor):
         # At its branch point circle_pose's own flags hang on the last digits too.
         own = {"ambiguous", "near_degenerate"} if name == "circle_pose" else set()
         assert [f for f in made["flags"] if f not in own] == [f for f in estimate.flags if f not in own]
-    truth = frame.highlights[0].highlight.normal
+    truth = frame.highlights[0].normal
     assert angle_deg(np.array(read["estimates"]["cone_axis"]["normal"]), truth) < LIMIT_DEG
 
 
@@ -361,7 +362,7 @@ def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
     sensor = {"vignetting": COS4, "response": {"type": "gamma"}, "bits": 12, "exposure": {"gain": 0.8}}
     frame = render(scene_from_dict({"surface": surface, "camera": LENS, "sensor": sensor}))
     write_frame(frame, tmp_path)
-    truth = frame.highlights[0].highlight.normal
+    truth = frame.highlights[0].normal
     stated = (tmp_path / "calibration.toml").read_text()
     assert load_calibration(tmp_path / "calibration.toml").camera == frame.camera
 
@@ -386,7 +387,7 @@ def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
 def test_the_automatic_exposure_goes_by_what_is_in_view(session):
     described = {"surface": {"type": "plane"}, "camera": LENS | {"view_mask": {"radius": 60.0}}}
     sensor = {"exposure": {"percentile": 50.0}, "vignetting": COS4}
-    seen = view(
+    seen = render_view(
         session, scene_from_dict({**described, "reflectance": {"type": "phong", "diffuse": 0.3}, "sensor": sensor})
     )
     inside = session.camera.seen
@@ -406,7 +407,7 @@ def test_known_emission_reads_back(tmp_path):
         _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / told)
         (read,) = json.loads(file.read_text())["specularities"]
         normal = np.array(read["estimates"]["cone_axis"]["normal"])
-        errors[told] = angle_deg(normal, frame.highlights[0].highlight.normal)
+        errors[told] = angle_deg(normal, frame.highlights[0].normal)
     assert errors["calibration.toml"] < LIMIT_DEG < 0.3 < errors["camera.toml"]
 
 

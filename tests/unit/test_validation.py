@@ -1,5 +1,6 @@
 """Matching, rows, summary figures, seeds, cases, and that a row can be made again alone."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,15 +15,15 @@ from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.rendering.frames import TrueHighlight
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
-from simtest.simulation.rendered_view import view
-from simtest.simulation.true_highlights import JudgedHighlight
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
-from simtest.validation.metrics import SCHEMA, RowContext, rows, table
+from simtest.validation.metrics import rows
 from simtest.validation.realisation import realise
+from simtest.validation.results_table import SCHEMA, ResultRow, table
 from simtest.validation.runner import run_experiment
 from simtest.validation.statistics import figures, mean_interval, summarise
 
@@ -31,8 +32,11 @@ NORTH = np.array([0.0, 0.0, -1.0])
 
 
 def truth_at(x, y, normal=NORTH, light=0):
-    highlight = TrueHighlight(light, np.array([x, y]), np.array([0, 0, 10.0]), normal, 10.0, 0.2, 0.5, True, 1.0)
-    return JudgedHighlight(highlight, 50.0, "")
+    return TrueHighlight(
+        light=light, bp_px=np.array([x, y]), position=np.array([0, 0, 10.0]), normal=normal,
+        direction_min=np.array([1.0, 0.0, 0.0]), distance=10.0, kd_min=0.2, kd_max=0.5, lit=True, radiance=1.0,
+        peak_snr=50.0, why_not="",
+    )  # fmt: skip
 
 
 def detection(x, y, width, height, peak, estimates=None):
@@ -85,11 +89,11 @@ def estimate(normal, candidates=None, look=(80.0, 60.0)):
 
 
 def context(look_normal=NORTH):
-    """Give a row's context whose surface has one normal wherever an estimate looks."""
+    """Return a session whose surface has one normal wherever an estimate looks, and what its rows share."""
     seen = SimpleNamespace(valid=np.array([True]), normal=look_normal[None])
     described = scene_from_dict({"surface": {"type": "plane"}})
     session = SimpleNamespace(scene=described, cast=lambda points: (seen, None, None))
-    return RowContext(session, {"experiment": "e", "setting": "s", "realisation": 3, "seed": 11})
+    return session, ResultRow(experiment="e", setting="s", realisation=3, seed=11)
 
 
 def leaned(degrees, towards=0.0):
@@ -103,7 +107,7 @@ def test_rows_count_matched_false_and_missed():
         detection(100, 80, 20, 20, (110, 90), {"a": estimate(NORTH), "b": estimate(NORTH)}),
     ]
     truths = [truth_at(21, 21), truth_at(75, 100)]
-    made = rows(context(), found, truths, match(found, truths), ["a", "b"])
+    made = rows(*context(), found, truths, match(found, truths), ["a", "b"])
     frame = table(made, {})
     assert frame.columns == list(SCHEMA)
     assert len(frame) == 6
@@ -125,16 +129,23 @@ def test_rows_count_matched_false_and_missed():
     assert frame.filter(pl.col("true_id").is_not_null())["kd_max"].unique().to_list() == [0.5]
 
 
+def test_a_row_has_the_columns_of_the_table_and_swept_parameters_by_their_own_names():
+    row = ResultRow(estimator="a", surface="plane", swept={"surface.radius_mm": 5.0, "surface": "sphere"}).to_row()
+    assert set(row) == {*SCHEMA, "surface.radius_mm"}
+    # The scene's own column wins over a swept one of its name.
+    assert (row["surface"], row["surface.radius_mm"], row["label"]) == ("plane", 5.0, None)
+
+
 def test_errors_of_a_row():
     """The proposed candidate, the better one, and the surface where the estimate looks."""
     result = estimate(leaned(5), [leaned(5), leaned(1, 180)])
     found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
-    (row,) = rows(context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, ["a"])
-    assert row["error_deg"] == pytest.approx(5)
-    assert row["error_oracle_deg"] == pytest.approx(1)
-    assert row["error_look_deg"] == pytest.approx(2)
-    assert row["rank_correct"] == 1
-    assert row["n_candidates"] == 2
+    (row,) = rows(*context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, ["a"])
+    assert row.error_deg == pytest.approx(5)
+    assert row.error_oracle_deg == pytest.approx(1)
+    assert row.error_look_deg == pytest.approx(2)
+    assert row.rank_correct == 1
+    assert row.n_candidates == 2
 
 
 def test_angles_are_exact_near_zero_and_near_180_deg():
@@ -161,42 +172,42 @@ def hand_made():
         ("s0", "a", 0, "missed", None, None, None),
     ]
     names = ("setting", "estimator", "true_id", "status", "error_deg", "error_oracle_deg", "mahalanobis2")
-    return table([dict(zip(names, line, strict=True)) for line in lines], {})
+    return table([ResultRow(**dict(zip(names, line, strict=True))) for line in lines], {})
 
 
 def test_summary_of_a_hand_made_table():
     summary = summarise(hand_made())
     assert list(summary) == ["s1", "s0"]
     a = summary["s1"]["a"]
-    assert (a["n"], a["n_ok"], a["n_missed"], a["n_false"]) == (4, 2, 1, 2)
-    assert a["n_failed_by_reason"] == {"not_an_ellipse": 1}
-    assert a["mean_deg"] == pytest.approx(2.0)
-    assert a["mean_oracle_deg"] == pytest.approx(1.75)
-    assert a["rms_deg"] == pytest.approx(np.sqrt(5))
-    assert a["std_deg"] == pytest.approx(np.sqrt(2))
-    assert a["median_deg"] == pytest.approx(2.0)
-    assert a["p95_deg"] == pytest.approx(2.9)
-    assert a["max_deg"] == pytest.approx(3.0)
+    assert (a.n, a.n_ok, a.n_missed, a.n_false) == (4, 2, 1, 2)
+    assert a.n_failed_by_reason == {"not_an_ellipse": 1}
+    assert a.mean_deg == pytest.approx(2.0)
+    assert a.mean_oracle_deg == pytest.approx(1.75)
+    assert a.rms_deg == pytest.approx(np.sqrt(5))
+    assert a.std_deg == pytest.approx(np.sqrt(2))
+    assert a.median_deg == pytest.approx(2.0)
+    assert a.p95_deg == pytest.approx(2.9)
+    assert a.max_deg == pytest.approx(3.0)
     # (1 + 3 + 90 + 90) / 4: the failed and the missed count 90 deg each, the false none.
-    assert a["mean_penalised_deg"] == pytest.approx(46.0)
+    assert a.mean_penalised_deg == pytest.approx(46.0)
     # Student's t with 1 degree of freedom: 12.706 standard errors of 1.
     # Its lower end would be negative, which no angle is.
-    assert a["ci95_deg"] == pytest.approx([0.0, 2 + 12.7062], abs=1e-4)
-    assert a["coverage95"] == pytest.approx(0.5)  # chi-square of 2 at 95 %: 5.99
+    assert a.ci95_deg == pytest.approx((0.0, 2 + 12.7062), abs=1e-4)
+    assert a.coverage95 == pytest.approx(0.5)  # chi-square of 2 at 95 %: 5.99
     b = summary["s1"]["b"]
-    assert (b["n"], b["n_ok"], b["n_missed"], b["n_false"]) == (3, 3, 0, 0)
-    assert b["mean_penalised_deg"] == b["mean_deg"] == pytest.approx(3.0)
-    assert b["ci95_deg"] == pytest.approx([0.0, 3 + 4.302653], abs=1e-5)
-    assert b["coverage95"] is None
+    assert (b.n, b.n_ok, b.n_missed, b.n_false) == (3, 3, 0, 0)
+    assert b.mean_penalised_deg == b.mean_deg == pytest.approx(3.0)
+    assert b.ci95_deg == pytest.approx((0.0, 3 + 4.302653), abs=1e-5)
+    assert b.coverage95 is None
 
 
 def test_summary_where_nothing_answered():
     figure = summarise(hand_made())["s0"]["a"]
-    assert figure["n"] == figure["n_missed"] == 1
-    assert figure["mean_deg"] is None
-    assert figure["ci95_deg"] == [None, None]
-    assert figure["mean_penalised_deg"] == 90
-    assert figures(hand_made().clear())["mean_penalised_deg"] is None
+    assert figure.n == figure.n_missed == 1
+    assert figure.mean_deg is None
+    assert figure.ci95_deg == (None, None)
+    assert figure.mean_penalised_deg == 90
+    assert figures(hand_made().clear()).mean_penalised_deg is None
 
 
 def test_the_interval_covers_the_mean_in_95_of_100_samples():
@@ -358,7 +369,8 @@ def test_a_run_has_a_row_for_each_estimator_and_realisation(whole):
     results = whole.results
     assert len(results) == 3 * 4 * 3
     assert results["status"].unique().to_list() == ["ok"]
-    for setting, estimators in whole.summary["experiments"]["test"]["settings"].items():
+    summary = json.loads((whole.folder / "summary.json").read_text())
+    for setting, estimators in summary["experiments"]["test"]["settings"].items():
         part = results.filter(pl.col("setting") == setting)
         for name, figure in estimators.items():
             assert figure["n"] == figure["n_ok"] == 4
@@ -376,12 +388,12 @@ def test_a_realisation_alone_gives_the_rows_of_the_whole_run(whole, index):
     scene, drawn = case.scene(described, 3)
     session = Session(scene)
     estimators = load_estimators(described.estimators)
-    made = realise(session, described, case, 3, view(session, scene), drawn, estimators)
+    made = realise(session, described, case, 3, render_view(session, scene), drawn, estimators)
     alone = table(made.rows, swept_example(expand(described)))
     in_run = whole.results.filter((pl.col("setting") == case.setting) & (pl.col("realisation") == 3))
     assert len(alone) == 3
     assert sorted_rows(alone).equals(sorted_rows(in_run))
-    other = realise(session, described, case, 2, view(session, scene), drawn, estimators)
+    other = realise(session, described, case, 2, render_view(session, scene), drawn, estimators)
     assert other.frame.tobytes() != made.frame.tobytes()
 
 
@@ -400,7 +412,7 @@ def test_what_drowns_in_noise_is_missed():
     (case,) = expand(described)
     scene, drawn = case.scene(described, 0)
     session = Session(scene)
-    made = realise(session, described, case, 0, view(session, scene), drawn, load_estimators(["cone_axis"]))
-    statuses = [row.get("status") for row in made.rows if row.get("true_id") is not None]
+    made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
+    statuses = [row.status for row in made.rows if row.true_id is not None]
     assert statuses == ["missed"]
     assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)

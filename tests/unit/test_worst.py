@@ -9,7 +9,7 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.spec import load_experiment
-from simtest.validation.metrics import SCHEMA
+from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import run_experiment
 from simtest.validation.worst import WorstCase, save_worst, worst_cases
 

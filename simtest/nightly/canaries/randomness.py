@@ -9,12 +9,13 @@ import polars as pl
 from simtest.nightly.canaries.record import Canary
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.paper import PaperSetting
 from simtest.validation.cases import Case, expand
-from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.rows import paper_rows
+from simtest.validation.results_table import ResultRow
 
 SLANT_OFF_DEG = 0.05
 """What interpolation may leave of the error of circle_pose without noise and smoothing; 0.0085 deg."""
@@ -44,7 +45,7 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Canary]:
     case, published = expand(experiment)
     # A scene of its own, so that no other canary's session is moved.
     scene = scene_from_dict(case.data, "canary")
-    seen = view(Session(scene, variant), scene)
+    seen = render_view(Session(scene, variant), scene)
     frames = [seen.frame(case.noise_seed(experiment, number)) for number in case.numbers()]
     pipeline = Pipeline(PaperSetting(size=64, sigma=SIGMA), {})
     generators = [from_integer(published.noise_seed(experiment, number)) for number in published.numbers()]
@@ -63,7 +64,7 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Canary]:
 def published() -> list[Canary]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)
-    rows = paper_rows(setting, {}, range(1), [0], ("circle_pose",))
+    rows = paper_rows(setting, ResultRow(), range(1), [0], ("circle_pose",))
     off = rows["error_deg"].fill_null(np.nan).item()
     about = "circle_pose at a slant of 58 deg, without noise; unsmoothed; interpolation leaves 0.01 deg"
     return [Canary("published", "circle_pose_off", "deg", off, SLANT_OFF_DEG, about=about)]

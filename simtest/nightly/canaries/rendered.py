@@ -10,7 +10,7 @@ from simtest.estimators import Estimate, load_estimators
 from simtest.nightly.canaries import by_hand
 from simtest.nightly.canaries.record import Canary
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, Scene, scene_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realisation, realise
@@ -92,8 +92,8 @@ def plane_errors(session: Session) -> list[Canary]:
     place = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
     half = float(by_hand.angle_deg(-place, np.array(LIGHT_MM) - place)) / 2
     # As the rows of results state it, the metric included.
-    stated = [row["error_deg"] for row in aside.rows if row["estimator"] == "cone_axis" and row["status"] == "ok"]
-    ratio = stated[0] / half if len(stated) == 1 else np.nan
+    stated = [row.error_deg for row in aside.rows if row.estimator == "cone_axis" and row.status == "ok"]
+    ratio = stated[0] / half if len(stated) == 1 and stated[0] is not None else np.nan
     about = f"half the angle between light and camera, {half:.4f} deg; falloff moves the peak by 1 % of it"
     return [*canaries, Canary("light_offset", "error_over_law", "x", float(ratio), 1.03, 0.97, about=about)]
 
@@ -102,9 +102,9 @@ def curved_errors(session: Session) -> list[Canary]:
     """Reconstruct a noise-free cylinder as wide as it is far: its normal, and the axis ratio of its isophotes."""
     surface = {"type": "cylinder", "radius_mm": DISTANCE_MM, "tilt_deg": 5.0, "azimuth_deg": 20.0, "spin_deg": 75.0}
     made = _realised(session, described(surface, camera=by_hand.FINE))
-    normal = made.truths[0].highlight.normal if len(made.truths) == 1 else np.full(3, np.nan)
+    normal = made.truths[0].normal if len(made.truths) == 1 else np.full(3, np.nan)
     # The normal at a highlight of a light at the camera is the reversed sightline, whatever the surface.
-    place = made.truths[0].highlight.position if len(made.truths) == 1 else np.full(3, np.nan)
+    place = made.truths[0].position if len(made.truths) == 1 else np.full(3, np.nan)
     canaries = _errors("cylinder", made, -place / np.sqrt((place**2).sum()), ("cone_axis", "curved"))
     turned = float(by_hand.angle_deg(normal, -place))
     about = "the true normal at the highlight against the reversed sightline"
@@ -137,7 +137,7 @@ def _realised(session: Session, scene: Scene) -> Realisation:
     """Make the one realisation of a noise-free scene, as an experiment does."""
     experiment = Experiment(name="canary", realisations=1, groups=[{"scene": "plane", "isolated": False}])
     (case,) = expand(experiment)
-    return realise(session, experiment, case, 0, view(session, scene), {}, load_estimators(ESTIMATORS))
+    return realise(session, experiment, case, 0, render_view(session, scene), {}, load_estimators(ESTIMATORS))
 
 
 def _estimate(made: Realisation, name: str) -> Estimate | None:

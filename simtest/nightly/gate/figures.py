@@ -30,7 +30,7 @@ def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
     Parameters
     ----------
     rows : polars.DataFrame
-        Columns of `simtest.validation.metrics.SCHEMA`.
+        Columns of `simtest.validation.results_table.SCHEMA`.
 
     Returns
     -------
@@ -50,20 +50,20 @@ def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
 def _figures_of(rows: pl.DataFrame) -> list[dict[str, Any]]:
     """Give the figures of one place."""
     found, frames = figures(rows), rows["realisation"].n_unique()
-    n, failed = found["n"], sum(found["n_failed_by_reason"].values())
-    made = [_figure("n", "", n, n), _figure("n_ok", "", found["n_ok"], n)]
+    n, failed = found.n, sum(found.n_failed_by_reason.values())
+    made = [_figure("n", "", n, n), _figure("n_ok", "", found.n_ok, n)]
     if n:
-        unanswered = failed + found["n_missed"]
-        counts = {"failed": failed, "missed": found["n_missed"], "unanswered": unanswered}
+        unanswered = failed + found.n_missed
+        counts = {"failed": failed, "missed": found.n_missed, "unanswered": unanswered}
         made += [_share(name, count, n) for name, count in counts.items()]
-    made.append(_figure("false", "a frame", found["n_false"] / frames, frames))
-    low, high = found["ci95_deg"]
-    made.append(_figure("mean_deg", "deg", found["mean_deg"], found["n_ok"], low, high))
+    made.append(_figure("false", "a frame", found.n_false / frames, frames))
+    low, high = found.ci95_deg
+    made.append(_figure("mean_deg", "deg", found.mean_deg, found.n_ok, low, high))
     for name in ("median_deg", "p95_deg", "mean_penalised_deg"):
-        made.append(_figure(name, "deg", found[name], n if name == "mean_penalised_deg" else found["n_ok"]))
-    if found["coverage95"] is not None:
+        made.append(_figure(name, "deg", getattr(found, name), n if name == "mean_penalised_deg" else found.n_ok))
+    if found.coverage95 is not None:
         judged = _judged(rows)
-        made.append(_share("coverage95", round(found["coverage95"] * judged), judged))
+        made.append(_share("coverage95", round(found.coverage95 * judged), judged))
     off = rows.select(off=RATIO_OFF)["off"].drop_nulls().to_numpy()
     if len(off):
         low, high = student_interval(off)

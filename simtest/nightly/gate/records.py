@@ -55,7 +55,7 @@ class Night:
         `id`, `profile`, `started` (ISO, UTC), `duration_s`, `command`, and `simtest.runtime.provenance.environment()`;
         where they are known `definitions` (a hash by experiment: what was run), `variant` and `llvm`.
     rows : polars.DataFrame
-        Results of all experiments, the columns of `simtest.validation.metrics.SCHEMA`.
+        Results of all experiments, the columns of `simtest.validation.results_table.SCHEMA`.
     figures : polars.DataFrame
         Columns `FIGURES`.
     """

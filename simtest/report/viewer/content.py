@@ -11,7 +11,7 @@ from simtest.calibration import Calibration
 from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import view
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene
 from simtest.surfaces.model import Array, IntArray
 
@@ -90,11 +90,11 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
         If the rendering backend cannot be used.
     """
     session = Session(scene, variant)
-    seen = view(session, scene)
+    seen = render_view(session, scene)
     vertices, faces, curvature = _visible(session)
     camera = session.camera
     corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float)
-    found = [truth.highlight for truth in seen.truths if truth.isolated]
+    found = [truth for truth in seen.highlights if truth.isolated]
     names, looks, estimates = _estimates(session, seen.frame(scene.sensor.seed), seen.calibration)
     return Content(
         vertices=vertices,

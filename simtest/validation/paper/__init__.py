@@ -1,4 +1,6 @@
 """The published validation protocol [MB, section 3.1]: a plane's texture seen slanted by a camera that is not at V.
 
 It tests the conic pipeline, not the imaging of a camera with its own light; the rendered experiments do that.
+`slanted_view` makes the noise-free picture, `published_pipeline` adds noise, smooths and reconstructs, `rows` measures.
+`smoothing` predicts the error without noise, and `bound` the least error with it.
 """

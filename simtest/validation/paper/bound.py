@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.spec.paper import PaperSetting
-from simtest.validation.paper.protocol import region_of_interest
+from simtest.validation.paper.slanted_view import region_of_interest
 
 Array = npt.NDArray[np.float64]
 
@@ -13,17 +13,17 @@ _STEPS = np.array([1e-5, 1e-5, 1e-2, 1e-2, 1e-4, 1e-2, 1e-3])
 
 
 MOST_CONDITION = 1e13
-"""Of the scaled information matrix: beyond it the inverse is rounding."""
+"""Largest condition of the scaled information matrix: beyond it the inverse is rounding."""
 
 LARGEST_RAD = 0.5
-"""The bound is one of small angles."""
+"""The bound holds for small angles."""
 
 
 def cramer_rao_bound(setting: PaperSetting) -> float | None:
-    """Give the bound on the RMS angle between estimated and true normal (theory.md section 2).
+    """Compute the bound on the RMS angle between estimated and true normal (theory.md section 2).
 
-    The frame is c max(0, cos beta)^n on the slanted plane with white noise; unknown are two tilts, the BP (two), the
-    scale of the scene, n and c. Scale and n are nearly degenerate, which does not touch the normal. Light at V.
+    The frame is c max(0, cos beta)^n on the slanted plane with white noise. Unknown are two tilts, the BP (two), the
+    scale of the scene, n and c. Scale and n are nearly degenerate, which does not affect the normal. Light at V.
 
     Parameters
     ----------
@@ -37,6 +37,7 @@ def cramer_rao_bound(setting: PaperSetting) -> float | None:
     """
     if setting.sigma == 0:
         return 0.0
+    # Jacobian of the frame by central differences.
     nominal = np.array([0.0, 0.0, 0.0, 0.0, 0.0, setting.exponent, 1.0])
     inside = _inside_window(setting)
     columns = []
@@ -46,6 +47,7 @@ def cramer_rao_bound(setting: PaperSetting) -> float | None:
         difference = _model(setting, nominal + change) - _model(setting, nominal - change)
         columns.append((difference / (2 * step))[inside])
     J = np.stack(columns, axis=1)
+    # Fisher information.
     information = J.T @ J / setting.sigma**2
     diagonal = np.diag(information)
     if not (np.isfinite(diagonal).all() and (diagonal > 0).all()):
@@ -61,7 +63,7 @@ def cramer_rao_bound(setting: PaperSetting) -> float | None:
 
 
 def _sightlines(setting: PaperSetting) -> Array:
-    """Give the sightlines of the region of interest's pixels at unit depth, shape (h, w, 3)."""
+    """Return the sightlines of the region of interest's pixels at unit depth, shape (h, w, 3)."""
     x, y, width, height = region_of_interest(setting)
     pixels = setting.camera.pixel_centres()[y : y + height, x : x + width]
     xy = (pixels - setting.size / 2) / setting.size
@@ -69,7 +71,7 @@ def _sightlines(setting: PaperSetting) -> Array:
 
 
 def _model(setting: PaperSetting, parameters: Array) -> Array:
-    """Give the frame of a plane through V_Z times the BP's sightline; the tilts turn its normal."""
+    """Compute the frame of a plane through V_Z times the BP's sightline; the tilts turn its normal."""
     tilt_x, tilt_y, bp_x, bp_y, log_scale, exponent, peak = parameters
     first = np.array([1.0, 0.0, 0.0])
     normal = setting.normal + tilt_x * first + tilt_y * np.cross(setting.normal, first)
@@ -84,7 +86,7 @@ def _model(setting: PaperSetting, parameters: Array) -> Array:
 
 
 def _inside_window(setting: PaperSetting) -> npt.NDArray[np.bool_]:
-    """Tell which pixels see the texture's window in front of the camera, shape (h, w) as the sightlines."""
+    """Return which pixels see the texture's window in front of the camera, shape (h, w) like the sightlines."""
     rays = _sightlines(setting)
     theta, centre = np.radians(setting.theta_deg), np.array([0.0, 0.0, setting.height])
     depth = (setting.normal @ centre) / (rays @ setting.normal)

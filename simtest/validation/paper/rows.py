@@ -1,9 +1,8 @@
-"""Rows of results for realisations of the published protocol."""
+"""Rows of results for realisations of the published protocol, column by column: they are many and alike."""
 
 import itertools
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,15 +14,18 @@ from simtest.estimators.photometric import Photometric, photometric_plane
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
-from simtest.validation.metrics import SCHEMA, mahalanobis2
-from simtest.validation.paper.pipeline import Pipeline
+from simtest.validation.metrics import mahalanobis2
+from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
+from simtest.validation.results_table import SCHEMA, ResultRow, Value
 
 SURFACE = "published plane"
 
+Columns = dict[str, list[Value]]
+
 
 def paper_rows(
-    setting: PaperSetting, common: dict[str, Any], numbers: range, seeds: list[int], estimators: tuple[str, ...]
+    setting: PaperSetting, common: ResultRow, numbers: range, seeds: list[int], estimators: tuple[str, ...]
 ) -> pl.DataFrame:
     """Make the rows of some realisations of one setting; runs in any process.
 
@@ -31,39 +33,43 @@ def paper_rows(
     ----------
     setting : PaperSetting
         The setting.
-    common : dict
-        Values of the columns that all rows share.
+    common : ResultRow
+        What all rows share.
     numbers : range
         Numbers of the realisations.
     seeds : list of int
-        A seed for each of them: it gives the light, then the noise.
+        A seed for each of them, which draws the light, then the noise.
     estimators : tuple of str
         Names; circle_pose is run at the setting's isovalue.
 
     Returns
     -------
     polars.DataFrame
-        Columns of `metrics.SCHEMA` and of `common`, in the order of the realisations.
+        Columns of `SCHEMA` and of the swept parameters that are not null, in the order of the realisations.
     """
     pipeline = pipeline_with(setting, estimators)
     made = pipeline.realise(from_integer(seed) for seed in seeds)
-    shared = {**common, "surface": SURFACE, "reflectance": "phong", "noise_sigma": setting.sigma, "n_lights": 1}
-    shared |= dict(zip(("truth_x", "truth_y", "truth_z"), setting.normal.tolist(), strict=True))
-    shared |= {"specularity": 0, "true_id": 0}
+    truth_x, truth_y, truth_z = setting.normal.tolist()
+    shared = replace(
+        common, surface=SURFACE, reflectance="phong", noise_sigma=setting.sigma, n_lights=1, truth_x=truth_x,
+        truth_y=truth_y, truth_z=truth_z, specularity=0, true_id=0,
+    )  # fmt: skip
     bias = smoothing_bias(setting)
-    law_deg = {"circle_pose": None if bias is None else float(np.degrees(bias))}
     tables = []
     for name, results in made.items():
-        own = {**shared, "estimator": name, "error_law_deg": law_deg.get(name)}
+        # The law is that of circle pose.
+        law_deg = float(np.degrees(bias)) if name == "circle_pose" and bias is not None else None
+        own = replace(shared, estimator=name, error_law_deg=law_deg).to_row()
         columns = {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}
         table = pl.DataFrame(columns, schema_overrides=SCHEMA)
-        tables.append(table.with_columns(**{column: pl.lit(value) for column, value in own.items()}))
-    return pl.concat(tables, how="vertical_relaxed").sort("realisation", maintain_order=True)
+        constant = {key: pl.lit(value) for key, value in own.items() if value is not None}
+        tables.append(table.with_columns(**constant))
+    return pl.concat(tables, how="diagonal_relaxed").sort("realisation", maintain_order=True)
 
 
 @lru_cache(maxsize=2)
 def pipeline_with(setting: PaperSetting, estimators: tuple[str, ...]) -> Pipeline:
-    """Give the pipeline with estimators by name, circle_pose at the setting's isovalue; the last two are kept."""
+    """Make the pipeline with estimators by name, circle_pose at the setting's isovalue; the last two are cached."""
     loaded = load_estimators(estimators)
     return Pipeline(setting, {name: _of_protocol(name, each, setting) for name, each in loaded.items()})
 
@@ -78,8 +84,8 @@ def _of_protocol(name: str, estimator: AnyEstimator, setting: PaperSetting) -> E
     return photometric_plane if isinstance(estimator, Photometric) else estimator
 
 
-def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[str, Any]:
-    """Give the columns that differ between the rows of one estimator; null where it failed."""
+def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> Columns:
+    """Compute the columns that differ between the rows of one estimator; null where it failed."""
     ok = [result for result in results if isinstance(result, Estimate)]
     # All candidates of all estimates in one go; an estimator may give more of them here and fewer there.
     ends = np.cumsum([0, *(len(estimate.candidates) for estimate in ok)]).tolist()
@@ -87,7 +93,7 @@ def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[s
     errors = [every[first:end] for first, end in itertools.pairwise(ends)]
     proposed = angle_deg(np.array([e.normal for e in ok]).reshape(-1, 3), setting.normal).tolist()
     isovalues = [[isophote.isovalue for isophote in estimate.isophotes] for estimate in ok]
-    columns: dict[str, list[Any]] = {
+    columns: Columns = {
         "error_deg": proposed,
         "error_oracle_deg": [min(own) for own in errors],
         # The plane's normal is the same wherever the estimate looks.
@@ -102,16 +108,17 @@ def _columns(setting: PaperSetting, results: list[Estimate | Failure]) -> dict[s
         "choice_margin": [e.choice_margin for e in ok],
         "mahalanobis2": [mahalanobis2(e, setting.normal) for e in ok],
     }
-    for name, place in (("cov_11", (0, 0)), ("cov_12", (0, 1)), ("cov_22", (1, 1))):
-        columns[name] = [None if e.covariance is None else float(e.covariance[place]) for e in ok]
+    for name, index in (("cov_11", (0, 0)), ("cov_12", (0, 1)), ("cov_22", (1, 1))):
+        columns[name] = [None if e.covariance is None else float(e.covariance[index]) for e in ok]
     columns |= {f"normal_{axis}": [float(e.normal[i]) for e in ok] for i, axis in enumerate("xyz")}
-    status = ["ok" if isinstance(r, Estimate) else str(r.reason) for r in results]
-    flags = [",".join(r.flags) if isinstance(r, Estimate) else r.detail for r in results]
+    # Failures have a status and flags only.
+    status: list[Value] = ["ok" if isinstance(r, Estimate) else str(r.reason) for r in results]
+    flags: list[Value] = [",".join(r.flags) if isinstance(r, Estimate) else r.detail for r in results]
     answered = [isinstance(result, Estimate) for result in results]
     return {"status": status, "flags": flags} | {name: _spread(answered, v) for name, v in columns.items()}
 
 
-def _spread(answered: list[bool], values: list[Any]) -> list[Any]:
-    """Put the values of the answered rows into all rows."""
+def _spread(answered: list[bool], values: list[Value]) -> list[Value]:
+    """Spread the values of the answered rows over all rows."""
     given = iter(values)
     return [next(given) if present else None for present in answered]

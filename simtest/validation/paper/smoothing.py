@@ -1,4 +1,4 @@
-"""The bias of circle pose that the smoothing leaves, predicted: the error without noise (docs/theory.md, section 4)."""
+"""Predicts the bias of circle pose under smoothing: its error without noise (docs/theory.md, section 4)."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +9,7 @@ from simtest.geometry.isocurves import isophote_radius
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.spec.paper import PaperSetting
-from simtest.validation.paper.protocol import plane_from_image
+from simtest.validation.paper.slanted_view import plane_from_image
 
 Array = npt.NDArray[np.float64]
 
@@ -43,10 +43,12 @@ def smoothing_bias(setting: PaperSetting) -> float | None:
     radius = isophote_radius(setting.isovalue, setting.exponent, setting.height)
     if setting.eps > 0 or not _window_goes_on(setting, radius):
         return None
+    # E of the exact isophote, a circle on the plane.
     H = plane_from_image(setting)
     C = H.T @ np.diag([1.0, 1.0, -(radius**2)]) @ H
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
     level = -(C[2, 2] + C[:2, 2] @ centre)
+    # E' with smoothing and interpolation.
     spread = -2 * np.log(setting.isovalue)
     added = spread * setting.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (spread - 1)
     E = np.linalg.inv(C[:2, :2] / level) + added * np.eye(2)
@@ -63,12 +65,12 @@ def smoothing_bias(setting: PaperSetting) -> float | None:
 
 
 def _window_goes_on(setting: PaperSetting, radius: float) -> bool:
-    """Tell whether the texture's window ends at least `MARGIN_WIDTHS` smoothing widths beyond the isophote."""
+    """Return whether the texture's window ends at least `MARGIN_WIDTHS` smoothing widths beyond the isophote."""
     half = setting.size / 2
     if radius >= half:
         return False
-    ways = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    points = np.concatenate([np.stack([radius * ways, half * ways]), np.ones((2, 3, 1))], axis=-1)
+    directions = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = np.concatenate([np.stack([radius * directions, half * directions]), np.ones((2, 3, 1))], axis=-1)
     seen = points @ np.linalg.inv(plane_from_image(setting)).T
     if np.any(seen[..., 2] <= 0):
         return False

@@ -1,7 +1,6 @@
-"""Keeps one realisation of the published protocol for the gallery and the pictures of the pipeline."""
+"""Keeps one realisation of the published protocol for the gallery, with the pictures of the pipeline's stages."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,12 +8,20 @@ import numpy.typing as npt
 from simtest.errors import Failure
 from simtest.geometry.isocurves import brightest_point
 from simtest.runtime.seeds import from_integer
-from simtest.spec import camera_table
+from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
-from simtest.validation.gallery_items import MAP_SIDE, drawn, write_item
-from simtest.validation.paper.pipeline import Stages
-from simtest.validation.paper.protocol import Box, plane_from_image, texture, window_centre
+from simtest.validation.cases import Case
+from simtest.validation.gallery_items import (
+    MAP_SIDE,
+    DrawnEstimate,
+    DrawnTruth,
+    GalleryMeta,
+    PublishedDetails,
+    write_item,
+)
+from simtest.validation.paper.published_pipeline import Stages
 from simtest.validation.paper.rows import SURFACE, pipeline_with
+from simtest.validation.paper.slanted_view import Box, plane_from_image, texture, window_centre
 
 Array = npt.NDArray[np.float64]
 
@@ -24,9 +31,7 @@ TEXTURE_STEP = 2
 """The texture is smooth: every other sample is enough to look at."""
 
 
-def save_realisation(
-    path: Path, setting: PaperSetting, estimators: tuple[str, ...], seed: int, names: dict[str, str]
-) -> None:
+def save_realisation(path: Path, experiment: Experiment, case: Case, number: int, why: str | None = None) -> None:
     """Write the gallery item of one realisation, with the pictures `texture`, `clean` and `smoothed`.
 
     The picture with noise is the item's frame: noise is drawn in and around the region of interest alone, as nothing
@@ -36,54 +41,58 @@ def save_realisation(
     ----------
     path : Path
         The .npz file.
-    setting : PaperSetting
-        The setting.
-    estimators : tuple of str
-        Names.
-    seed : int
-        The realisation's, as in its row.
-    names : dict
-        `label` and `setting` of its case.
+    experiment : Experiment
+        For seed and estimators.
+    case : Case
+        Of the published protocol.
+    number : int
+        Of the realisation.
+    why : str, optional
+        Why it is kept.
     """
-    pipeline = pipeline_with(setting, estimators)
+    setting, seed = case.paper_setting(), case.noise_seed(experiment, number)
+    pipeline = pipeline_with(setting, experiment.estimators)
     stages = pipeline.stages(from_integer(seed))
     patch = pipeline.cut(stages)
-    camera = setting.camera
-    spot = _on_plane(setting, _bp(setting, stages))
-    # Behind the imaging camera the BP is nowhere in the picture.
-    bp_px = camera.project(spot).tolist() if spot[2] > 0 else None
+    camera, normal = setting.camera, setting.normal
+    bp = _on_plane(setting, _bp(setting, stages))
     peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()
-    entries = [
-        {
-            "specularity": 0,
-            "true_id": 0,
-            "estimator": name,
-            "bp_px": peak,
-            **drawn(result, patch, camera, setting.normal),
-        }
-        for name, (result,) in pipeline.reconstruct([patch]).items()
-    ]
-    true = {
-        "id": 0, "bp_px": bp_px, "normal": setting.normal.tolist(), "position": spot.tolist(),
-        "kd_min": 0.0, "kd_max": 0.0, "isolated": True,
-    }  # fmt: skip
-    meta: dict[str, Any] = {
-        **names, "surface": SURFACE, "sigma": setting.sigma, "command": again(setting, estimators, seed),
-        "camera": camera_table(camera),
-        "truth": [true], "estimates": entries, "length_unit": LENGTH_UNIT,
-        "paper": setting.model_dump(), "light": stages.light.tolist(), "seed": seed, "outer": list(pipeline.outer),
-        "peak_value": None if isinstance(patch, Failure) else patch.peak_value,
-    }  # fmt: skip
-    position, normal = _truth_maps(setting)
+    meta = GalleryMeta(
+        surface=SURFACE,
+        setting=case.setting,
+        label=case.label,
+        sigma=setting.sigma,
+        command=reproduce_command(setting, experiment.estimators, seed),
+        camera=camera,
+        # Behind the imaging camera the BP is nowhere in the picture.
+        truth=[
+            DrawnTruth(
+                0, camera.project(bp).tolist() if bp[2] > 0 else None, normal.tolist(), bp.tolist(), 0.0, 0.0, True
+            )
+        ],
+        estimates=[
+            DrawnEstimate(0, 0, peak, name).answered(result, patch, camera, normal)
+            for name, (result,) in pipeline.reconstruct([patch]).items()
+        ],
+        why=why,
+        published=PublishedDetails(
+            length_unit=LENGTH_UNIT,
+            paper=setting.model_dump(),
+            light=stages.light.tolist(),
+            seed=seed,
+            outer=list(pipeline.outer),
+            peak_value=None if isinstance(patch, Failure) else patch.peak_value,
+        ),
+    )
     write_item(
-        path, meta, _in_frame(setting, stages.noisy, pipeline.outer), position, normal,
+        path, meta, _in_frame(setting, stages.noisy, pipeline.outer), *_truth_maps(setting),
         texture=texture(setting, stages.light)[::TEXTURE_STEP, ::TEXTURE_STEP],
         clean=stages.clean, smoothed=stages.smoothed,
     )  # fmt: skip
 
 
-def again(setting: PaperSetting, estimators: tuple[str, ...], seed: int) -> str:
-    """Give the command that makes a realisation again alone: it prints the estimates."""
+def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: int) -> str:
+    """Return the command that makes a realisation alone and prints its estimates."""
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     return (
         'python -c "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; '
@@ -93,20 +102,20 @@ def again(setting: PaperSetting, estimators: tuple[str, ...], seed: int) -> str:
 
 
 def _bp(setting: PaperSetting, stages: Stages) -> Array:
-    """Give the BP in coordinates about the window's centre, shape (2,)."""
+    """Return the BP in coordinates about the window's centre, shape (2,)."""
     overhead = np.array([0.0, 0.0, setting.height])
     return brightest_point(stages.light, overhead) - window_centre(setting, stages.light)
 
 
 def _on_plane(setting: PaperSetting, xy: Array) -> Array:
-    """Give points of the plane, shape (..., 2), in the imaging camera's frame, shape (..., 3)."""
+    """Return points of the plane, shape (..., 2), in the imaging camera's frame, shape (..., 3)."""
     theta = np.radians(setting.theta_deg)
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([x, y * np.cos(theta), y * np.sin(theta) + setting.height], axis=-1)
 
 
 def _truth_maps(setting: PaperSetting) -> tuple[Array, Array]:
-    """Give the texture's window in the camera frame on a thinned grid of pixels, and its normals."""
+    """Compute the texture's window in the camera frame on a thinned grid of pixels, and its normals."""
     step = max(1, setting.size // MAP_SIDE)
     pixels = setting.camera.pixel_centres()[::step, ::step]
     plane = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1) @ plane_from_image(setting).T
@@ -116,7 +125,7 @@ def _truth_maps(setting: PaperSetting) -> tuple[Array, Array]:
 
 
 def _in_frame(setting: PaperSetting, picture: Array, box: Box) -> Array:
-    """Put a part of the picture at its place in the whole one, which is black elsewhere."""
+    """Return the whole picture, black except in a box, which holds the given part."""
     x, y, width, height = box
     frame = np.zeros((setting.size, setting.size))
     frame[y : y + height, x : x + width] = picture

@@ -1,4 +1,4 @@
-"""The picture of the published protocol: texture of the specular term, slanted view, all noise-free.
+"""The noise-free picture of the published protocol: texture of the specular term, seen slanted.
 
 Choices that the article does not state: the plane's centre lies at distance V_Z from the imaging camera; one texture
 sample is one length unit; the tilt is about the image's x axis; the texture's centre maps to (M/2, M/2) with pixel
@@ -14,6 +14,8 @@ from simtest.geometry.isocurves import brightest_point
 from simtest.spec.paper import PaperSetting
 
 Array = npt.NDArray[np.float64]
+Box = tuple[int, int, int, int]
+"""Column, row, width, height, px."""
 
 
 def draw_light(setting: PaperSetting, rng: np.random.Generator) -> Array:
@@ -23,9 +25,9 @@ def draw_light(setting: PaperSetting, rng: np.random.Generator) -> Array:
 
 
 def plane_from_image(setting: PaperSetting) -> Array:
-    """Give the homography from pixels to plane coordinates about the window's centre, shape (3, 3), texture units.
+    """Return the homography from pixels to plane coordinates about the window's centre, shape (3, 3), texture units.
 
-    The plane's point x (1, 0, 0) + y (0, cos theta, sin theta) + (0, 0, V_Z) is seen at K times it.
+    The plane's point x (1, 0, 0) + y (0, cos theta, sin theta) + (0, 0, V_Z), times K, is its pixel.
     """
     theta = np.radians(setting.theta_deg)
     camera_from_plane = np.array([[1, 0, 0], [0, np.cos(theta), 0], [0, np.sin(theta), setting.height]])
@@ -33,18 +35,9 @@ def plane_from_image(setting: PaperSetting) -> Array:
 
 
 def texture(setting: PaperSetting, light: Array) -> Array:
-    """Give the M x M texture of the specular term max(0, cos beta)^n, its largest sample 1 at most.
+    """Compute the texture, shape (M, M), of the specular term max(0, cos beta)^n; its largest sample is at most 1.
 
-    Parameters
-    ----------
-    setting : PaperSetting
-        For M, V_Z, n and the window.
-    light : ndarray, shape (3,)
-        L, texture units, the camera's foot at the origin.
-
-    Returns
-    -------
-    ndarray, shape (M, M)
+    `light` is L, shape (3,), texture units, with the camera's foot at the origin.
     """
     side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
     centre = window_centre(setting, light)
@@ -57,42 +50,26 @@ def texture(setting: PaperSetting, light: Array) -> Array:
 
 
 def window_centre(setting: PaperSetting, light: Array) -> Array:
-    """Give the plane point at the texture's centre, shape (2,)."""
+    """Return the plane point at the texture's centre, shape (2,)."""
     camera = np.array([0.0, 0.0, setting.height])
     return brightest_point(light, camera) if setting.recentre else np.zeros(2)
 
 
-Box = tuple[int, int, int, int]
-"""Column, row, width, height, px."""
-
-
 def sample_positions(setting: PaperSetting, box: Box) -> Array:
-    """Give where each pixel of a part of the picture reads the texture: rows and columns, shape (2, h, w)."""
+    """Compute where each pixel in a box of the picture reads the texture: rows and columns, shape (2, h, w)."""
     x0, y0, width, height = box
     x, y = np.meshgrid(np.arange(x0, x0 + width) + PIXEL_CENTRE, np.arange(y0, y0 + height) + PIXEL_CENTRE)
     plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ plane_from_image(setting).T
-    # The plane behind the camera is not seen: such pixels read outside of the texture.
+    # The plane behind the camera is not seen: such pixels read outside the texture.
     scale = np.where(plane[..., 2] > 0, plane[..., 2], np.nan)
     samples = plane[..., :2] / scale[..., None] + setting.size / 2 - PIXEL_CENTRE
     return np.asarray(np.nan_to_num(np.moveaxis(samples[..., ::-1], -1, 0), nan=-2.0))
 
 
 def picture(setting: PaperSetting, light: Array, positions: Array | None = None) -> Array:
-    """Give the noise-free picture of the texture seen slanted: the texture warped by the homography, bilinear.
+    """Warp the texture into the slanted view, bilinear: the noise-free picture, 0 outside the window.
 
-    Parameters
-    ----------
-    setting : PaperSetting
-        The setting.
-    light : ndarray, shape (3,)
-        L, texture units.
-    positions : ndarray, shape (2, h, w), optional
-        `sample_positions` of a part of the picture; default of all of it.
-
-    Returns
-    -------
-    ndarray, shape (h, w)
-        0 where the window ends; the peak is the texture's.
+    `positions`, shape (2, h, w), are the `sample_positions` of a part of the picture; default of all of it.
     """
     if positions is None:
         positions = sample_positions(setting, (0, 0, setting.size, setting.size))
@@ -100,14 +77,14 @@ def picture(setting: PaperSetting, light: Array, positions: Array | None = None)
 
 
 def region_of_interest(setting: PaperSetting) -> Box:
-    """Give the bounding box of the texture's window in the picture: column, row, width, height, px.
+    """Return the bounding box of the texture's window in the picture.
 
-    Outside of it the picture is black; the published method's region of interest is its part inside the frame.
+    Outside it the picture is black; the published method's region of interest is its part inside the frame.
     """
     half = setting.size / 2
     corners = np.array([[x, y, 1.0] for x in (-half, half) for y in (-half, half)])
     seen = corners @ np.linalg.inv(plane_from_image(setting)).T
-    # A corner behind the camera is seen nowhere: then the window fills the frame towards it.
+    # A corner behind the camera is not seen: then the window fills the frame towards it.
     points = seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
     low = np.nan_to_num(np.floor(points.min(axis=0)), nan=0.0)
     high = np.nan_to_num(np.ceil(points.max(axis=0)), nan=float(setting.size))

@@ -17,7 +17,8 @@ CHANNELS = (
     "depth", "x", "y", "z", "normal_x", "normal_y", "normal_z", "geometric_x", "geometric_y", "geometric_z",
     "k_min", "k_max", "face", "second", "third",
 )  # fmt: skip
-"""What `trace` gives: depth, mm; position, mm, and normals, camera frame; curvatures, 1/mm; where in which triangle."""
+"""Channels of `trace`: depth, mm; position, mm, and normals, camera frame; curvatures, 1/mm; triangle, and position in
+it."""
 
 
 class ShapeLabels:
@@ -33,7 +34,7 @@ class ShapeLabels:
         Of a mesh: S at its vertices for normals on the camera's side, model frame, 1/mm. None for a sphere, cylinder
         or plane, whose derivatives Mitsuba knows exactly.
     curved : bool
-        Whether to give the curvatures; they are NaN otherwise, and all else is the same.
+        Whether to compute the curvatures; they are NaN otherwise, and all else is the same.
     """
 
     def __init__(self, mi: Any, shape: Any, shape_operators: Array | None, curved: bool = True) -> None:
@@ -45,7 +46,7 @@ class ShapeLabels:
             self._operators = mi.Float(upper.ravel())
 
     def trace(self, preliminary: Any, si: Any, rays: Rays, rotation: Any) -> list[Any]:
-        """Give the channels.
+        """Compute the channels at the hits.
 
         Parameters
         ----------
@@ -67,12 +68,13 @@ class ShapeLabels:
 
         mi = self.mi
         seen = si.is_valid()
-        # Rendered shapes are seen from either side.
+        # Rendered shapes are seen from either side: turn the triangle's normal towards the camera.
         facing = dr.select(dr.dot(si.n, rays.traced.d) > 0, mi.Float(-1), mi.Float(1))
         shading, geometric = rotation @ mi.Vector3f(si.sh_frame.n), rotation @ (mi.Vector3f(si.n) * facing)
         curvatures = [mi.Float(dr.nan), mi.Float(dr.nan)]
         if self._curved:
             a, b, c = self._second_form(preliminary, si, seen)
+            # Eigenvalues of the second fundamental form [[a, b], [b, c]].
             mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
             curvatures = [facing * mean - half, facing * mean + half]
         position = rays.sightline * si.t
@@ -82,19 +84,20 @@ class ShapeLabels:
         return [*channels, face, *preliminary.prim_uv]
 
     def _second_form(self, preliminary: Any, si: Any, seen: Any) -> tuple[Any, Any, Any]:
-        """Give the components of S along two perpendicular tangents, for the shape's own normal."""
+        """Compute the components of S along two perpendicular tangents, for the shape's own normal."""
         import drjit as dr
 
         mi = self.mi
         if self._operators is None:
             first = dr.normalize(si.dp_du)
-            # dN along the first tangent, and along the one perpendicular to it.
+            # Analytic shape: dN along the first tangent, and along the one perpendicular to it.
             along = si.dn_du / dr.norm(si.dp_du)
             share = dr.dot(first, si.dp_dv)
             across = si.dp_dv - share * first
             second = dr.normalize(across)
-            aside = (si.dn_dv - share * along) / dr.norm(across)
-            return dr.dot(first, along), dr.dot(first, aside), dr.dot(second, aside)
+            along_second = (si.dn_dv - share * along) / dr.norm(across)
+            return dr.dot(first, along), dr.dot(first, along_second), dr.dot(second, along_second)
+        # Mesh: S interpolated between the triangle's corners.
         corners = self._shape.face_indices(preliminary.prim_index, seen)
         u, v = preliminary.prim_uv
         upper = [mi.Float(0)] * 6
@@ -120,7 +123,7 @@ def as_labels(channels: list[FloatImage]) -> Labels:
     seen = np.isfinite(named["depth"])
 
     def vector(*names: str) -> FloatImage:
-        # The components stay apart in memory: no copy from pixel to pixel.
+        # The components stay separate in memory, which saves a copy from pixel to pixel.
         return np.moveaxis(np.stack([named[name] for name in names]), 0, -1)
 
     return Labels(
@@ -136,7 +139,7 @@ def as_labels(channels: list[FloatImage]) -> Labels:
 
 
 def as_hits(channels: list[FloatImage]) -> tuple[RayHits, Array, Array]:
-    """Give what the exact truth starts from: hits, and shading and geometric normals, camera frame, shape (N, 3)."""
+    """Return the hits that the exact truth starts from, and shading and geometric normals, camera frame, (N, 3)."""
     named = {name: channel.ravel() for name, channel in zip(CHANNELS, channels, strict=True)}
     barycentric = np.stack([named["second"], named["third"]], axis=1)
     hits = pack_hits(named["depth"], named["face"].view(np.int32), barycentric)

@@ -15,19 +15,12 @@ from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.dispatch import run_each
 from simtest.geometry import Patch
 from simtest.spec.paper import PaperSetting
-from simtest.validation.paper.protocol import (
-    Box,
-    draw_light,
-    picture,
-    region_of_interest,
-    sample_positions,
-)
+from simtest.validation.paper.slanted_view import Box, draw_light, picture, region_of_interest, sample_positions
 
 Array = npt.NDArray[np.float64]
 
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""
-
 
 NOISE_SIDE_PX = 48
 """Side of the square that the noise is estimated in."""
@@ -35,7 +28,7 @@ NOISE_SIDE_PX = 48
 
 @dataclass(frozen=True)
 class Stages:
-    """The pictures of one realisation on the way to its isophote; of the pipeline's outer region, shape (h, w).
+    """The pictures of one realisation on the way to its isophote, within the pipeline's outer region, shape (h, w).
 
     Parameters
     ----------
@@ -54,8 +47,8 @@ class Stages:
 class Pipeline:
     """The published pipeline at one setting; what all realisations share is computed once.
 
-    Only the region of interest, the texture's window in the picture, is made and smoothed, with a margin of the
-    kernel's half-width, so that its values are those of the whole picture.
+    Only the region of interest, the texture's window in the picture, is computed and smoothed. A margin of the kernel's
+    half-width makes its values equal those of the whole picture.
 
     Parameters
     ----------
@@ -76,36 +69,29 @@ class Pipeline:
         self._fixed = picture(setting, self._overhead, self.positions) if setting.eps == 0 else None
 
     def realise(self, generators: Iterable[np.random.Generator]) -> dict[str, list[Estimate | Failure]]:
-        """Make realisations, one a generator.
+        """Make a realisation with each generator; return the Estimate or Failure of each by estimator name.
 
-        Parameters
-        ----------
-        generators : iterable of numpy.random.Generator
-            Each gives the light, where it is offset, then the noise of the outer region row by row.
-
-        Returns
-        -------
-        dict
-            Estimate or Failure of each realisation by estimator name.
+        A generator draws the light, where it is offset, then the noise of the outer region row by row.
         """
         return self.reconstruct([self.patch(rng) for rng in generators])
 
     def reconstruct(self, patches: Sequence[Patch | Failure]) -> dict[str, list[Estimate | Failure]]:
-        """Give Estimate or Failure of each region of interest by estimator name."""
+        """Return the Estimate or Failure of each region of interest by estimator name."""
         return {name: run_each(each, patches, self.setting.camera) for name, each in self.estimators.items()}
 
     def patch(self, rng: np.random.Generator) -> Patch | Failure:
-        """Give the smoothed region of interest of one realisation (see `realise`)."""
+        """Make the smoothed region of interest of one realisation (see `realise`)."""
         return self.cut(self.stages(rng))
 
     def stages(self, rng: np.random.Generator) -> Stages:
         """Make the pictures of one realisation (see `realise`)."""
         setting = self.setting
+        # Slanted view: the same for all realisations unless the light is drawn.
         light, clean = self._overhead, self._fixed
         if clean is None:
             light = draw_light(setting, rng)
             clean = picture(setting, light, self.positions)
-        # Smoothed in double precision: in single precision the normal moves by up to 2e-5 deg.
+        # Noise; smoothed in double precision, since in single precision the normal moves by up to 2e-5 deg.
         noisy = smoothed = clean + setting.sigma * rng.standard_normal(clean.shape, dtype=np.float32)
         if setting.smoothing_px > 0:
             side = 2 * kernel_radius(setting) + 1
@@ -123,13 +109,13 @@ class Pipeline:
 
 
 def frame_noise(noisy: Array) -> float:
-    """Estimate the noise of a picture from its middle: that suffices for white noise, and is many times faster."""
+    """Estimate the noise of a picture from its middle: enough for white noise, and many times faster."""
     rows, columns = (max(size - NOISE_SIDE_PX, 0) // 2 for size in noisy.shape)
     return estimate_noise(noisy[rows : rows + NOISE_SIDE_PX, columns : columns + NOISE_SIDE_PX])
 
 
 def kernel_radius(setting: PaperSetting) -> int:
-    """Give the half-width of the smoothing kernel, px."""
+    """Return the half-width of the smoothing kernel, px."""
     return math.ceil(KERNEL_SIGMAS * setting.smoothing_px)
 
 
