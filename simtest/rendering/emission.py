@@ -68,23 +68,7 @@ def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDi
 
 
 def factor(mi: Any, kind: LightKind, values: MitsubaDict, away: Any) -> Any:
-    """Compute the emission into unit directions away from a light, relative to that along its axis.
-
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    kind : LightKind
-        The light's.
-    values : MitsubaDict
-        Its `parameters`.
-    away : mitsuba.Vector3f
-        Unit directions.
-
-    Returns
-    -------
-    mitsuba.Float
-    """
+    """Compute the emission, mitsuba.Float, into unit directions away from a light, relative to that along its axis."""
     import drjit as dr
 
     if kind.profile == "uniform" and not kind.spot:

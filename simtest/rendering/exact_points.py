@@ -13,18 +13,9 @@ _OF_POINTS = ("position", "normal", "k_min", "k_max", "direction_min", "directio
 
 
 def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
-    """Trace rays against the rendered shape.
+    """Trace rays, shape (N, 3), model frame, mm, against the rendered shape, the scene's only surface.
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    scene : mitsuba.Scene
-        Holds one surface.
-    shape : Shape
-        That surface.
-    origins, directions : ndarray, shape (N, 3)
-        Model frame, mm; unit directions, NaN where there is no ray.
+    Directions are unit, NaN where there is no ray.
 
     Returns
     -------

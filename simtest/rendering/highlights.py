@@ -76,21 +76,9 @@ def misfit(position: Array, normal: Array, light: Array) -> Array:
 
 
 def find(session: Caster, radiance: Radiance, stride: int) -> list[HighlightPoint]:
-    """Find the highlight points of all lights in view.
+    """Find the highlight points of all lights in view, the brightest first.
 
-    Parameters
-    ----------
-    session : Caster
-        Casts exact rays.
-    radiance : Radiance
-        Of the same frame.
-    stride : int
-        Spacing of the seeds' grid, px.
-
-    Returns
-    -------
-    list of HighlightPoint
-        The brightest first.
+    `radiance` is that of the same frame; the seeds' grid has a spacing of `stride` px.
     """
     camera = session.camera
     lights = session.scene.rig.true_mm()

@@ -47,23 +47,9 @@ _LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "di
 
 
 def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
-    """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply.
+    """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply (see `simtest.export`).
 
     The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    out : Path
-        Folder, made if need be.
-    variant : str, optional
-        Mitsuba variant that parses the scene; the files are the same for all.
-
-    Returns
-    -------
-    list of Path
-        The files.
 
     Raises
     ------

@@ -93,11 +93,6 @@ class Session:
     def update(self, scene: Scene) -> None:
         """Move to another scene; update only what changed, and rebuild only another structure.
 
-        Parameters
-        ----------
-        scene : Scene
-            The next scene.
-
         Raises
         ------
         InputError
@@ -192,35 +187,17 @@ class Session:
     # Radiance ----------------------------------------------------------------------------------------------------
 
     def radiance(self, progress: Progress | None = None) -> Radiance:
-        """Render the frame.
+        """Render the frame; `progress` is called after each launch, and what it raises stops the frame only.
 
-        Parameters
-        ----------
-        progress : callable, optional
-            Called after each part of the work (see `simtest.rendering.integrate.Progress`); what it raises stops the
-            frame and leaves the session as it was.
-
-        Returns
-        -------
-        Radiance
-            With one sample a pixel: the value on the ray through each pixel's centre; with more: the mean over the
-            pixel's area. The same scene and seed give the same bytes.
+        With one sample a pixel the radiance is that on the ray through each pixel's centre, with more the mean over the
+        pixel's area. The same scene and seed give the same bytes.
         """
         return self._render(None, progress)[0]
 
     def frame(self, progress: Progress | None = None) -> Frame:
         """Render the frame with the labels of the rendered shape, in one pass where it has one sample a pixel.
 
-        The exact truth that `truth` computes afterwards starts from the same hits.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            See `radiance`.
-
-        Returns
-        -------
-        Frame
+        The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
         """
         radiance, channels = self._render(self._shape_labels(), progress)
         self._centre = channels
@@ -260,12 +237,7 @@ class Session:
     # Ground truth ------------------------------------------------------------------------------------------------
 
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixels onto the exact surface.
-
-        Parameters
-        ----------
-        points_px : ndarray, shape (N, 2)
-            Pixel positions.
+        """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
 
         Returns
         -------
@@ -277,17 +249,9 @@ class Session:
         return self._cast(*self.sightlines.in_model(points_px))
 
     def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
-        """Cast rays through pixels onto the rendered shape.
+        """Cast rays through pixel positions, shape (N, 2), onto the rendered shape.
 
-        Parameters
-        ----------
-        points_px : ndarray, shape (N, 2)
-            Pixel positions.
-
-        Returns
-        -------
-        position, normal : ndarray, shape (N, 3)
-            Points, mm, and shading normals, camera frame; NaN where the ray misses.
+        Returns points, mm, and shading normals, shape (N, 3), camera frame; NaN where the ray misses.
         """
         hits, shading, _ = self._hits(*self.sightlines.in_model(points_px))
         distance = np.where(np.isfinite(hits.distance), hits.distance, np.nan)

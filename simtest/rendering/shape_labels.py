@@ -46,23 +46,10 @@ class ShapeLabels:
             self._operators = mi.Float(upper.ravel())
 
     def trace(self, preliminary: Any, si: Any, rays: Rays, rotation: Any) -> list[Any]:
-        """Compute the channels at the hits.
+        """Compute the channels at the hits (see `CHANNELS`); NaN where there is no surface.
 
-        Parameters
-        ----------
-        preliminary : mitsuba.PreliminaryIntersection3f
-            The hits.
-        si : mitsuba.SurfaceInteraction3f
-            Of the same hits, with all derivatives.
-        rays : Rays
-            The rays.
-        rotation : mitsuba.Matrix3f
-            From the model frame to the camera frame.
-
-        Returns
-        -------
-        list of mitsuba.Float
-            See `CHANNELS`; NaN where there is no surface.
+        `si` are the surface points of the hits, with all derivatives; `rotation` leads from the model frame to the
+        camera frame.
         """
         import drjit as dr
 

@@ -34,22 +34,7 @@ FIELDS = {
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where more is known.
 
-    Parameters
-    ----------
-    frame : LabelledFrame
-        What to write.
-    out : Path
-        Folder, made if need be.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
+    The folder is made if need be; `InputError` is raised if it cannot be written. Returns the files.
     """
     files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
     make_folder(out)

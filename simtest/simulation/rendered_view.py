@@ -53,21 +53,7 @@ class RenderedView:
 
 
 def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
-    """Move a session to a scene, render it and judge its highlights.
-
-    Parameters
-    ----------
-    session : Session
-        Is moved to the scene.
-    scene : Scene
-        The scene.
-    radiance : Radiance, optional
-        Of the scene, where it is rendered already.
-
-    Returns
-    -------
-    RenderedView
-    """
+    """Move a session to a scene, render it, unless its radiance is given, and judge its highlights."""
     session.update(scene)
     if radiance is None:
         radiance = session.radiance()

@@ -107,7 +107,7 @@ def sample_views(
     write: Callable[[RenderedView], WrittenView] | None = None,
     keep_all: bool = False,
 ) -> SampledViews:
-    """Try viewpoints one after the other until enough of them show an isolated highlight.
+    """Try viewpoints one after the other until `count` of them show an isolated highlight, or none is left.
 
     Parameters
     ----------
@@ -125,11 +125,6 @@ def sample_views(
         Writes the picture of a view that is kept.
     keep_all : bool
         Keep every view, whatever it shows: a sequence.
-
-    Returns
-    -------
-    SampledViews
-        With fewer than `count` views where the viewpoints ran out.
 
     Raises
     ------

@@ -29,12 +29,6 @@ class Part:
 
     Parameters
     ----------
-    experiment : Experiment
-        Name, seed and estimators.
-    case : Case
-        The case.
-    numbers : range
-        Which of its realisations.
     swept : mapping
         An example of each swept value of the experiment, for the columns' types.
     item : Path or None

@@ -62,18 +62,14 @@ class RunRecord:
 
     Parameters
     ----------
-    variant : str
-        Mitsuba variant.
-    llvm : str or None
-        The libLLVM in use.
+    variant, llvm : str
+        Mitsuba variant, and the libLLVM in use, if any.
     fingerprint : str
         Hash of everything that determines the results.
     seed, realisations : int
         The experiment's.
-    started : str
-        ISO 8601, UTC.
-    duration_s : float
-        Wall time.
+    started, duration_s
+        ISO 8601, UTC, and wall time.
     command : str
         How the run was called.
     inputs : dict
@@ -112,18 +108,8 @@ def run_experiment(
     folder : Path
         Made if need be. A folder that holds something other than a run is refused; the same run, finished, is
         returned as it is.
-    command : str
-        How the run was called, for the report.
-    variant : str, optional
-        Mitsuba variant.
-    progress : callable, optional
-        See `Progress`.
-    engine : Engine, optional
-        Who does the work; default this process. The rows do not depend on it.
-
-    Returns
-    -------
-    Run
+    command, variant, progress, engine
+        See `simtest.validate`; by default this process does the work. The rows do not depend on the engine.
 
     Raises
     ------

@@ -23,19 +23,7 @@ _CELL = ("experiment", "label", "surface", "setting", "estimator")
 
 @dataclass(frozen=True)
 class WorstCase:
-    """A frame that is worth a look.
-
-    Parameters
-    ----------
-    experiment, setting : str
-        Where it belongs.
-    realisation : int
-        Number of the realisation.
-    estimator : str
-        Who missed.
-    why : str
-        A sentence with the error, and what was expected.
-    """
+    """A frame that is worth a look: the estimator that missed, and why, as a sentence with error and expectation."""
 
     experiment: str
     setting: str
@@ -121,14 +109,9 @@ def save_worst(
     experiments : iterable of Experiment
         As they were run: name, seed and realisations.
     folder : Path
-        Where the .npz files go; made if need be.
+        Where the .npz files go, in the order of the cases; made if need be.
     variant : str, optional
         Mitsuba variant.
-
-    Returns
-    -------
-    tuple of Path
-        The files, in the order of the cases.
 
     Raises
     ------
