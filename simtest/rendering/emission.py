@@ -53,6 +53,7 @@ def kind_of(light: LightSpec) -> LightKind:
 
 def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
     """Return the emitter's parameters by name; position, mm, and unit axis, shape (3,), are in the model frame."""
+    # Angles in radians.
     values = {
         "position": mi.Point3f(*position.tolist()),
         "axis": mi.Vector3f(*axis.tolist()),
@@ -150,6 +151,7 @@ def _make_class(mi: Any, variant: str) -> Any:
             dr.make_opaque(self.parts)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+            # A point light has one direction, of density 1.
             ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
             towards = self.parts["position"] - it.p
             squared = dr.squared_norm(towards)

@@ -43,6 +43,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
     valid = si.is_valid()
     normals = (mi.Vector3f(si.sh_frame.n), mi.Vector3f(si.n))
     dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
+    # Back to arrays; a miss becomes NaN.
     missed = ~np.array(valid)
     hits = pack_hits(
         np.where(missed, np.nan, np.array(preliminary.t)),

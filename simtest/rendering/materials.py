@@ -44,6 +44,7 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
                 "roughness": {"type": "uniform", "value": reflectance.roughness},
                 "specular": 0.5 * specular,
             }
+        # A rough conductor has no base of its own: a matt one is blended in.
         case RoughConductorReflectance():
             return {
                 "type": "blendbsdf",

@@ -145,11 +145,13 @@ class Session:
         self.rebuilds += 1
         reflectance = self.scene.reflectance
         shape = make_shape(self.mi, self._shape, bsdf_dict(reflectance, self.plugin, diffuse_only=False))
+        # Surface and lights; `_apply` writes the values of the lights.
         kinds = (emission.kind_of(light) for light in self.scene.rig.lights)
         lights = {f"light_{i}": emission.emitter_dict(kind) for i, kind in enumerate(kinds)}
         # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
         # would share a parameter, and an update of one would change both.
         scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
+        # The base alone, where the BSDF cannot evaluate its parts separately.
         base = None
         if not parts_alone(reflectance):
             base = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True), optimize=False)
@@ -211,6 +213,7 @@ class Session:
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
         effort, tracer = self.scene.render, self._tracer()
+        # Direct light is traced here; a path depth above 2 adds bounces.
         bounces = None
         if effort.path_depth > 2:
             bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
@@ -299,6 +302,7 @@ class Session:
         # A light at the camera reaches all that is seen.
         if is_at_camera(source):
             return emitted
+        # Shadow rays from the light.
         pose = self.surface.model_from_camera
         origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
         hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)

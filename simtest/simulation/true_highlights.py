@@ -88,9 +88,11 @@ def judge(
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
     """
+    # The maximum that each point makes in the frame as detectors see it, and whose it is.
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
     peaks = [_peak_pixel(smoothed, point) for point in points]
     owners = _owners(points, peaks)
+    # Verdicts.
     highlights = []
     for point, peak in zip(points, peaks, strict=True):
         sigma = float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale if full_scale > 0 else 0.0

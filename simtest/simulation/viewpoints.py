@@ -137,9 +137,11 @@ def sample_views(
     kept: list[SampledView] = []
     rejected: Counter[str] = Counter()
     for viewpoint in viewpoints:
+        # Render.
         moved = scene.model_copy(update={"surface": scene.surface.model_copy(update={name: viewpoint})})
         session = session or Session(moved, variant)
         view = render_view(session, moved)
+        # Keep, or count the reason.
         isolated = sum(highlight.isolated for highlight in view.highlights)
         if isolated or keep_all:
             pose = session.surface.model_from_camera

@@ -60,6 +60,7 @@ def parts_of(
     experiment: Experiment, case: Case, swept: Mapping[str, Value], item: Path | None, variant: str | None
 ) -> list[Part]:
     """Split a case into parts: the published protocol into chunks, a rendered case not at all."""
+    # A rendered case shares its view between realisations; the protocol's realisations have nothing in common.
     numbers = case.numbers()
     size = PAPER_CHUNK if case.is_paper else max(1, len(numbers))
     return [

@@ -161,6 +161,7 @@ def save(
 ) -> None:
     """Write the gallery item of a realisation, at whose scene the session must be; `why` says why it is kept."""
     camera, scene = session.camera, made.view.scene
+    # Thinned maps: enough for arrows and the 3D view.
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
     meta = GalleryMeta(
         surface=scene.surface.label,

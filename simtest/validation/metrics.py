@@ -73,6 +73,7 @@ def rows(
 
 def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> ResultRow:
     """Fill in the scene and, unless the detection is false, the true highlight."""
+    # Scene.
     row = replace(
         common,
         surface=scene.surface.label,

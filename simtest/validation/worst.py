@@ -55,6 +55,7 @@ def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: 
     # Excess over what is expected. A law that is not finite predicts nothing, and would be sorted before all numbers.
     results = results.with_columns(error_law_deg=pl.when(pl.col("error_law_deg").is_finite()).then("error_law_deg"))
     expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_CELL))
+    # Only answers that were matched have an error.
     answered = (pl.col("status") == "ok") & pl.col("true_id").is_not_null() & pl.col("error_oracle_deg").is_finite()
     rows = results.filter(answered).with_columns(
         expected=expected, excess=pl.col("error_oracle_deg") - expected, row=pl.int_range(pl.len())
