@@ -76,6 +76,7 @@ def requested_variant(variant: str | None = None) -> str:
 
 def candidates() -> list[Candidate]:
     """List the libraries in the order they are tried: the variable, the pip package's, the system's newest."""
+    # The user's choice, then the tested package, then whatever the system has.
     found = []
     if variable := os.environ.get(LIBRARY_VARIABLE):
         found.append(Candidate(LIBRARY_VARIABLE, variable))
@@ -101,6 +102,7 @@ def _system_libraries() -> list[str]:
     folders = ["/usr/lib", "/usr/lib64", "/usr/local/lib", *map(str, Path("/usr/lib").glob("*-linux-gnu"))]
     folders += map(str, Path("/usr/lib").glob("llvm-*/lib"))
     versions: dict[str, tuple[int, ...]] = {}
+    # File names tell the version: libLLVM-19.so.1, libLLVM.so.19.1.
     for folder in folders:
         for path in Path(folder).glob("libLLVM*.so*"):
             if match := re.fullmatch(
@@ -115,6 +117,7 @@ def _system_libraries() -> list[str]:
 
 def probe(candidate: Candidate) -> Candidate:
     """Try a library in a child process; return it with the verdict, cached per file (path, size, time of change)."""
+    # Paths that need no child process.
     path = Path(candidate.path)
     if path.is_dir():
         verdict = "is a folder; must be the file libLLVM.so itself"
@@ -141,6 +144,7 @@ def _run_probe(path: str) -> str:
         return f"{UNTRIED} ({type(error).__name__})"
     if "simtest-probe-ok" in child.stdout:
         return "ok"
+    # Aborted: too old. Another signal: nothing is known. Else its own message.
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     if child.returncode == -signal.SIGABRT:
         return "aborts the process when a kernel is compiled; too old for Dr.Jit"

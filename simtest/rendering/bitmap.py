@@ -11,17 +11,7 @@ from simtest.runtime.resources import shown
 
 
 def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None:
-    """Write a float32 OpenEXR file.
-
-    Parameters
-    ----------
-    path : Path
-        Ends in .exr.
-    image : ndarray of float32, shape (H, W) or (H, W, 3)
-        Linear values.
-    variant : str, optional
-        Mitsuba variant.
-    """
+    """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
     mi = backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
     bitmap.write(str(path))

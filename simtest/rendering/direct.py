@@ -64,21 +64,7 @@ class DirectLight:
         dr.make_opaque(self.values)
 
     def radiance(self, scene: Any, material: Material, si: Any) -> tuple[Any, Any]:
-        """Compute the radiance off the lobe and off the base at surface points.
-
-        Parameters
-        ----------
-        scene : mitsuba.Scene
-            For the shadow rays.
-        material : Material
-            The surface's.
-        si : mitsuba.SurfaceInteraction3f
-            The points.
-
-        Returns
-        -------
-        specular, diffuse : mitsuba.Spectrum
-        """
+        """Compute the radiance off the lobe and the base, mitsuba.Spectrum, at surface points, with shadow rays."""
         import drjit as dr
 
         mi = self.mi

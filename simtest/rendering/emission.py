@@ -53,6 +53,7 @@ def kind_of(light: LightSpec) -> LightKind:
 
 def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
     """Return the emitter's parameters by name; position, mm, and unit axis, shape (3,), are in the model frame."""
+    # Angles in radians.
     values = {
         "position": mi.Point3f(*position.tolist()),
         "axis": mi.Vector3f(*axis.tolist()),
@@ -68,23 +69,7 @@ def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDi
 
 
 def factor(mi: Any, kind: LightKind, values: MitsubaDict, away: Any) -> Any:
-    """Compute the emission into unit directions away from a light, relative to that along its axis.
-
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    kind : LightKind
-        The light's.
-    values : MitsubaDict
-        Its `parameters`.
-    away : mitsuba.Vector3f
-        Unit directions.
-
-    Returns
-    -------
-    mitsuba.Float
-    """
+    """Compute the emission, mitsuba.Float, into unit directions away from a light, relative to that along its axis."""
     import drjit as dr
 
     if kind.profile == "uniform" and not kind.spot:
@@ -166,6 +151,7 @@ def _make_class(mi: Any, variant: str) -> Any:
             dr.make_opaque(self.parts)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+            # A point light has one direction, of density 1.
             ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
             towards = self.parts["position"] - it.p
             squared = dr.squared_norm(towards)

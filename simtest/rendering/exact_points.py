@@ -13,18 +13,9 @@ _OF_POINTS = ("position", "normal", "k_min", "k_max", "direction_min", "directio
 
 
 def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
-    """Trace rays against the rendered shape.
+    """Trace rays, shape (N, 3), model frame, mm, against the rendered shape, the scene's only surface.
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    scene : mitsuba.Scene
-        Holds one surface.
-    shape : Shape
-        That surface.
-    origins, directions : ndarray, shape (N, 3)
-        Model frame, mm; unit directions, NaN where there is no ray.
+    Directions are unit, NaN where there is no ray.
 
     Returns
     -------
@@ -52,6 +43,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
     valid = si.is_valid()
     normals = (mi.Vector3f(si.sh_frame.n), mi.Vector3f(si.n))
     dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
+    # Back to arrays; a miss becomes NaN.
     missed = ~np.array(valid)
     hits = pack_hits(
         np.where(missed, np.nan, np.array(preliminary.t)),

@@ -76,21 +76,9 @@ def misfit(position: Array, normal: Array, light: Array) -> Array:
 
 
 def find(session: Caster, radiance: Radiance, stride: int) -> list[HighlightPoint]:
-    """Find the highlight points of all lights in view.
+    """Find the highlight points of all lights in view, the brightest first.
 
-    Parameters
-    ----------
-    session : Caster
-        Casts exact rays.
-    radiance : Radiance
-        Of the same frame.
-    stride : int
-        Spacing of the seeds' grid, px.
-
-    Returns
-    -------
-    list of HighlightPoint
-        The brightest first.
+    `radiance` is that of the same frame; the seeds' grid has a spacing of `stride` px.
     """
     camera = session.camera
     lights = session.scene.rig.true_mm()
@@ -165,6 +153,7 @@ def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> A
     _, _, step_x, step_y = _newton_steps(misfit(points.position, points.normal, light).reshape(height, width, 2))
     with np.errstate(invalid="ignore"):
         near = np.hypot(step_x, step_y) < NEAR_CELLS
+    # Streaks are no points.
     gain = np.minimum(np.abs(1 + points.distance * points.k_min), np.abs(1 + points.distance * points.k_max))
     near &= gain.reshape(height, width) > MIN_GAIN
     seeds = pixels[near] - stride * np.stack([step_x[near], step_y[near]], axis=1)
@@ -173,6 +162,7 @@ def _seeds(pixels: Array, points: SurfacePoints, light: Array, stride: int) -> A
 
 def _newton(session: Caster, seeds: Array, light: Array) -> Array:
     """Refine seeds to zeros of the misfit; return those that converged, shape (M, 2), px."""
+    # Active seeds take a Newton step with derivatives from a stencil of five rays.
     position = seeds.copy()
     step_length = np.full(len(position), np.inf)
     offsets = DIFFERENCE_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -206,6 +196,7 @@ def _newton(session: Caster, seeds: Array, light: Array) -> Array:
 def _distinct(points: Array) -> Array:
     """Keep one of the points that lie within half a pixel of each other."""
     kept: list[Array] = []
+    # Hash points into cells, so that only neighbours are compared.
     cells: dict[tuple[int, int], list[Array]] = {}
     for point in points[np.isfinite(points).all(axis=1)]:
         cell = (int(point[0] // SAME_PX), int(point[1] // SAME_PX))
@@ -219,6 +210,7 @@ def _distinct(points: Array) -> Array:
 def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[HighlightPoint]:
     points, _, _ = session.cast(solutions)
     lit = session.lit(points.position, light)
+    # Radiance at the pixel that holds the point.
     total = radiance.intensity
     columns = np.clip(solutions[:, 0].astype(int), 0, session.camera.width - 1)
     rows = np.clip(solutions[:, 1].astype(int), 0, session.camera.height - 1)

@@ -65,6 +65,7 @@ class Refinement:
             weights = mi.Vector3d(*_ROUND[self.shape.kind])
             t = self._root(weights, o, d, mi.Float64(si.t))
             gradient = weights * (o + t * d)
+        # Normals transform by the inverse transpose.
         normal = dr.normalize(self._normals @ gradient) * (-1.0 if self.shape.flip else 1.0)
         # Replace Mitsuba's values where the solution is the same hit.
         found = si.is_valid() & dr.isfinite(t) & (dr.abs(mi.Float(t) - si.t) < SAME_HIT * si.t)

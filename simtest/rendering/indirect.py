@@ -25,20 +25,10 @@ class Bounces:
         self._integrator = mi.load_dict({"type": "path", "max_depth": path_depth - 1, "rr_depth": path_depth})
 
     def radiance(self, si: Any, count: int, block: int, sample: int) -> Any:
-        """Sample the radiance that surface points send back after two or more bounces.
+        """Sample the radiance, mitsuba.Spectrum, that `count` surface points send back after two or more bounces.
 
-        Parameters
-        ----------
-        si : mitsuba.SurfaceInteraction3f
-            The points.
-        count : int
-            How many there are.
-        block, sample : int
-            Index of the launch in the frame and of the sample in each pixel: each pair has its own random numbers.
-
-        Returns
-        -------
-        mitsuba.Spectrum
+        `block` is the index of the launch in the frame, `sample` that of the sample in each pixel: each pair has its
+        own random numbers.
         """
         import drjit as dr
 

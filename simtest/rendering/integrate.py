@@ -144,6 +144,7 @@ class Tracer:
 
     def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
         """Split a pixel's samples into the runs of single launches."""
+        # Bounces draw new random numbers for each sample, other cameras unproject on the host: one sample a launch.
         looped = bounces is None and self.sightlines.in_kernel
         step = max(1, min(SUMMED, RAYS // count)) if looped else 1
         for start in range(0, samples, step):

@@ -14,16 +14,9 @@ AnyReflectance = PhongReflectance | RoughPlasticReflectance | PrincipledReflecta
 
 
 def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> MitsubaDict:
-    """Describe a reflectance to `mi.load_dict`.
+    """Describe a reflectance to `mi.load_dict`; `phong_plugin` is the registered name of the Phong plugin.
 
-    Parameters
-    ----------
-    reflectance : reflectance model
-        From the scene.
-    phong_plugin : str
-        Name under which the Phong plugin is registered.
-    diffuse_only : bool
-        Leave out the specular part. The difference between both radiances is the specular one.
+    With `diffuse_only` the specular part is left out: the difference between both radiances is the specular one.
     """
     specular = 0.0 if diffuse_only else 1.0
     base = {"type": "rgb", "value": [reflectance.diffuse * c for c in reflectance.colour]}
@@ -51,6 +44,7 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
                 "roughness": {"type": "uniform", "value": reflectance.roughness},
                 "specular": 0.5 * specular,
             }
+        # A rough conductor has no base of its own: a matt one is blended in.
         case RoughConductorReflectance():
             return {
                 "type": "blendbsdf",

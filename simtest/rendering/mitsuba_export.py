@@ -47,23 +47,9 @@ _LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "di
 
 
 def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
-    """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply.
+    """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply (see `simtest.export`).
 
     The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    out : Path
-        Folder, made if need be.
-    variant : str, optional
-        Mitsuba variant that parses the scene; the files are the same for all.
-
-    Returns
-    -------
-    list of Path
-        The files.
 
     Raises
     ------
@@ -129,6 +115,7 @@ def _cut_to_view(shape: Shape, surface: SurfaceModel, camera: Camera) -> Shape:
     """
     if shape.kind != "plane":
         return shape
+    # Where the sightlines of the frame's corners meet the plane z = 0.
     pose = surface.model_from_camera
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
     directions = camera.unproject(corners) @ pose[:3, :3].T
@@ -142,6 +129,7 @@ def _cut_to_view(shape: Shape, surface: SurfaceModel, camera: Camera) -> Shape:
 
 def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
     camera = scene.camera.model()
+    # Clipping planes by the size of the scene.
     if shape.mesh:
         scale = float(np.linalg.norm(np.ptp(shape.mesh.vertices, axis=0)))
     else:
@@ -193,6 +181,7 @@ def _lights(scene: Scene, surface: SurfaceModel) -> MitsubaDict:
 
 
 def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
+    # Describe.
     bsdf = bsdf_dict(scene.reflectance, plugin, diffuse_only=False)
     effort = scene.render
     described = {
@@ -212,6 +201,7 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
     # Replace the transforms, add the comment at the head.
     root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
+    # A mesh is stored in the model frame already.
     if not shape.mesh:
         _set_transform(root, "shape", shape.parameters["to_model"])
     root.insert(0, ET.Comment(_head(scene)))

@@ -41,6 +41,7 @@ def _clearances(surface: SurfaceModel, positions: Array) -> Array:
 
 def _advice(rig: Rig, surface: SurfaceModel, light: int) -> str:
     """Name what to change where a light's nominal position is free and only the drawn one lies in the body."""
+    # No advice on the draw where the nominal position itself lies in the body.
     deviation = rig.lights[light].position_error_mm
     if deviation == 0 or not _clearances(surface, rig.nominal_mm())[light] > 0:
         return ""

@@ -123,6 +123,7 @@ class Sightlines:
         start, salt = mi.UInt32(first), mi.UInt32(seed)
         dr.make_opaque(start, salt)
         index = dr.arange(mi.UInt32, count) + start
+        # Lane -> pixel: tile by tile, within a tile row by row.
         if tiled:
             cell, tile = index & (TILE * TILE - 1), index // (TILE * TILE)
             tile_row = tile // self._tiles
@@ -153,6 +154,7 @@ class Sightlines:
         active = mi.Bool(True)
         # Sightlines, camera frame.
         if self.in_kernel:
+            # K^-1 (x, y, 1).
             n = self._numbers
             b = (mi.Float64(y) - n["cy"]) * n["fy"]
             a = (mi.Float64(x) - n["cx"] - n["skew"] * b) * n["fx"]

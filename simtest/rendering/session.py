@@ -93,11 +93,6 @@ class Session:
     def update(self, scene: Scene) -> None:
         """Move to another scene; update only what changed, and rebuild only another structure.
 
-        Parameters
-        ----------
-        scene : Scene
-            The next scene.
-
         Raises
         ------
         InputError
@@ -150,11 +145,13 @@ class Session:
         self.rebuilds += 1
         reflectance = self.scene.reflectance
         shape = make_shape(self.mi, self._shape, bsdf_dict(reflectance, self.plugin, diffuse_only=False))
+        # Surface and lights; `_apply` writes the values of the lights.
         kinds = (emission.kind_of(light) for light in self.scene.rig.lights)
         lights = {f"light_{i}": emission.emitter_dict(kind) for i, kind in enumerate(kinds)}
         # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
         # would share a parameter, and an update of one would change both.
         scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
+        # The base alone, where the BSDF cannot evaluate its parts separately.
         base = None
         if not parts_alone(reflectance):
             base = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True), optimize=False)
@@ -192,35 +189,17 @@ class Session:
     # Radiance ----------------------------------------------------------------------------------------------------
 
     def radiance(self, progress: Progress | None = None) -> Radiance:
-        """Render the frame.
+        """Render the frame; `progress` is called after each launch, and what it raises stops the frame only.
 
-        Parameters
-        ----------
-        progress : callable, optional
-            Called after each part of the work (see `simtest.rendering.integrate.Progress`); what it raises stops the
-            frame and leaves the session as it was.
-
-        Returns
-        -------
-        Radiance
-            With one sample a pixel: the value on the ray through each pixel's centre; with more: the mean over the
-            pixel's area. The same scene and seed give the same bytes.
+        With one sample a pixel the radiance is that on the ray through each pixel's centre, with more the mean over the
+        pixel's area. The same scene and seed give the same bytes.
         """
         return self._render(None, progress)[0]
 
     def frame(self, progress: Progress | None = None) -> Frame:
         """Render the frame with the labels of the rendered shape, in one pass where it has one sample a pixel.
 
-        The exact truth that `truth` computes afterwards starts from the same hits.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            See `radiance`.
-
-        Returns
-        -------
-        Frame
+        The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
         """
         radiance, channels = self._render(self._shape_labels(), progress)
         self._centre = channels
@@ -234,6 +213,7 @@ class Session:
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
         effort, tracer = self.scene.render, self._tracer()
+        # Direct light is traced here; a path depth above 2 adds bounces.
         bounces = None
         if effort.path_depth > 2:
             bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
@@ -260,12 +240,7 @@ class Session:
     # Ground truth ------------------------------------------------------------------------------------------------
 
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixels onto the exact surface.
-
-        Parameters
-        ----------
-        points_px : ndarray, shape (N, 2)
-            Pixel positions.
+        """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
 
         Returns
         -------
@@ -277,17 +252,9 @@ class Session:
         return self._cast(*self.sightlines.in_model(points_px))
 
     def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
-        """Cast rays through pixels onto the rendered shape.
+        """Cast rays through pixel positions, shape (N, 2), onto the rendered shape.
 
-        Parameters
-        ----------
-        points_px : ndarray, shape (N, 2)
-            Pixel positions.
-
-        Returns
-        -------
-        position, normal : ndarray, shape (N, 3)
-            Points, mm, and shading normals, camera frame; NaN where the ray misses.
+        Returns points, mm, and shading normals, shape (N, 3), camera frame; NaN where the ray misses.
         """
         hits, shading, _ = self._hits(*self.sightlines.in_model(points_px))
         distance = np.where(np.isfinite(hits.distance), hits.distance, np.nan)
@@ -335,6 +302,7 @@ class Session:
         # A light at the camera reaches all that is seen.
         if is_at_camera(source):
             return emitted
+        # Shadow rays from the light.
         pose = self.surface.model_from_camera
         origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
         hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)

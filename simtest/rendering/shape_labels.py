@@ -41,28 +41,16 @@ class ShapeLabels:
         self.mi, self._shape, self._curved = mi, shape, curved
         self._operators = None
         if shape_operators is not None:
+            # S is symmetric: six numbers a vertex.
             rows, columns = np.triu_indices(3)
             upper = np.ascontiguousarray(shape_operators[:, rows, columns], dtype=np.float32)
             self._operators = mi.Float(upper.ravel())
 
     def trace(self, preliminary: Any, si: Any, rays: Rays, rotation: Any) -> list[Any]:
-        """Compute the channels at the hits.
+        """Compute the channels at the hits (see `CHANNELS`); NaN where there is no surface.
 
-        Parameters
-        ----------
-        preliminary : mitsuba.PreliminaryIntersection3f
-            The hits.
-        si : mitsuba.SurfaceInteraction3f
-            Of the same hits, with all derivatives.
-        rays : Rays
-            The rays.
-        rotation : mitsuba.Matrix3f
-            From the model frame to the camera frame.
-
-        Returns
-        -------
-        list of mitsuba.Float
-            See `CHANNELS`; NaN where there is no surface.
+        `si` are the surface points of the hits, with all derivatives; `rotation` leads from the model frame to the
+        camera frame.
         """
         import drjit as dr
 
@@ -77,6 +65,7 @@ class ShapeLabels:
             # Eigenvalues of the second fundamental form [[a, b], [b, c]].
             mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
             curvatures = [facing * mean - half, facing * mean + half]
+        # Misses are NaN; triangle and position in it travel as they are.
         position = rays.sightline * si.t
         channels = [si.t, *position, *shading, *geometric, *curvatures]
         channels = [dr.select(seen, channel, dr.nan) for channel in channels]

@@ -9,22 +9,7 @@ from simtest.surfaces import Shape, TriangleMesh
 
 
 def make_shape(mi: Any, shape: Shape, bsdf: MitsubaDict) -> Any:
-    """Make a shape for `mi.load_dict`.
-
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    shape : Shape
-        In the model frame.
-    bsdf : MitsubaDict
-        Its material.
-
-    Returns
-    -------
-    MitsubaDict or mitsuba.Mesh
-        The description of an analytic shape, or a mesh with the vertex normals given.
-    """
+    """Make a shape for `mi.load_dict`: a description of an analytic shape, or a mesh with the given vertex normals."""
     if shape.mesh is not None:
         return _make_mesh(mi, shape.mesh, bsdf)
     plugin = {"plane": "rectangle", "sphere": "sphere", "cylinder": "cylinder"}[shape.kind]

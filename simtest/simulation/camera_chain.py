@@ -22,6 +22,7 @@ def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
 
     The camera gives each pixel's angle from the optical axis. The point spread mirrors the frame at its borders.
     """
+    # Point spread, then vignetting.
     light = smooth(radiance, sensor.point_spread_px)
     vignetting = sensor.vignetting.model()
     if vignetting.is_uniform:
@@ -60,6 +61,7 @@ def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Gene
 
 def encode(frame: npt.NDArray[np.float32], sensor: Sensor) -> Image:
     """Clip a linear frame to full scale, apply the response and quantise."""
+    # Saturation and response, then quantisation.
     values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0))
     if sensor.bits is not None:
         largest = 2**sensor.bits - 1
@@ -71,6 +73,7 @@ def _electrons(frame: Image, full_well: float, read_noise: float, rng: np.random
     """Count electrons, Poisson about the light's mean, and add the normal noise of the readout; share of full scale."""
     if rng is None:
         raise ValueError("shot noise needs a generator")
+    # Shot noise: beyond `MAX_COUNT` the mean stands for itself.
     mean = np.maximum(frame.astype(float), 0.0) * full_well
     counts = np.where(mean > MAX_COUNT, mean, rng.poisson(np.minimum(mean, MAX_COUNT)))
     if read_noise > 0:

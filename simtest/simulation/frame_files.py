@@ -34,22 +34,7 @@ FIELDS = {
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where more is known.
 
-    Parameters
-    ----------
-    frame : LabelledFrame
-        What to write.
-    out : Path
-        Folder, made if need be.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
+    The folder is made if need be; `InputError` is raised if it cannot be written. Returns the files.
     """
     files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
     make_folder(out)
@@ -82,6 +67,7 @@ def _png_bits(sensor: Sensor) -> int:
 def _calibration_file(scene: Scene) -> str:
     """Return the calibration file of frame.png, as `simtest reconstruct --camera` reads it."""
     sensor = scene.sensor
+    # Only what the scene says is known (`sensor.*_known`).
     stated: dict[str, dict[str, Json]] = {"camera": scene.camera.model_dump(exclude_none=True)}
     if not sensor.encodes:
         stated["response"] = {"type": "srgb"}
@@ -91,6 +77,7 @@ def _calibration_file(scene: Scene) -> str:
         stated["vignetting"] = sensor.vignetting.model_dump()
     if (profile := scene.rig.known_emission()) is not None:
         stated["emission"] = profile.model_dump()
+    # Noise and quantisation.
     electrons = {"full_well": sensor.full_well, "read_noise": sensor.read_noise} if sensor.full_well else {}
     bits = (sensor.bits or _png_bits(sensor)) if sensor.encodes else 8
     stated["sensor"] = {**electrons, "bits": bits, "saturation_level": 1.0}
@@ -105,6 +92,7 @@ def encoded_png(image: npt.NDArray[np.float32], sensor: Sensor) -> bytes:
         picture = np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind)
     else:
         picture = to_uint8(image)
+    # OpenCV wants blue first.
     ok, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[:, :, ::-1])
     assert ok
     return bytes(encoded)

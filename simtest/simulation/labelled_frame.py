@@ -48,20 +48,7 @@ class LabelledFrame:
 
 
 def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
-    """Render a labelled frame.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene; ``sensor.seed`` draws its noise.
-    variant : str, optional
-        Mitsuba variant.
-    progress : callable, optional
-        Called after each part of the rendering: samples done, samples in all, and what is done.
-
-    Returns
-    -------
-    LabelledFrame
+    """Render a labelled frame (see `simtest.render`).
 
     Raises
     ------

@@ -53,21 +53,7 @@ class RenderedView:
 
 
 def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
-    """Move a session to a scene, render it and judge its highlights.
-
-    Parameters
-    ----------
-    session : Session
-        Is moved to the scene.
-    scene : Scene
-        The scene.
-    radiance : Radiance, optional
-        Of the scene, where it is rendered already.
-
-    Returns
-    -------
-    RenderedView
-    """
+    """Move a session to a scene, render it, unless its radiance is given, and judge its highlights."""
     session.update(scene)
     if radiance is None:
         radiance = session.radiance()
@@ -90,6 +76,7 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
     if peak <= 0:
         warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=3)
         return 0.0
+    # Fixed by the scene, or by a percentile of the frame, or by its brightest isolated highlight.
     if exposure.full_scale is not None:
         radiance = exposure.full_scale
     elif exposure.percentile is not None:
@@ -102,7 +89,7 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
             )
             radiance = peak
     else:
-        # The brightest isolated highlight; which ones are isolated is judged without noise first.
+        # Which highlights are isolated is judged without noise first.
         isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen) if h.isolated]
         radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
     return radiance / exposure.gain

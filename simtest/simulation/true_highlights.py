@@ -80,24 +80,19 @@ def judge(
     points : list of HighlightPoint
         All points where the normal bisects light and camera.
     light : ndarray of float32, shape (H, W)
-        Noise-free radiance behind the lens, mean of the channels.
+        Noise-free radiance behind the lens, mean of `channels` channels.
     noise : NoiseModel
         Of one channel.
     full_scale : float
         Radiance at full scale; 0 where there is no light at all.
-    channels : int
-        How many channels were averaged.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
-
-    Returns
-    -------
-    list of TrueHighlight
-        In the same order.
     """
+    # The maximum that each point makes in the frame as detectors see it, and whose it is.
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
     peaks = [_peak_pixel(smoothed, point) for point in points]
     owners = _owners(points, peaks)
+    # Verdicts.
     highlights = []
     for point, peak in zip(points, peaks, strict=True):
         sigma = float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale if full_scale > 0 else 0.0
@@ -109,19 +104,8 @@ def judge(
 def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
     """Return the pixels above half height of the maximum that a highlight point makes.
 
-    Parameters
-    ----------
-    point : HighlightPoint
-        The highlight.
-    smoothed : ndarray of float32, shape (H, W)
-        Noise-free smoothed light.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the camera's view mask; default all.
-
-    Returns
-    -------
-    Component or None
-        None where a higher maximum lies in it.
+    None where a higher maximum lies in it. `smoothed` is the noise-free smoothed light, shape (H, W); `seen` are the
+    pixels inside the camera's view mask, default all.
     """
     return half_height_component(smoothed, *_peak_pixel(smoothed, point), seen)
 

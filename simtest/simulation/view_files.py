@@ -56,6 +56,7 @@ class ViewWriter:
         shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
         if self._film_wanted:
             self._write(shown)
+        # Thumbnails for the sheet.
         width = SHEET_WIDTH // SHEET_COLUMNS
         small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
         self._thumbnails.append(np.asarray(small, dtype=np.uint8))

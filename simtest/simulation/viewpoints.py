@@ -107,7 +107,7 @@ def sample_views(
     write: Callable[[RenderedView], WrittenView] | None = None,
     keep_all: bool = False,
 ) -> SampledViews:
-    """Try viewpoints one after the other until enough of them show an isolated highlight.
+    """Try viewpoints one after the other until `count` of them show an isolated highlight, or none is left.
 
     Parameters
     ----------
@@ -126,11 +126,6 @@ def sample_views(
     keep_all : bool
         Keep every view, whatever it shows: a sequence.
 
-    Returns
-    -------
-    SampledViews
-        With fewer than `count` views where the viewpoints ran out.
-
     Raises
     ------
     InputError
@@ -142,9 +137,11 @@ def sample_views(
     kept: list[SampledView] = []
     rejected: Counter[str] = Counter()
     for viewpoint in viewpoints:
+        # Render.
         moved = scene.model_copy(update={"surface": scene.surface.model_copy(update={name: viewpoint})})
         session = session or Session(moved, variant)
         view = render_view(session, moved)
+        # Keep, or count the reason.
         isolated = sum(highlight.isolated for highlight in view.highlights)
         if isolated or keep_all:
             pose = session.surface.model_from_camera

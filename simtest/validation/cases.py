@@ -96,14 +96,16 @@ class Case:
         InputError
             If a swept or drawn value does not fit the schema.
         """
+        # Drawn values.
         rng = generator(experiment.seed, experiment.name, self.name, realisation, Stage.SWEEP)
         drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
         data = apply_settings(self.data, drawn, self.where) if drawn else self.data
         scene = scene_from_dict(data, self.where)
-        # Seeds of what else is random: the renderer's samples, and the rig's deviations.
+        # Seeds of what else is random: the renderer's samples, which realisations of one scene share, ...
         if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
             seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
             scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
+        # ... and the rig's deviations, which they do not.
         if scene.rig.is_drawn:
             seed = integer(experiment.seed, experiment.name, self.name, realisation, Stage.RIG)
             scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"seed": seed})})
@@ -116,11 +118,9 @@ class Case:
     def reproduce_command(self, experiment: Experiment, realisation: int) -> str:
         """Return the command that renders a realisation's frame alone."""
         scene, drawn = self.scene(experiment, realisation)
-        values: dict[str, Json] = {
-            **self.settings,
-            **drawn,
-            "sensor.seed": self.noise_seed(experiment, realisation),
-        }
+        noise = self.noise_seed(experiment, realisation)
+        values: dict[str, Json] = {**self.settings, **drawn, "sensor.seed": noise}
+        # Seeds that `scene` has drawn.
         if scene.render.seed != self.data.get("render", {}).get("seed", 0):
             values["render.seed"] = scene.render.seed
         if scene.rig.is_drawn:
@@ -152,6 +152,7 @@ def expand(experiment: Experiment) -> list[Case]:
 
 def _check(case: Case, experiment: Experiment) -> None:
     """Raise `InputError` if a scene of a case is malformed; drawn ranges are tried at both ends."""
+    # Published protocol: nothing is rendered.
     if case.is_paper:
         case.paper_setting()
         if case.random:
@@ -161,9 +162,11 @@ def _check(case: Case, experiment: Experiment) -> None:
     lows = {path: float(d.low) for path, d in case.random.items()}
     # The upper end itself is never drawn.
     highs = {path: max(math.nextafter(d.high, -math.inf), d.low) for path, d in case.random.items()}
+    # Each range alone and, where there are several, all together.
     ends = [{path: value} for tried in (lows, highs) for path, value in tried.items()]
     for values in ends if len(lows) < 2 else (*ends, lows, highs):
         scene_from_dict(apply_settings(case.data, values, case.where), case.where)
+    # An anatomy's recipe is read only when its mesh is made: check it here.
     if isinstance(first.surface, AnatomySurface) and (file := first.surface.file()).suffix == ".toml":
         load_recipe(file, first.surface.recipe_values)
 
@@ -176,8 +179,10 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
     cases = []
     for swept in _combinations(group.sweep):
         for part, pooled in enumerate(_combinations(group.pool)):
+            # Scene.
             values = {**swept, **pooled}
             data = apply_settings(base, values, str(path))
+            # Names: pooled values are parts of one setting, so they are not in its name.
             label = group.label or ("published" if is_paper(data) else scene_from_dict(data, str(path)).surface.label)
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])
             columns = {key: _plain(value) for key, value in values.items()}

@@ -65,11 +65,12 @@ class ClosedScene:
 
     def _hit(self, sightlines: Array) -> tuple[Array, Array]:
         """Compute distance, mm, and cosine between normal and view along unit sightlines, shape (..., 3)."""
+        # Plane.
         along = sightlines @ self.sightline
         if not self.kd:
             return DISTANCE_MM / along, along
         radius = DISTANCE_MM / self.kd
-        # The cylinder runs along y, its axis lies behind the brightest point.
+        # Cylinder along y; its axis lies behind the brightest point. Nearer root of a quadratic in the distance.
         across = 1 - sightlines[..., 1] ** 2
         reach = (DISTANCE_MM + radius) * along
         under = reach**2 - across * ((DISTANCE_MM + radius) ** 2 - radius**2)
@@ -102,7 +103,7 @@ class ClosedScene:
         phase = np.linspace(0, 2 * np.pi, CONTOUR_POINTS, endpoint=False)
         directions = np.stack([np.cos(phase), np.sin(phase)], axis=1)
         peak, level = CAMERA.project(self.sightline), isovalue * self.radiance(self.sightline)
-        # Bisection along rays from the peak.
+        # Bisect along rays from the peak.
         low, high = np.zeros(CONTOUR_POINTS), np.full(CONTOUR_POINTS, REACH_PX)
         for _ in range(HALVINGS):
             middle = (low + high) / 2
@@ -224,6 +225,7 @@ def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung
     noisy = [_whole(frame, DEFAULT_SMOOTHING_PX)[0] for frame in frames]
     smoothed, _ = _whole(clean, DEFAULT_SMOOTHING_PX)
     sharp, patch = _whole(clean, 0.0)
+    # Its contours replaced by the exact ones.
     exact = None if isinstance(patch, Failure) else ExactPatch.of(patch, scene)
     # Rungs: the candidates that each replaced input leads to.
     for name, estimator in ESTIMATORS.items():

@@ -29,12 +29,6 @@ class Part:
 
     Parameters
     ----------
-    experiment : Experiment
-        Name, seed and estimators.
-    case : Case
-        The case.
-    numbers : range
-        Which of its realisations.
     swept : mapping
         An example of each swept value of the experiment, for the columns' types.
     item : Path or None
@@ -66,6 +60,7 @@ def parts_of(
     experiment: Experiment, case: Case, swept: Mapping[str, Value], item: Path | None, variant: str | None
 ) -> list[Part]:
     """Split a case into parts: the published protocol into chunks, a rendered case not at all."""
+    # A rendered case shares its view between realisations; the protocol's realisations have nothing in common.
     numbers = case.numbers()
     size = PAPER_CHUNK if case.is_paper else max(1, len(numbers))
     return [

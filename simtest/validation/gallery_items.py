@@ -51,18 +51,14 @@ class DrawnIsophote(TypedDict):
 
 @dataclass(frozen=True)
 class DrawnEstimate:
-    """An estimator's answer at one detection; without `answered` it has none.
+    """An estimator's answer at one detection; `answered` fills in what follows the estimator's name.
 
     Parameters
     ----------
-    specularity : int
-        Index of the detection.
-    true_id : int or None
-        Of the true highlight that it was matched to.
+    specularity, true_id : int
+        Index of the detection, and of the true highlight that it was matched to, if any.
     bp_px : list of float or None
         The detection's peak, px.
-    estimator : str
-        Name.
     """
 
     specularity: int
@@ -126,12 +122,8 @@ class GalleryMeta:
         Noise, share of full scale.
     command : str
         Reproduces the item.
-    camera : Camera
-        Of the frame.
-    truth : sequence of DrawnTruth
-        The highlights that count.
-    estimates : sequence of DrawnEstimate
-        One for each detection and estimator.
+    camera, truth, estimates
+        Calibration, the highlights that count, and the answers at each detection.
     lights : list of list of float, optional
         Positions, camera frame, mm.
     why : str, optional
@@ -167,24 +159,9 @@ class GalleryMeta:
 def save(
     path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation, why: str | None = None
 ) -> None:
-    """Write the gallery item of a realisation.
-
-    Parameters
-    ----------
-    path : Path
-        The .npz file.
-    session : Session
-        At the realisation's scene.
-    experiment : Experiment
-        Of the case.
-    case : Case
-        Its setting.
-    made : Realisation
-        The frame and the estimates.
-    why : str, optional
-        Why it is kept.
-    """
+    """Write the gallery item of a realisation, at whose scene the session must be; `why` says why it is kept."""
     camera, scene = session.camera, made.view.scene
+    # Thinned maps: enough for arrows and the 3D view.
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
     meta = GalleryMeta(
         surface=scene.surface.label,
@@ -214,20 +191,10 @@ def write_item(
     normal: npt.ArrayLike,
     **pictures: npt.ArrayLike,
 ) -> None:
-    """Write the file of one gallery item.
+    """Write the .npz file of one gallery item.
 
-    Parameters
-    ----------
-    path : Path
-        The .npz file.
-    meta : GalleryMeta
-        All that is no picture.
-    frame : ndarray, shape (H, W) or (H, W, 3)
-        Share of full scale.
-    position, normal : ndarray, shape (h, w, 3)
-        Thinned truth, camera frame; NaN where there is no surface.
-    **pictures : ndarray
-        Further pictures.
+    `frame`, shape (H, W) or (H, W, 3), is a share of full scale; position and normal, shape (h, w, 3), are the thinned
+    truth, camera frame, NaN where there is no surface. Further pictures are stored by their names.
     """
     # Half precision is enough to look at; the frame is stored wider, since it is read back as it is.
     content = {"frame": np.asarray(frame).astype(np.float16).astype(np.float32)}

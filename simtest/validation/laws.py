@@ -103,6 +103,7 @@ def axis_ratio_seen(
     `pixel` is the angle of a pixel at the BP, rad; 0: a picture without pixels. The ratio lies in (0, 1]; it is NaN
     where the isophote does not close.
     """
+    # Added to both squared half-axes.
     level = -2 * np.log(np.asarray(isovalue, float))
     s2 = np.asarray(smoothing_px, float) ** 2
     added = (level * s2 + (level - 1) * LINEAR_INTERPOLATION_PX2) * np.asarray(pixel, float) ** 2

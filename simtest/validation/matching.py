@@ -14,13 +14,6 @@ from simtest.rendering import HighlightPoint
 def match(specularities: Sequence[Specularity], truths: Sequence[HighlightPoint]) -> dict[int, int]:
     """Match each detection to the nearest true BP inside its isophote at t = 0.5 (theory.md section 6).
 
-    Parameters
-    ----------
-    specularities : sequence of Specularity
-        Detections.
-    truths : sequence of HighlightPoint
-        The highlights that count as true.
-
     Returns
     -------
     dict

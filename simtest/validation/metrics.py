@@ -40,20 +40,12 @@ def rows(
         At the scene; casts exact rays.
     common : ResultRow
         What all rows share: experiment, setting, realisation, seed, swept parameters.
-    specularities : sequence of Specularity
-        Detections with their estimates.
-    truths : sequence of TrueHighlight
-        The highlights that count as true.
+    specularities, truths : sequence
+        Detections with their estimates, and the highlights that count as true.
     matched : mapping
         Index of the truth by index of the detection.
-    estimators : sequence of str
-        Names, for the missed.
-    unfound : str
-        Status of the rows of truths that no detection found.
-
-    Returns
-    -------
-    list of ResultRow
+    estimators, unfound
+        Names and status for the rows of truths that no detection found.
     """
     made = []
     scene = session.scene
@@ -81,6 +73,7 @@ def rows(
 
 def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> ResultRow:
     """Fill in the scene and, unless the detection is false, the true highlight."""
+    # Scene.
     row = replace(
         common,
         surface=scene.surface.label,

@@ -28,10 +28,12 @@ def law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> floa
     camera for those that take the reversed sightline for the normal; for others, which were told a distance, the
     effect of the distance's error.
     """
+    # Offset light and unknown falloff together: no law.
     light = scene.rig.true_mm()[highlight.light]
     offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
     if power is None or (offset and power > 0):
         return None
+    # Estimators of one candidate take the peak or the axis; two candidates come from circle pose.
     if len(estimate.candidates) == 1:
         if offset:
             return _offset_law_deg(scene, estimate, highlight, light)
@@ -87,6 +89,7 @@ def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint,
     """Predict the error of one candidate with a light beside the camera, deg."""
     if _reverses_sightline(scene, estimate):
         return float(np.degrees(laws.bisector_angle(highlight.position, light)))
+    # Others take the bisector at the distance that they were told.
     # With several lights the estimate may assume another light, and another distance, than the highlight's.
     told = scene.calibration(highlight.distance).priors.distance_mm
     if told is None or len(scene.rig.lights) > 1:
@@ -122,6 +125,7 @@ def _takes_ratio_as_seen(estimate: Estimate) -> bool:
 def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
     """Compute the angle of a pixel at a BP, rad: the root of its solid angle."""
     camera = scene.camera.model()
+    # Half a pixel along x and along y.
     steps = np.array([[0.5, 0.0], [0.0, 0.5]])
     ahead, behind = camera.unproject(highlight.bp_px + steps), camera.unproject(highlight.bp_px - steps)
     return float(np.sqrt(np.linalg.norm(np.cross(*(ahead - behind)))))
@@ -137,6 +141,7 @@ def look_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) ->
         return None
     look = scene.camera.model().unproject(estimate.look_px)
     sightline = highlight.position / np.linalg.norm(highlight.position)
+    # w: the miss across the true sightline, per unit distance along it.
     across = look / (look @ sightline) - sightline
     # The miss along the principal directions.
     first, second = highlight.direction_min, np.cross(highlight.normal, highlight.direction_min)

@@ -82,28 +82,9 @@ def realise(
     session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, float],
     estimators: Mapping[str, AnyEstimator],
 ) -> Realisation:  # fmt: skip
-    """Make one realisation of a case.
+    """Make one realisation of a case from its rendered view, at whose scene the session must be.
 
-    Parameters
-    ----------
-    session : Session
-        At the view's scene.
-    experiment : Experiment
-        For name and seed.
-    case : Case
-        The case.
-    number : int
-        Of the realisation.
-    view : RenderedView
-        The rendered scene.
-    drawn : mapping
-        Values drawn for this realisation, by key path.
-    estimators : mapping
-        Estimator by name.
-
-    Returns
-    -------
-    Realisation
+    `drawn` holds the values drawn for this realisation, by key path, and `estimators` the estimators by name.
     """
     seed = case.noise_seed(experiment, number)
     frame = view.frame(seed)

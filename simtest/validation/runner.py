@@ -32,6 +32,7 @@ from simtest.validation.statistics import summarise
 
 GALLERY_ITEMS = 18
 PARTS = "parts"
+"""Folder of the finished cases of a run that is not finished."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -62,18 +63,14 @@ class RunRecord:
 
     Parameters
     ----------
-    variant : str
-        Mitsuba variant.
-    llvm : str or None
-        The libLLVM in use.
+    variant, llvm : str
+        Mitsuba variant, and the libLLVM in use, if any.
     fingerprint : str
         Hash of everything that determines the results.
     seed, realisations : int
         The experiment's.
-    started : str
-        ISO 8601, UTC.
-    duration_s : float
-        Wall time.
+    started, duration_s
+        ISO 8601, UTC, and wall time.
     command : str
         How the run was called.
     inputs : dict
@@ -112,18 +109,8 @@ def run_experiment(
     folder : Path
         Made if need be. A folder that holds something other than a run is refused; the same run, finished, is
         returned as it is.
-    command : str
-        How the run was called, for the report.
-    variant : str, optional
-        Mitsuba variant.
-    progress : callable, optional
-        See `Progress`.
-    engine : Engine, optional
-        Who does the work; default this process. The rows do not depend on it.
-
-    Returns
-    -------
-    Run
+    command, variant, progress, engine
+        See `simtest.validate`; by default this process does the work. The rows do not depend on the engine.
 
     Raises
     ------
@@ -190,6 +177,7 @@ class _Job:
 
 def _job(experiment: Experiment, folder: Path, variant: str) -> _Job:
     cases = expand(experiment)
+    # Loaded in the workers; here to refuse unknown names.
     load_estimators(experiment.estimators)
     digest = _fingerprint(experiment, cases, variant)
     _check_folder(folder)
@@ -233,6 +221,7 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     case_of = [(job.folder, index) for job, index, _ in parts]
     waiting = Counter(case_of)
     made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {case: {} for case in waiting}
+    # Progress counts the realisations of earlier, stopped runs as done.
     done = total - sum(job.cases[index].realisations for job in jobs for index in missing[job.folder])
     name = parts[0][2].case.setting if parts else ""
 
@@ -244,6 +233,7 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
 
     if progress and parts:
         progress(done, total, name)
+    # Parts come back in any order.
     for number, rows in engine.run(make_rows, [part for *_, part in parts], step):
         folder, index = case = case_of[number]
         made[case][number] = rows
@@ -282,6 +272,7 @@ def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str
 
 def definition(experiment: Experiment, cases: list[Case]) -> str:
     """Return a hash of what an experiment is: itself, its scenes and its input files; not of code, versions, paths."""
+    # Names without folders: a moved checkout holds the same experiments.
     files = sorted((Path(name).name, digest) for name, digest in _inputs(cases).items())
     scenes = [case.data for case in cases]
     return _hash({"experiment": experiment.model_dump(mode="json"), "scenes": scenes, "inputs": files})
@@ -327,6 +318,7 @@ def _check_folder(folder: Path) -> None:
     try:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
+        # Leftovers of a killed run.
         held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
         for name in [name for name in held if re.fullmatch(r"\.(results|summary|index)\.\d+\.part\.\w+", name)]:
             held.pop(name).unlink()
@@ -334,6 +326,7 @@ def _check_folder(folder: Path) -> None:
             left.unlink()
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
+    # What is no part of a run.
     strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
@@ -362,7 +355,7 @@ def _inputs(cases: list[Case]) -> dict[str, str]:
     files = {Path(case.where) for case in cases}
     for case in cases:
         surface = case.data.get("surface", {})
+        # Meshes and recipes.
         if surface.get("type") == "anatomy":
-            path = AnatomySurface.model_validate(surface).file()
-            files.add(path)
+            files.add(AnatomySurface.model_validate(surface).file())
     return {str(file): provenance.file_hash(file) for file in sorted(files) if file.is_file()}

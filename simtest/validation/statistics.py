@@ -75,9 +75,11 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
 
 def figures(rows: pl.DataFrame) -> Figures:
     """Compute the figures of the rows of one setting and estimator."""
+    # Of the true highlights: answered, failed, missed.
     true = rows.filter(pl.col("true_id").is_not_null())
     answered = true.filter(pl.col("status") == "ok")
     failed = true.filter(~pl.col("status").is_in(["ok", "missed"]))["status"].value_counts()
+    # Errors of the answers, and the penalty of the others.
     errors = answered["error_deg"].to_numpy()
     penalised = np.concatenate([errors, np.full(true.height - len(errors), PENALTY_DEG)])
     distances = answered["mahalanobis2"].drop_nulls().to_numpy()

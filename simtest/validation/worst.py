@@ -23,19 +23,7 @@ _CELL = ("experiment", "label", "surface", "setting", "estimator")
 
 @dataclass(frozen=True)
 class WorstCase:
-    """A frame that is worth a look.
-
-    Parameters
-    ----------
-    experiment, setting : str
-        Where it belongs.
-    realisation : int
-        Number of the realisation.
-    estimator : str
-        Who missed.
-    why : str
-        A sentence with the error, and what was expected.
-    """
+    """A frame that is worth a look: the estimator that missed, and why, as a sentence with error and expectation."""
 
     experiment: str
     setting: str
@@ -67,6 +55,7 @@ def worst_cases(results: pl.DataFrame, worse: pl.DataFrame | None = None, most: 
     # Excess over what is expected. A law that is not finite predicts nothing, and would be sorted before all numbers.
     results = results.with_columns(error_law_deg=pl.when(pl.col("error_law_deg").is_finite()).then("error_law_deg"))
     expected = pl.coalesce("error_law_deg", pl.col("error_oracle_deg").median().over(_CELL))
+    # Only answers that were matched have an error.
     answered = (pl.col("status") == "ok") & pl.col("true_id").is_not_null() & pl.col("error_oracle_deg").is_finite()
     rows = results.filter(answered).with_columns(
         expected=expected, excess=pl.col("error_oracle_deg") - expected, row=pl.int_range(pl.len())
@@ -121,14 +110,9 @@ def save_worst(
     experiments : iterable of Experiment
         As they were run: name, seed and realisations.
     folder : Path
-        Where the .npz files go; made if need be.
+        Where the .npz files go, in the order of the cases; made if need be.
     variant : str, optional
         Mitsuba variant.
-
-    Returns
-    -------
-    tuple of Path
-        The files, in the order of the cases.
 
     Raises
     ------

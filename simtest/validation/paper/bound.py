@@ -23,12 +23,8 @@ def cramer_rao_bound(setting: PaperSetting) -> float | None:
     """Compute the bound on the RMS angle between estimated and true normal (theory.md section 2).
 
     The frame is c max(0, cos beta)^n on the slanted plane with white noise. Unknown are two tilts, the BP (two), the
-    scale of the scene, n and c. Scale and n are nearly degenerate, which does not affect the normal. Light at V.
-
-    Parameters
-    ----------
-    setting : PaperSetting
-        Its `eps`, `isovalue` and `smoothing_px` do not enter.
+    scale of the scene, n and c. Scale and n are nearly degenerate, which does not affect the normal. Light at V; the
+    setting's `eps`, `isovalue` and `smoothing_px` do not enter.
 
     Returns
     -------

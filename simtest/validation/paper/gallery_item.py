@@ -35,20 +35,7 @@ def save_realisation(path: Path, experiment: Experiment, case: Case, number: int
     """Write the gallery item of one realisation, with the pictures `texture`, `clean` and `smoothed`.
 
     The picture with noise is the item's frame: noise is drawn in and around the region of interest alone, as nothing
-    else of the frame is used.
-
-    Parameters
-    ----------
-    path : Path
-        The .npz file.
-    experiment : Experiment
-        For seed and estimators.
-    case : Case
-        Of the published protocol.
-    number : int
-        Of the realisation.
-    why : str, optional
-        Why it is kept.
+    else of the frame is used. `why` says why the item is kept.
     """
     setting, seed = case.paper_setting(), case.noise_seed(experiment, number)
     pipeline = pipeline_with(setting, experiment.estimators)

@@ -27,25 +27,10 @@ Columns = dict[str, list[Value]]
 def paper_rows(
     setting: PaperSetting, common: ResultRow, numbers: range, seeds: list[int], estimators: tuple[str, ...]
 ) -> pl.DataFrame:
-    """Make the rows of some realisations of one setting; runs in any process.
+    """Make the rows of some realisations of one setting, in their order; runs in any process.
 
-    Parameters
-    ----------
-    setting : PaperSetting
-        The setting.
-    common : ResultRow
-        What all rows share.
-    numbers : range
-        Numbers of the realisations.
-    seeds : list of int
-        A seed for each of them, which draws the light, then the noise.
-    estimators : tuple of str
-        Names; circle_pose is run at the setting's isovalue.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `SCHEMA` and of the swept parameters that are not null, in the order of the realisations.
+    `common` holds what all rows share; each realisation's seed draws the light, then the noise. The table has the
+    columns of `SCHEMA` and of the swept parameters that are not null.
     """
     pipeline = pipeline_with(setting, estimators)
     made = pipeline.realise(from_integer(seed) for seed in seeds)
