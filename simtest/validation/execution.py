@@ -10,7 +10,7 @@ import polars as pl
 
 from simtest.estimators import load_estimators
 from simtest.rendering import Session
-from simtest.runtime.engines import Tell
+from simtest.runtime.engines import OnStep
 from simtest.simulation.rendered_view import View, view
 from simtest.spec import Experiment, Scene
 from simtest.validation import gallery_items as gallery
@@ -88,7 +88,7 @@ def parts_of(
     ]
 
 
-def make_rows(part: Part, tell: Tell) -> pl.DataFrame:
+def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     """Make a part's rows.
 
     Parameters
@@ -111,7 +111,7 @@ def make_rows(part: Part, tell: Tell) -> pl.DataFrame:
     return table(_rendered(part, tell), part.swept)
 
 
-def _rendered(part: Part, tell: Tell) -> list[dict[str, Any]]:
+def _rendered(part: Part, tell: OnStep) -> list[dict[str, Any]]:
     experiment, case = part.experiment, part.case
     estimators, renderer = load_estimators(experiment.estimators), _renderer(part.variant)
     rows: list[dict[str, Any]] = []

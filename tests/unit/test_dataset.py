@@ -23,7 +23,7 @@ from simtest.dataset.verify import mend, verify
 from simtest.dataset.writer import write_dataset
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.cluster import cores_each
+from simtest.runtime.engines.cluster import cores_per_task
 from simtest.spec import load_dataset, scene_from_dict
 from simtest.spec.dataset import Dataset, Distribution, Splits
 from simtest.spec.toml_input import validate
@@ -551,7 +551,7 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
 )
 def test_no_task_asks_a_cluster_for_more_cores_than_a_node_has(cores, workers, each):
     nodes = [{"memory": 1e9} if count is None else {"CPU": float(count)} for count in cores]
-    assert cores_each(nodes, workers) == each
+    assert cores_per_task(nodes, workers) == each
 
 
 # Command line -------------------------------------------------------------------------------------------------------
