@@ -311,6 +311,7 @@ HOSTILE = {
     "many digits": (ROS_FILE.replace("438.78", "9" * 5000), "fx = inf: must be a finite number"),
     "only a comment": ("%YAML:1.0\n# nothing\n", "holds no keys"),
     "quotes": ("'" * 900_000, "holds no keys"),
+    "digits": ("a: " + "9" * 900_000 + "x", "image_width: missing"),
     "colons": (":" * 900_000, "line 1: mapping values are not allowed here"),
 }
 
@@ -329,11 +330,13 @@ def test_hostile_yaml_is_one_line(tmp_path, case):
 @settings(max_examples=300, deadline=2000, derandomize=True)
 @given(st.text(alphabet="ab1.-: \n\t[]{},&*!|>'\"%@`?#~<", max_size=60))
 def test_yaml_raises_value_errors_only(text):
+    said = "line "
     try:
         parse_yaml(text)
     except ValueError as error:
-        assert str(error).startswith("line ")
-        assert "\n" not in str(error)
+        said = str(error)
+    assert said.startswith("line ")
+    assert "\n" not in said
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)

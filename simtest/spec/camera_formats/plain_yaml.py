@@ -1,10 +1,10 @@
-"""The YAML of camera files, by PyYAML's safe loader: OpenCV's tags are read, everything a calibration never needs is not.
+"""YAML of camera files, by PyYAML's safe loader: with OpenCV's tags, without what a calibration never needs.
 
 OpenCV's own reader takes ROS files too, but never returns from some malformed files and crashes on others.
 """
 
 import re
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -14,16 +14,16 @@ MAX_VALUES = 100_000
 
 _YAML = "tag:yaml.org,2002:"
 _CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
-_NUMBER = re.compile(r"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|\.?inf|\.?nan)", re.IGNORECASE)
+_NUMBER = re.compile(r"[-+]?((\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|\.?inf|\.?nan)", re.IGNORECASE)
 
 
 class _CameraLoader(yaml.SafeLoader):
     """Builds maps, lists, numbers and text; refuses aliases, merge keys, other tags, and files that are too large."""
 
-    # Both tables are our own. PyYAML's would read 1e-5 as text, 010 as 8, 12:30 as 750 and 2024-01-01 as a date.
-    yaml_implicit_resolvers: dict[str, Any] = {}
-    yaml_constructors: dict[str | None, Any] = {}
-    yaml_multi_constructors: dict[str | None, Any] = {}
+    # All three tables are our own. PyYAML's would read 1e-5 as text, 010 as 8, 12:30 as 750 and 2024-01-01 as a date.
+    yaml_implicit_resolvers: ClassVar = {}
+    yaml_constructors: ClassVar = {}
+    yaml_multi_constructors: ClassVar = {}
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
