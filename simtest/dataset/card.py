@@ -11,7 +11,7 @@ from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
 from simtest.runtime.files import write_atomically
-from simtest.spec.dataset import Distribution
+from simtest.spec.dataset_recipe import Distribution
 
 CARD = "README.md"
 

@@ -11,7 +11,7 @@ from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
 from simtest.runtime.resources import shown
-from simtest.spec.dataset import Dataset
+from simtest.spec.dataset_recipe import Dataset
 
 NAME = "manifest.json"
 FORMAT = "simtest dataset, version 1"

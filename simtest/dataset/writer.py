@@ -28,7 +28,7 @@ from simtest.errors import InputError
 from simtest.runtime.engines import Engine, Tell
 from simtest.runtime.files import make_folder
 from simtest.runtime.resources import shown
-from simtest.spec.dataset import Dataset
+from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
 
 PART = ".part"

@@ -19,7 +19,7 @@ from simtest.simulation.rendered_view import view
 from simtest.simulation.true_highlights import JudgedHighlight
 from simtest.spec import Scene, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
-from simtest.spec.toml_output import toml_tables
+from simtest.spec.toml_files import toml_tables
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
+from simtest.spec.spec_model import Spec, validate
+from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
@@ -145,7 +146,7 @@ def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> 
         If the file is missing or malformed.
     """
     path, values = Path(path), dict(_flat(settings or {}))
-    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), place(path, values))
+    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), source_name(path, values))
 
 
 def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -25,8 +25,8 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.cluster import cores_per_task
 from simtest.spec import load_dataset, scene_from_dict
-from simtest.spec.dataset import Dataset, Distribution, Splits
-from simtest.spec.toml_input import validate
+from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
+from simtest.spec.spec_model import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}

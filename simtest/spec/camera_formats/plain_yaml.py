@@ -20,8 +20,6 @@ _NUMBER = re.compile(r"[-+]?((\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|\.?inf|\.?nan)", re
 class _CameraLoader(yaml.SafeLoader):
     """Builds maps, lists, numbers and text; refuses aliases, merge keys, other tags, and files that are too large."""
 
-    # All three tables are our own. PyYAML's would read 1e-5 as text, 010 as 8, 12:30 as 750 and 2024-01-01 as a date.
-    yaml_implicit_resolvers: ClassVar = {}
     yaml_constructors: ClassVar = {}
     yaml_multi_constructors: ClassVar = {}
 
@@ -114,6 +112,8 @@ def _refuse_tag(_: _CameraLoader, node: yaml.Node) -> Any:
     raise _refusal(node, f"tag {tag[:40]} is not allowed; only !!opencv-... is")
 
 
+# PyYAML's own resolvers would read 1e-5 as text, 010 as 8, 12:30 as 750 and 2024-01-01 as a date.
+_CameraLoader.yaml_implicit_resolvers = {}
 for kind in ("map", "seq", "str", "int", "float", "bool", "null"):
     _CameraLoader.add_constructor(f"{_YAML}{kind}", _content)
 _CameraLoader.add_multi_constructor(f"{_YAML}opencv-", lambda loader, _, node: _content(loader, node))
