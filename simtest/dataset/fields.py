@@ -31,18 +31,16 @@ class Field:
 
     Parameters
     ----------
-    name : str
+    name, shape, dtype, unit : str
         Of the decoded array.
     suffix : str
         Of the member in the shard, after the sample's key.
-    shape, dtype, unit : str
-        Of the decoded array.
     meaning : str
         What it holds, with frame and sign.
     encoding : str
         How a reader without this package decodes it.
     encode : callable
-        AnyArray to bytes.
+        Array to bytes.
     decode : callable
         Bytes and the sample's metadata to the array.
     """

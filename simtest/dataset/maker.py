@@ -33,15 +33,7 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
 class Maker:
-    """Makes samples one after the other and keeps the rendering session.
-
-    Parameters
-    ----------
-    plan : Plan
-        Of the dataset.
-    variant : str, optional
-        Mitsuba variant, of colour; default `DEFAULT_VARIANT`.
-    """
+    """Makes samples of a plan one after the other and keeps the rendering session."""
 
     def __init__(self, plan: Plan, variant: str | None = None) -> None:
         self.plan = plan
@@ -53,10 +45,7 @@ class Maker:
     def make(self, index: int) -> Sample:
         """Make a sample; the same index gives the same sample, whatever was made before.
 
-        Raises
-        ------
-        InputError
-            If the drawn scene cannot be rendered.
+        Raises `InputError` if the drawn scene cannot be rendered.
         """
         drawn, attempt, seen, frame = self._choose(index)
         session = self._at(drawn)

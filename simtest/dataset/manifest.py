@@ -35,15 +35,7 @@ class Origin(TypedDict):
 
 @dataclass(frozen=True)
 class FileEntry:
-    """A finished file.
-
-    Parameters
-    ----------
-    bytes : int
-        Size.
-    sha256 : str
-        Of its content.
-    """
+    """A finished file: its size in bytes, and the SHA-256 of its content."""
 
     bytes: int
     sha256: str
@@ -105,13 +97,7 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read a folder's manifest.
-
-    Raises
-    ------
-    ManifestError
-        If it is missing, is no manifest, or was changed by hand.
-    """
+    """Read a folder's manifest; raise `ManifestError` if it is missing, is no manifest, or was changed by hand."""
     path = folder / NAME
     try:
         if path.stat().st_size > MAX_BYTES:

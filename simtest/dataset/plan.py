@@ -261,17 +261,8 @@ class Plan:
     def draw(self, index: int, attempt: int = 0) -> Drawn:
         """Draw a sample's scene.
 
-        Parameters
-        ----------
-        index : int
-            Sample, from 0.
-        attempt : int
-            Number of the draw of all that differs between samples; the anatomy stays.
-
-        Raises
-        ------
-        InputError
-            If the drawn values contradict each other.
+        `attempt` numbers the draws of all that differs between samples; the anatomy stays. Raises `InputError` if the
+        drawn values contradict each other.
         """
         dataset, anatomy = self.dataset, self.anatomy(index)
         family = dataset.families[anatomy.family]

@@ -40,21 +40,10 @@ class Card:
 
 
 def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
-    """Write the contact sheet; return its path.
+    """Write the contact sheet of a finished dataset as an HTML page; return its path.
 
-    Parameters
-    ----------
-    folder : Path
-        A finished dataset's.
-    page : Path
-        HTML file to write.
-    count : int
-        How many samples to show, evenly over the dataset, 1 to 500.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no finished dataset, the number is out of range, or the page cannot be written.
+    `count` samples are shown, 1 to 500, evenly over the dataset. Raises `InputError` if the folder holds no finished
+    dataset, the number is out of range, or the page cannot be written.
     """
     if not 1 <= count <= MAX_SAMPLES:
         raise InputError(f"--samples {count}: must be 1 to {MAX_SAMPLES}")

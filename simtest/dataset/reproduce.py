@@ -11,28 +11,10 @@ from simtest.runtime.files import make_folder
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
-    """Make a sample anew and write its members as files.
+    """Make a sample anew and write its members as files into a folder, created if needed; return their paths.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    index : int
-        Sample, from 0.
-    out : Path
-        Folder for the files, created if needed.
-    variant : str, optional
-        Mitsuba variant; default the dataset's.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If there is no such sample, or the folder cannot be written.
+    By default the dataset's Mitsuba variant renders it. Raises `InputError` if there is no such sample, or the folder
+    cannot be written.
     """
     manifest = open_manifest(folder)
     plan = manifest.plan()

@@ -13,15 +13,7 @@ from simtest.runtime.arrays import AnyArray
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample with its images decoded.
-
-    Parameters
-    ----------
-    meta : SampleMeta
-        What is written as JSON.
-    images : dict
-        Array by field name.
-    """
+    """A sample: its metadata, written as JSON, and its decoded images by field name."""
 
     meta: SampleMeta
     images: dict[str, AnyArray]

@@ -23,19 +23,7 @@ MAX_MEMBER_BYTES = 1 << 31
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A sample in a shard.
-
-    Parameters
-    ----------
-    key : str
-        Its name.
-    members : dict
-        Offset and size of each member by suffix.
-    end : int
-        Offset after the sample.
-    meta : SampleMeta
-        Its metadata.
-    """
+    """A sample in a shard: its key, offset and size of each member by suffix, the offset after it, and its metadata."""
 
     key: str
     members: dict[str, tuple[int, int]]
@@ -64,18 +52,9 @@ def finish(file: IO[bytes]) -> None:
 
 
 def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
-    """Read a shard's samples.
+    """Read the samples of a shard from a file at its beginning.
 
-    Parameters
-    ----------
-    file : file
-        At its beginning.
-    check : bool
-        Read all members and compare their hashes; if false, read the metadata alone.
-
-    Yields
-    ------
-    StoredSample
+    With `check` all members are read and their hashes compared; without, the metadata alone are read.
 
     Raises
     ------

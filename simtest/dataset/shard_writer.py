@@ -40,19 +40,7 @@ SHARDS_PER_PROCESS = 8
 
 @dataclass(frozen=True)
 class ShardTask:
-    """Argument of `write_shard`: what a worker needs.
-
-    Parameters
-    ----------
-    folder : str
-        The dataset's.
-    dataset : str
-        The specification, as JSON.
-    number : int
-        Index among the plan's shards.
-    variant : str
-        Mitsuba variant.
-    """
+    """Argument of `write_shard`: folder, specification as JSON, index among the plan's shards, and Mitsuba variant."""
 
     folder: str
     dataset: str

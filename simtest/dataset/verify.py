@@ -44,15 +44,7 @@ REQUIRED = tuple(field.name for field in FIELDS if field.name != "radiance")
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a file.
-
-    Parameters
-    ----------
-    file : str
-        Name in the folder.
-    what : str
-        What is wrong with it.
-    """
+    """What is wrong with a file, named as in the folder."""
 
     file: str
     what: str
@@ -62,24 +54,10 @@ class Fault:
 
 
 def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
-    """Check a dataset.
+    """Check a dataset; return its faults, none if it is sound.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    progress : callable, optional
-        Called with samples checked, samples in all, and the shard.
-
-    Returns
-    -------
-    list of Fault
-        Empty if the dataset is sound.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist.
+    `progress` is called with samples checked, samples in all, and the shard. Raises `InputError` if there is no such
+    folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -141,23 +119,10 @@ def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
 
 
 def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
-    """Make broken files anew, remove files that do not belong, and verify once more.
+    """Make broken files anew, remove files that do not belong, and verify once more; return what is still broken.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    faults : list of Fault
-        As returned by `verify`.
-    engine : Engine
-        Runs the tasks.
-    progress : callable, optional
-        Called with samples done, samples in all, and what is being done.
-
-    Returns
-    -------
-    list of Fault
-        What is still broken.
+    `faults` are those of `verify`; `engine` runs the tasks; `progress` is called with samples done, samples in all, and
+    what is being done.
 
     Raises
     ------
@@ -199,19 +164,10 @@ def _shard(folder: Path, shard: Shard) -> Iterator[Fault]:
 
 
 def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
-    """Check a sample's values: sizes, ranges, unit normals that face the camera, depth against normals, counts.
+    """Yield what is wrong with a sample's values, of which the metadata's may be missing or malformed.
 
-    Parameters
-    ----------
-    members : dict
-        Bytes by suffix.
-    meta : SampleMeta
-        Metadata; any part of it may be missing or malformed.
-
-    Yields
-    ------
-    str
-        What is wrong.
+    Sizes, ranges, unit normals that face the camera, depth against normals, and counts are checked; `members` are bytes
+    by suffix.
     """
     # decoding
     try:

@@ -28,12 +28,7 @@ def make_folder(folder: Path) -> None:
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it.
 
-    Parameters
-    ----------
-    path : Path
-        The final file.
-    write : callable
-        Writes to the path it is passed, which has the final file's suffix.
+    `write` is called with the temporary path, which has the final file's suffix.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:

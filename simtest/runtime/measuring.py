@@ -9,21 +9,10 @@ from collections.abc import Callable, Mapping
 def times_in_turns(
     functions: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, list[float]]:
-    """Time functions in turns, so that a slow spell of the machine slows all of them alike.
+    """Return the times of functions by name, s, one per round.
 
-    Parameters
-    ----------
-    functions : mapping
-        Function without arguments by name; each is called once beforehand.
-    rounds : int
-        How many times each is timed.
-    clock : callable
-        Returns the time, s; default wall time.
-
-    Returns
-    -------
-    dict
-        Times by name, s, one per round.
+    The functions take turns, so that a slow spell of the machine slows all of them alike; each is called once
+    beforehand. `clock` returns the time, s.
     """
     for function in functions.values():
         function()

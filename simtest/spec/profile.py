@@ -50,22 +50,9 @@ class Profile(Spec):
 
 
 def load_profile(name: str | Path) -> Profile:
-    """Read a profile.
+    """Read a profile, by its path or the name of a shipped one; the paths of its experiments become absolute.
 
-    Parameters
-    ----------
-    name : str or Path
-        A path, or the name of a shipped profile.
-
-    Returns
-    -------
-    Profile
-        With the paths of its experiments made absolute.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    Raises `InputError` if the file is missing or malformed.
     """
     path = find(name, "scenes", "profiles")
     profile = load(Profile, path)
@@ -82,12 +69,9 @@ def _beside(profile: Path, experiment: str) -> str:
 
 
 def experiments_of(profile: Profile) -> list[Experiment]:
-    """Read a profile's experiments, cut down as it says.
+    """Read a profile's experiments, reduced as it demands.
 
-    Raises
-    ------
-    InputError
-        If an experiment is missing or malformed, or has no group of a label that is asked for.
+    Raises `InputError` if one is missing or malformed, or has no group of a demanded label.
     """
     return [_experiment(profile, entry) for entry in profile.experiments]
 

@@ -101,20 +101,7 @@ class Scene(Spec):
 
 
 def scene_from_dict(data: Mapping[str, Any], where: str = "scene") -> Scene:
-    """Validate a scene given as nested tables.
-
-    Parameters
-    ----------
-    data : mapping
-        The tables of a scene file.
-    where : str
-        Name for messages.
-
-    Raises
-    ------
-    InputError
-        If the data do not fit the schema.
-    """
+    """Validate a scene given as nested tables; `where` names it in the `InputError` if they do not fit the schema."""
     return validate(Scene, data, where)
 
 

@@ -69,19 +69,8 @@ def _leaves(value: Any) -> Iterator[Any]:
 def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = None) -> Model:
     """Read a TOML file as a model that has a `Name`, by default that of the file.
 
-    Parameters
-    ----------
-    model : type
-        A pydantic model.
-    path : Path
-        The file.
-    settings : mapping, optional
-        Values that replace those of the file, by key path.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    Values of `settings` replace those of the file, by key path. Raises `InputError` if the file is missing or
+    malformed.
     """
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
@@ -89,21 +78,12 @@ def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = No
 
 
 def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
-    """Validate data against a model; an error is one line with file, key path, value and what is allowed.
-
-    Parameters
-    ----------
-    model : type
-        A pydantic model.
-    data : mapping
-        Nested tables.
-    where : str
-        Name of the file, for messages.
+    """Validate nested tables against a model; `where` is the name of their file.
 
     Raises
     ------
     InputError
-        If the data do not fit; further errors are counted at the end of the line.
+        If the data do not fit: one line with file, key path, value, what is allowed, and the number of further errors.
     """
     try:
         return model.model_validate(data)

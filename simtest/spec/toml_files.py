@@ -23,19 +23,9 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path, kind: str) -> str:
-    """Read a text file of moderate size.
+    """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : str
-        What it should be, for messages: "TOML", "camera".
-
-    Raises
-    ------
-    InputError
-        If the file is missing, too large or not UTF-8.
+    Raises `InputError` if it is missing, too large or not UTF-8.
     """
     name = shown(path)
     try:
@@ -69,22 +59,9 @@ def _loads(text: str) -> dict[str, Any]:
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """Parse the `key=value` pairs of a command line; a value is TOML, or else plain text.
+    """Parse the `key=value` pairs of a command line, such as "surface.radius_mm=10", to values by key path.
 
-    Parameters
-    ----------
-    settings : list of str
-        Such as ``["surface.radius_mm=10", "surface.path=colon.ply"]``.
-
-    Returns
-    -------
-    dict
-        Value by key path.
-
-    Raises
-    ------
-    InputError
-        If a pair has no ``=`` or an empty key.
+    A value is TOML, or else plain text. Raises `InputError` for a pair without ``=`` or with an empty key.
     """
     parsed = {}
     for setting in settings:
@@ -101,21 +78,12 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 
 def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return a copy of nested data with values replaced at key paths such as ``rig.lights.0.position_mm``.
-
-    Parameters
-    ----------
-    data : mapping
-        Nested tables, as read from TOML.
-    settings : mapping
-        Value by key path.
-    where : str
-        Name of the file, for messages.
+    """Return a copy of nested tables with values replaced at key paths such as ``rig.lights.0.position_mm``.
 
     Raises
     ------
     InputError
-        If a path leads through something that is no table or beyond the end of a list.
+        If a path leads through something that is no table or beyond the end of a list; `where` names the file.
     """
     where = shown(where)
     result = copy.deepcopy(dict(data))

@@ -84,17 +84,9 @@ class _Keyed:
 
 
 def camera_path(surface: SurfaceModel) -> CameraPath:
-    """Find the camera path through a surface's mesh; the last few are cached.
+    """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached.
 
-    Parameters
-    ----------
-    surface : SurfaceModel
-        A lumen with a mesh, closed or open at its ends.
-
-    Raises
-    ------
-    InputError
-        If no path of `MIN_LENGTH_MM` fits into the mesh.
+    Raises `InputError` if no path of `MIN_LENGTH_MM` fits into the mesh.
     """
     shape = surface.shape()
     assert shape.mesh is not None
@@ -230,21 +222,12 @@ def _sides(tangents: Array) -> Array:
 def path_pose(spec: AnatomySurface, surface: SurfaceModel) -> Array:
     """Return model_from_camera, shape (4, 4), of a camera on or beside the camera path.
 
-    It changes smoothly with `path_share` and `around_deg`.
+    With `view` path it is on the path and looks at the point `look_ahead_mm` ahead; with off_axis it does so from
+    beside the path, by `off_axis_share` of the room up to `MIN_CLEARANCE_MM` before the wall; with wall it is on the
+    path and looks across it. `around_deg` is the direction across. The pose changes smoothly with it and with
+    `path_share`.
 
-    Parameters
-    ----------
-    spec : AnatomySurface
-        `view` path: on the path, looking at its point `look_ahead_mm` ahead. off_axis: the same from beside the path,
-        by `off_axis_share` of the room up to `MIN_CLEARANCE_MM` before the wall. wall: on the path, looking across
-        it. `around_deg` is the direction across.
-    surface : SurfaceModel
-        The lumen.
-
-    Raises
-    ------
-    InputError
-        If the surface is an organ, or its mesh has no room for a path.
+    Raises `InputError` if the surface is an organ, or its mesh has no room for a path.
     """
     if surface.solid:
         raise InputError(f"surface.view = {spec.view}: {spec.label} is an organ; a path needs a lumen; allowed: auto")

@@ -85,7 +85,7 @@ class BuiltColon(BuiltMesh):
 
 @lru_cache(maxsize=4)
 def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
-    """Make the surface and the mesh of a recipe; normals into the lumen.
+    """Make the surface and the mesh of a recipe, with normals into the lumen.
 
     Parameters
     ----------
@@ -184,19 +184,9 @@ def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
 
 
 class Colon(MeshedSurface):
-    """A generated colon with a camera inside; a shell.
+    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell.
 
-    Parameters
-    ----------
-    recipe : ColonRecipe
-        The sizes. The mesh is cached by recipe.
-    viewpoint : int
-        Number of the camera pose, >= 0.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no usable tube.
+    Raises `InputError` if the recipe gives no usable tube.
     """
 
     solid = False

@@ -9,18 +9,10 @@ from simtest.runtime.arrays import Array, IntArray, Mask
 
 
 def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
-    """Cut each triangle into 1 to 4, by how many of its edges have a new vertex.
+    """Cut each triangle into 1 to 4, by how many of its edges have a new vertex; the winding is kept.
 
-    Parameters
-    ----------
-    faces : ndarray of int, shape (F, 3)
-    middles : ndarray of int, shape (F, 3)
-        New vertex on the edge from each corner to the next; -1: none.
-
-    Returns
-    -------
-    ndarray of int, shape (F', 3)
-        Of the same winding.
+    `middles`, of the shape (F, 3) of `faces`, holds the new vertex on the edge from each corner to the next; -1 for
+    none.
     """
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
@@ -42,17 +34,10 @@ def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
 def rough_edges(
     normals: Array, edges: IntArray, middle_normals: Callable[[IntArray], Array], limit_deg: float
 ) -> IntArray:
-    """Return the numbers of the edges at whose middle the mean of the end normals is wrong.
+    """Return the numbers of the edges, shape (E, 2), at whose middle the mean of the end normals is wrong.
 
-    Parameters
-    ----------
-    normals : ndarray, shape (V, 3)
-        Exact unit normals at the vertices.
-    edges : ndarray of int, shape (E, 2)
-    middle_normals : callable
-        Returns the exact unit normals at the middles of edges, by their numbers.
-    limit_deg : float
-        Allowed error.
+    `normals`, shape (V, 3), are exact at the vertices; `middle_normals` returns exact ones at the middles of edges, by
+    their numbers. `limit_deg` is the allowed error.
     """
     limit, ends = math.radians(limit_deg), normals[edges]
     # If the end normals nearly agree nothing between can be far off, which settles most edges.
@@ -61,18 +46,10 @@ def rough_edges(
 
 
 def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> Mask:
-    """Return where the normal interpolated along an edge is wrong, shape (N,).
+    """Return where the normal interpolated along an edge is wrong by more than a limit, shape (N,).
 
-    Parameters
-    ----------
-    ends : ndarray, shape (N, 2, 3)
-        Exact unit normals at the edges' ends.
-    normals : ndarray, shape (N, 3)
-        Those at a share of the way between.
-    share : float
-        From the first end, 0 to 1.
-    limit_deg : float
-        Allowed error.
+    `ends`, shape (N, 2, 3), are the exact unit normals at both ends, `normals`, shape (N, 3), those at a share of the
+    way from the first to the second.
     """
     between = (1 - share) * ends[:, 0] + share * ends[:, 1]
     between /= np.linalg.norm(between, axis=1, keepdims=True)

@@ -80,12 +80,7 @@ def _outer(vectors: Array) -> Array:
 
 
 class Body:
-    """The level-set function of a recipe.
-
-    Parameters
-    ----------
-    recipe : LiverRecipe
-    """
+    """The level-set function of a recipe."""
 
     def __init__(self, recipe: LiverRecipe) -> None:
         self.recipe = recipe
@@ -161,19 +156,9 @@ class Body:
         return rest @ self._normal - (rest * rest).sum(axis=1) / (2 * radius), self._normal - rest / radius
 
     def solve(self, origins: Array, directions: Array, distance: Array) -> Array:
-        """Solve F(origin + t direction) = 0 by Newton's method from a start close by.
+        """Solve F(origin + t direction) = 0 by Newton's method; return t, mm, shape (N,), NaN if there is no solution.
 
-        Parameters
-        ----------
-        origins, directions : ndarray, shape (N, 3)
-            Rays, mm; unit directions.
-        distance : ndarray, shape (N,)
-            The start, mm.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            mm; NaN if there is no solution.
+        The rays are of shape (N, 3), in mm, with unit directions; `distance`, shape (N,), is a start close by.
         """
         t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
@@ -201,13 +186,7 @@ def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
 
 @dataclass(frozen=True)
 class BuiltLiver(BuiltMesh):
-    """A recipe's level set and mesh.
-
-    Parameters
-    ----------
-    body : Body
-        The level set.
-    """
+    """A recipe's level set `body` and mesh."""
 
     body: Body
 
@@ -315,19 +294,9 @@ def _project(body: Body, points: Array, steps: int) -> Array:
 
 
 class Liver(MeshedSurface):
-    """A generated liver with a camera outside.
+    """A generated liver with a camera outside, at the pose numbered by `viewpoint`.
 
-    Parameters
-    ----------
-    recipe : LiverRecipe
-        The sizes. The mesh is cached by recipe.
-    viewpoint : int
-        Number of the camera pose, >= 0.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no body.
+    Raises `InputError` if the recipe gives no body.
     """
 
     def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:

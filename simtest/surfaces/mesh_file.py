@@ -34,15 +34,10 @@ ORGAN_RANGE_MM = (60.0, 2000.0)
 
 
 def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
-    """Read a triangle mesh and repair what can be repaired safely.
+    """Read a PLY, OBJ, STL or VTK file (PolyData, UnstructuredGrid), in mm, and repair what can be repaired safely.
 
-    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons
-    are cut into triangles; the winding is made consistent within each piece, normals outward.
-
-    Parameters
-    ----------
-    path : str or Path
-        A PLY, OBJ, STL or VTK (PolyData, UnstructuredGrid) file; lengths in mm.
+    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons are
+    cut into triangles; the winding is made consistent within each piece, normals outward.
 
     Returns
     -------
@@ -80,17 +75,9 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
 
 
 def other_unit(extent: float) -> str:
-    """Guess the unit of a mesh whose largest extent is hardly that of an organ in mm.
+    """Guess the unit of a mesh whose largest extent, in the file's unit, is hardly that of an organ in mm.
 
-    Parameters
-    ----------
-    extent : float
-        Largest extent, in the file's unit.
-
-    Returns
-    -------
-    str
-        Such as "metres, 214 mm"; empty if no other unit is likelier than mm.
+    The answer is such as "metres, 214 mm"; empty if no other unit is likelier than mm.
     """
     low, high = ORGAN_RANGE_MM
     if extent >= 10.0 and extent <= high:

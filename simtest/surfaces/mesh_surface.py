@@ -176,16 +176,7 @@ def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: b
 def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
     """Return the edge length, mm, that highlights of `AUTO_CONCENTRATION` need as near as a camera comes.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        Outward.
-    lumen : bool
-        Whether the camera is inside.
-    smoothing_mm : float
-        Smoothing that the mesh will undergo; the curvatures are taken after it.
+    The faces are outward. Curvatures are taken after smoothing by `smoothing_mm`.
     """
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     distance = (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
@@ -197,15 +188,7 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
 class MeshSurface(MeshedSurface):
     """A user's mesh with a camera inside its lumen or outside the organ.
 
-    Parameters
-    ----------
-    spec : AnatomySurface
-        Path, kind, viewpoint and subdivisions.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed, or no camera can be placed.
+    Raises `InputError` if the file is missing or malformed, or no camera can be placed.
     """
 
     def __init__(self, spec: AnatomySurface) -> None:

@@ -213,14 +213,9 @@ def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:
 
 
 def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Array]:
-    """Return normal and shape operator of a level set from gradient, shape (N, 3), and Hessian, shape (N, 3, 3).
+    """Return normal, shape (N, 3), and shape operator, shape (N, 3, 3), of a level set from gradient and Hessian.
 
-    N = g/|g|, dN = (I - N N^T) H dP / |g|, restricted to the tangent plane.
-
-    Returns
-    -------
-    normal : ndarray, shape (N, 3)
-    shape_operator : ndarray, shape (N, 3, 3)
+    N = g/|g|, dN = (I - N N^T) H dP / |g|, restricted to the tangent plane; the inputs have the same shapes.
     """
     length = np.linalg.norm(gradient, axis=1)
     normal = gradient / length[:, None]

@@ -128,19 +128,10 @@ class LiverRecipe(Spec):
 
 
 def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> ColonRecipe | LiverRecipe:
-    """Read a recipe file.
+    """Read a TOML file with the keys of `ColonRecipe` or `LiverRecipe`, which its ``type`` selects.
 
-    Parameters
-    ----------
-    path : str or Path
-        A TOML file with the keys of `ColonRecipe` or `LiverRecipe`; ``type`` says which. Lengths in mm.
-    settings : mapping, optional
-        Values that replace those of the file, by key path; or nested tables of such values.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    `settings` replace values of the file, by key path or as nested tables. Raises `InputError` if the file is missing
+    or malformed.
     """
     path, values = Path(path), dict(_flat(settings or {}))
     return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), source_name(path, values))
@@ -169,23 +160,10 @@ def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | Liver
 def load_anatomy(
     kind: str, recipe: str | Path | None = None, seed: int | None = None, settings: Mapping[str, Any] | None = None
 ) -> ColonRecipe | LiverRecipe:
-    """Read a recipe of one kind.
+    """Read a recipe of one kind, colon or liver; by default the shipped one.
 
-    Parameters
-    ----------
-    kind : {"colon", "liver"}
-        What the recipe must be of.
-    recipe : str or Path, optional
-        A recipe file; default the shipped one.
-    seed : int, optional
-        Replaces the recipe's.
-    settings : mapping, optional
-        Values that replace those of the file, by key path.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, or of the other kind.
+    `seed` and `settings`, values by key path, replace those of the file. Raises `InputError` if the file is missing,
+    malformed, or of the other kind.
     """
     path = find(recipe if recipe is not None else kind, "meshes")
     described = load_recipe(path, {**(settings or {}), **({} if seed is None else {"seed": seed})})

@@ -89,19 +89,12 @@ def _many(count: int, one: str, more: str) -> str:
 def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array, IntArray, Repairs]:
     """Repair what can be repaired without a guess at the shape.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        Of either winding.
-    soup : bool
-        Whether each face has its own vertices by the format of the file, so that merging them is no repair.
+    `soup` says that by the file's format each face has its own vertices, so that merging them is no repair.
 
     Returns
     -------
     vertices : ndarray, shape (V', 3)
-        Each used, none twice.
+        mm; each is used, and none repeated.
     faces : ndarray of int, shape (F', 3)
         Winding consistent within each piece, normals outward: positive volume about the piece's centroid.
     repairs : Repairs
@@ -131,15 +124,9 @@ def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array,
 
 
 def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
-    """Make the winding consistent within each connected piece, and each piece's normals point outward.
+    """Make the winding consistent within each connected piece, and the normals of each piece point outward.
 
-    Returns
-    -------
-    faces : ndarray of int, shape (F, 3)
-    against : int
-        Faces that wound against the majority of their piece.
-    turned : int
-        Pieces whose majority pointed inward.
+    Returns the faces, how many of them wound against the majority of their piece, and how many pieces pointed inward.
     """
     import igl
 
@@ -167,17 +154,7 @@ def _follower(faces: IntArray) -> IntArray:
 
 
 def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
-    """Find the faults of a repaired mesh.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        From `repair`.
-    crossings : bool
-        Whether to search for self-intersections too, which takes longest.
-    """
+    """Find the faults of a mesh from `repair`; `crossings`, the search for self-intersections, takes longest."""
     import igl
     from igl import predicates
 

@@ -24,20 +24,11 @@ MAX_SMOOTHED_FACES = 400_000
 
 
 def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
-    """Smooth a mesh: a wave of this length keeps half of its height, a longer one nearly all, a shorter one little.
+    """Smooth a manifold: a wave of this length keeps half of its height, a longer one nearly all, a shorter one little.
 
-    Minimises sum m |x - x0|^2 + s sum |L x|^2 / m, with L the cotangent Laplacian, m the Voronoi areas and
-    s = (wavelength / 2 pi)^4, which damps a wave of wave number q by 1 / (1 + s q^4). At a rim the Laplacian is left
-    out, so that an open mesh does not shrink.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        A manifold.
-    wavelength_mm : float
-        > 0.
+    Minimises sum m |x - x0|^2 + s sum |L x|^2 / m, with L the cotangent Laplacian, m the Voronoi areas and s =
+    (wavelength / 2 pi)^4, which damps a wave of wave number q by 1 / (1 + s q^4). At a rim the Laplacian is left out,
+    so that an open mesh does not shrink.
     """
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
@@ -98,25 +89,10 @@ def allowed_smoothing(path: str, faces: IntArray, wanted: float) -> float:
 
 
 def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
-    """Subdivide by Loop's scheme, `times` times, and smooth fairly.
+    """Subdivide by Loop's scheme, `times` times, and smooth fairly unless `smoothing_mm` (see `fair`) is 0.
 
     The smoothing comes after the first subdivision, where it also evens out what Loop's scheme leaves around vertices
-    of other than six neighbours; before it where there would be more than `MAX_SMOOTHED_FACES`.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-    times : int
-        >= 0.
-    smoothing_mm : float
-        See `fair`; 0: none.
-
-    Returns
-    -------
-    vertices : ndarray, shape (V', 3)
-    faces : ndarray of int, shape (4^times F, 3)
+    of other than six neighbours; before it if there would be more than `MAX_SMOOTHED_FACES`.
     """
     if smoothing_mm:
         if times and 4 * len(faces) <= MAX_SMOOTHED_FACES:

@@ -51,14 +51,7 @@ class _Fold:
 class Tube:
     """The surface of a recipe as a function of (u, v): u along the centreline, mm; v around it, rad.
 
-    Parameters
-    ----------
-    recipe : ColonRecipe
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen or the tube bends into itself.
+    Raises `InputError` if the folds close the lumen or the tube bends into itself.
     """
 
     def __init__(self, recipe: ColonRecipe) -> None:
@@ -291,19 +284,10 @@ class Tube:
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
     ) -> tuple[Array, Array, Array]:
-        """Solve P(u, v) = origin + t direction by Newton's method from a start close by.
+        """Solve P(u, v) = origin + t direction by Newton's method; return t, u and v, t NaN if there is no solution.
 
-        Parameters
-        ----------
-        origins, directions : ndarray, shape (N, 3)
-            Rays, mm; unit directions.
-        distance, u, v : ndarray, shape (N,)
-            The start.
-
-        Returns
-        -------
-        distance, u, v : ndarray, shape (N,)
-            The solution; distance is NaN if there is none.
+        The rays are of shape (N, 3), in mm, with unit directions; `distance`, `u` and `v`, shape (N,), are a start
+        close by.
         """
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)

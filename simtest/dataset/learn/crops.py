@@ -80,20 +80,7 @@ class _Crop:
 
 
 def read_crops(folder: str | Path, split: str) -> Crops:
-    """Read the matched highlights of a split.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The dataset's.
-    split : str
-        train, validation or test.
-
-    Raises
-    ------
-    InputError
-        As `simtest.dataset.read`.
-    """
+    """Read the matched highlights of a split: train, validation or test; raise errors as `simtest.dataset.read`."""
     crops = [crop for sample in read_samples(folder, split, ["image"]) for crop in _crops(sample)]
     nothing = (float("nan"), float("nan"))
     classical = {}

@@ -43,23 +43,9 @@ class HighlightNetwork(nn.Module):
 
 
 def train(crops: Crops, epochs: int = 60, seed: int = 0, on_epoch: OnEpoch | None = None) -> HighlightNetwork:
-    """Train a network.
+    """Train a network on the crops of the train split; return it in evaluation mode.
 
-    Parameters
-    ----------
-    crops : Crops
-        Of the train split.
-    epochs : int
-        Passes over them.
-    seed : int
-        Of weights and order.
-    on_epoch : callable, optional
-        See `OnEpoch`.
-
-    Returns
-    -------
-    HighlightNetwork
-        In evaluation mode.
+    `epochs` are passes over the crops; `seed` is that of weights and order.
     """
     torch.manual_seed(seed)
     images, extras = torch.from_numpy(crops.images), torch.from_numpy(crops.extras)

@@ -18,22 +18,8 @@ ANSWER_S = 5.0
 class RayEngine:
     """Runs tasks on a Ray cluster whose nodes share the folder of the files.
 
-    Parameters
-    ----------
-    workers : int
-        How many tasks run at once.
-    address : str, optional
-        Of the cluster's head, such as ``10.0.0.1:6379``; default: a cluster of this machine is started, and ended
-        with the run.
-    gpu : bool
-        Whether each task needs a GPU.
-    renew_after : int, optional
-        Tasks after which a process is replaced; default never.
-
-    Raises
-    ------
-    InputError
-        If Ray is not installed.
+    The parameters are those of `make_engine`. Without an address a cluster of this machine is started, and ended with
+    the run. Raises `InputError` if Ray is not installed.
     """
 
     def __init__(
@@ -115,12 +101,7 @@ class RayEngine:
 def cores_per_task(nodes: Sequence[Mapping[str, float]], workers: int) -> int:
     """Return a task's cores, at least 1: its share of all, but no more than one node has, or it would wait forever.
 
-    Parameters
-    ----------
-    nodes : sequence of mapping
-        The resources of each live node; one that offers no cores names none.
-    workers : int
-        How many tasks run at once.
+    `nodes` are the resources of each live node; one that offers no cores names none. `workers` tasks run at once.
     """
     cores = [node.get("CPU", 0.0) for node in nodes]
     return max(1, int(min(sum(cores) // workers, max(cores, default=0.0))))

@@ -25,15 +25,7 @@ class _Worker:
 
 
 class LocalEngine:
-    """Runs tasks in this process if one worker is asked for, else in spawned ones.
-
-    Parameters
-    ----------
-    workers : int
-        Number of processes.
-    renew_after : int, optional
-        Tasks after which a process is replaced, so that leaks of libraries do not add up; default never.
-    """
+    """Runs tasks in this process if one worker is asked for, else in spawned ones; parameters as in `make_engine`."""
 
     def __init__(self, workers: int, renew_after: int | None = None) -> None:
         self._workers, self._renew_after = workers, renew_after

@@ -23,11 +23,8 @@ HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 def read_matlab(path: Path) -> dict[str, Any]:
     """Read a calibration of MATLAB as the table of a `CameraSpec`.
 
-    Parameters
-    ----------
-    path : Path
-        A .mat file that holds one struct with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
-        RadialDistortion and TangentialDistortion, under any name.
+    The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
+    RadialDistortion and TangentialDistortion.
 
     Raises
     ------

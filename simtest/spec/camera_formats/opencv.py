@@ -40,12 +40,7 @@ UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 
 
 def read_opencv(path: Path) -> dict[str, Any]:
-    """Read a calibration of OpenCV or ROS as the table of a `CameraSpec`.
-
-    Parameters
-    ----------
-    path : Path
-        .yml, .yaml, .xml or .json.
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`.
 
     Raises
     ------
@@ -215,19 +210,9 @@ def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:
 
 
 def opencv_text(camera: Camera, suffix: str) -> str:
-    """Return a camera as the text of an OpenCV FileStorage.
+    """Return a camera as the text of an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
 
-    Parameters
-    ----------
-    camera : Camera
-        What to write.
-    suffix : {".yml", ".yaml", ".xml", ".json"}
-        Selects the format.
-
-    Raises
-    ------
-    InputError
-        If the camera has a skew, which OpenCV ignores.
+    Raises `InputError` if the camera has a skew, which OpenCV ignores.
     """
     matrix, coefficients = _shifted(camera, "OpenCV")
     kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}

@@ -44,17 +44,9 @@ class _CameraLoader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """Read the first document of a YAML file.
+    """Read the first document of a YAML file: maps, lists, numbers and text; None if it is empty.
 
-    Parameters
-    ----------
-    text : str
-        Maps, lists, numbers and text; tags of OpenCV are allowed and ignored. Keys are text, whatever they look like.
-
-    Returns
-    -------
-    dict, list, int, float, str, bool or None
-        None for an empty document.
+    Tags of OpenCV are allowed and ignored. Keys are text, whatever they look like.
 
     Raises
     ------
