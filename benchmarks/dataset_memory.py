@@ -17,7 +17,7 @@ SAMPLES, EVERY = 2000, 50
 _PROGRAM = """
 import sys
 from simtest.dataset.plan import Plan
-from simtest.dataset.sample import Maker
+from simtest.dataset.maker import Maker
 from simtest.spec import load_dataset
 maker = Maker(Plan(load_dataset("endoscopy", {"samples": 100000, "samples_per_anatomy": 4, "tries": 1,
     "camera.width": 64, "camera.height": 48, "camera.fx": 32.0, "camera.fy": 32.0, "render.samples_per_pixel": 1})))

@@ -43,7 +43,7 @@ HIGHLIGHT_CONTRAST_SIGMA = 10.0
 """A highlight's peak stands at least this many noise standard deviations above its surroundings."""
 
 HIGHLIGHT_MIN_GAIN = 0.25
-"""Least abs(1 + d k) of an isolated highlight: below it the spot is a streak or a ring."""
+"""Least abs(1 + d k) of an isolated highlight: below it the highlight is a streak or a ring."""
 
 HIGHLIGHT_ELLIPSE_RESIDUAL = 0.045
 """Most that the isophote of an isolated highlight at t = 0.7 differs from an ellipse, RMS, as a share of its radius;
@@ -61,4 +61,4 @@ SPECULAR_DIFFUSE_RATIO = 1.0
 """... and at least this many times the light from elsewhere at that pixel."""
 
 SPECULAR_MIN_AREA_PX = 12
-"""A highlight of fewer pixels is none that anyone need find: no ellipse can be fitted to it."""
+"""A highlight of fewer pixels need not be found: no ellipse can be fitted to it."""

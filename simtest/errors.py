@@ -1,8 +1,8 @@
-"""The two ways of saying no: exceptions for malformed input, values for ill-posed data.
+"""Two kinds of error: exceptions for malformed input, values for ill-posed data.
 
-Malformed input (a file, a key, an argument) raises an `InputError` whose message is one line that names the
-place, the value got and the values allowed. Ill-posed data (no closed isophote, a degenerate conic) is a normal
-outcome of an experiment: it is returned as a `Failure`, counted and reported.
+Malformed input (a file, a key, an argument) raises an `InputError` whose message is one line that names the file or
+key, the value got and the values allowed. Ill-posed data (no closed isophote, a degenerate conic) is a normal outcome
+of an experiment: it is returned as a `Failure`, counted and reported.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from enum import StrEnum
 
 
 class SimtestError(Exception):
-    """Base of every error that simtest raises on purpose; its text is one line meant for the user."""
+    """Base of every error that simtest raises on purpose; its text is one line for the user."""
 
 
 class InputError(SimtestError, ValueError):
@@ -18,11 +18,11 @@ class InputError(SimtestError, ValueError):
 
 
 class BackendError(SimtestError, RuntimeError):
-    """The rendering backend cannot be used; the message says how to mend it."""
+    """The rendering backend cannot be used; the message says how to repair it."""
 
 
 class Reason(StrEnum):
-    """Why a reconstruction gave no normal. The values are the `status` column of the results."""
+    """Why a reconstruction has no normal; the values are the `status` column of the results."""
 
     NO_LIGHT = "no_light"
     NO_PEAK = "no_peak"

@@ -15,8 +15,8 @@ from isal import isal_zlib
 from benchmarks.measuring import Figure, print_figures
 from simtest.dataset import png
 from simtest.dataset.fields import BY_NAME
+from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
-from simtest.dataset.sample import Maker
 from simtest.spec import load_dataset
 
 ROUNDS = 5

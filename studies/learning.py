@@ -27,7 +27,7 @@ def main() -> None:
     taught, tested = read_crops(folder, "train"), read_crops(folder, "test")
     print(f"{len(taught)} crops to learn from, {len(tested)} of other anatomies to test on\n")
     with progress_bar("testing") as progress:
-        network = train(taught, tell=progress)
+        network = train(taught, on_epoch=progress)
     normal, ratio = propose(network, tested)
     errors = {NETWORK: (angle_deg(normal, tested.normal), ratio), **tested.classical}
     print(table(tested, errors))

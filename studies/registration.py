@@ -20,8 +20,9 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
-from simtest.spec.toml_output import toml_value
-from simtest.surfaces.generate import load_anatomy, make_mesh
+from simtest.spec.toml_files import toml_value
+from simtest.surfaces.factory import make_mesh
+from simtest.surfaces.recipe import load_anatomy
 from simtest.validation.matching import match
 from simtest.validation.reference_surface import MeshReference, Model, angle_deg
 

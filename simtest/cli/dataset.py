@@ -37,7 +37,7 @@ def make(
         A dataset file, or the name of a shipped one: endoscopy, learning, tiny.
     """
     from simtest.cli.progress import progress_bar
-    from simtest.dataset.writer import SHARDS_PER_PROCESS, write_dataset
+    from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_dataset, parse_settings
 
@@ -66,9 +66,9 @@ def verify(
 ) -> int:
     """Check a dataset's files and values; exit 1 if anything is broken, and name it."""
     from simtest.cli.progress import progress_bar
+    from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
     from simtest.dataset.verify import mend
     from simtest.dataset.verify import verify as check
-    from simtest.dataset.writer import SHARDS_PER_PROCESS
     from simtest.runtime.engines import make_engine
 
     with progress_bar("done") as progress:
@@ -100,10 +100,10 @@ def sample(
     index : int
         Of the sample, from 0.
     """
-    from simtest.dataset.reproduce import compare, sample_again
+    from simtest.dataset.reproduce import compare, reproduce_sample
 
     target = out or Path(f"sample-{index}")
-    files = sample_again(folder, index, target, variant)
+    files = reproduce_sample(folder, index, target, variant)
     print(*files, sep="\n")
     verdict = compare(folder, index, target)
     print(verdict)

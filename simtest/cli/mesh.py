@@ -58,7 +58,7 @@ def check(
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")
     verdict = check_mesh(file, distance, concentration(exponent, roughness), kind)
     if as_json:
-        print(json.dumps(verdict.as_dict(), indent=2, allow_nan=False))
+        print(json.dumps(verdict.to_json(), indent=2, allow_nan=False))
     else:
         print(*verdict.lines(), sep="\n")
     return 0 if verdict.usable else 1
@@ -103,8 +103,9 @@ def _make(
 ) -> None:
     from simtest.errors import InputError
     from simtest.spec import parse_settings
-    from simtest.surfaces.generate import load_anatomy, make_mesh
-    from simtest.surfaces.mesh_writing import check_target, write_mesh
+    from simtest.surfaces.factory import make_mesh
+    from simtest.surfaces.mesh_file import check_target, write_mesh
+    from simtest.surfaces.recipe import load_anatomy
 
     check_target(out)
     if curvature and out.suffix.lower() != ".ply":

@@ -1,7 +1,7 @@
-"""The dataset card: a README that says what is in the folder, and that Hugging Face `datasets` reads."""
+"""The dataset card: a README for people, whose head Hugging Face `datasets` reads."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -11,7 +11,7 @@ from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
 from simtest.runtime.files import write_atomically
-from simtest.spec.dataset import Distribution
+from simtest.spec.dataset_recipe import Distribution
 
 CARD = "README.md"
 
@@ -23,7 +23,7 @@ def write_card(plan: Plan, manifest: Manifest, folder: Path) -> None:
 
 
 def make_card(plan: Plan, manifest: Manifest) -> str:
-    """Give the card's text; it hangs on the dataset alone."""
+    """Return the card's text, which depends on the dataset alone."""
     dataset = plan.dataset
     counts: dict[str, list[int]] = {name: [0, 0] for name in dataset.splits.shares}
     for shard in plan.shards:
@@ -33,7 +33,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    # Markdown, not HTML: nothing is to be escaped.
+    # Markdown, not HTML: nothing is escaped.
     return environment.get_template("card.md.j2").render(
         dataset=dataset,
         counts=counts,
@@ -47,16 +47,17 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
     )
 
 
-def _draws(plan: Plan) -> Any:
+def _draws(plan: Plan) -> Iterator[tuple[str, str, str]]:
+    """Yield how often each drawn key is drawn, the key, and from what."""
     dataset = plan.dataset
     for number, family in enumerate(dataset.families):
         where = f"family {number} ({family.scene}), each"
-        yield from ((f"{where} anatomy", key, _say(drawn)) for key, drawn in family.per_anatomy.items())
-        yield from ((f"{where} sample", key, _say(drawn)) for key, drawn in family.per_sample.items())
-    yield from (("each sample", key, _say(drawn)) for key, drawn in dataset.per_sample.items())
+        yield from ((f"{where} anatomy", key, _describe(drawn)) for key, drawn in family.per_anatomy.items())
+        yield from ((f"{where} sample", key, _describe(drawn)) for key, drawn in family.per_sample.items())
+    yield from (("each sample", key, _describe(drawn)) for key, drawn in dataset.per_sample.items())
 
 
-def _say(drawn: Distribution) -> str:
+def _describe(drawn: Distribution) -> str:
     if drawn.choose:
         weights = f", weights {list(drawn.weights)}" if drawn.weights else ""
         return f"one of {list(drawn.choose)}{weights}"

@@ -1,4 +1,4 @@
-"""The images of a sample: what each holds, its unit, frame and sign, and how it is written.
+"""Images of a sample: what each holds, its unit, frame and sign, and how it is encoded.
 
 Compression was chosen by measurement (docs/datasets.md): PNG without a row filter for pictures, with one for the smooth
 maps of 16 bits.
@@ -6,18 +6,17 @@ maps of 16 bits.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from io import BytesIO
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from simtest.dataset.metadata import SampleMeta
 from simtest.dataset.png import decode, encode
-
-Array = npt.NDArray[Any]
+from simtest.runtime.arrays import AnyArray
 
 DEPTH_SCALES_MM = tuple(0.005 * 2**k for k in range(12))
-"""A sample's depth is counted in the first of these with which its farthest point fits 16 bits."""
+"""A sample's depth is counted in the first of these units with which its farthest point fits 16 bits."""
 
 CURVATURE_SCALE = 1e-4
 """1/mm; 16 bits then reach 3.2767 per mm, a radius of 0.3 mm."""
@@ -32,12 +31,10 @@ class Field:
 
     Parameters
     ----------
-    name : str
+    name, shape, dtype, unit : str
         Of the decoded array.
     suffix : str
         Of the member in the shard, after the sample's key.
-    shape, dtype, unit : str
-        Of the decoded array.
     meaning : str
         What it holds, with frame and sign.
     encoding : str
@@ -55,20 +52,15 @@ class Field:
     unit: str
     meaning: str
     encoding: str
-    encode: Callable[[Array], bytes]
-    decode: Callable[[bytes, dict[str, Any]], Array]
-
-    def describe(self) -> dict[str, str]:
-        """Give the entry of the field dictionary."""
-        keys = ("name", "shape", "dtype", "unit", "meaning", "encoding")
-        return {"member": f"KEY.{self.suffix}", **{key: getattr(self, key) for key in keys}}
+    encode: Callable[[AnyArray], bytes]
+    decode: Callable[[bytes, SampleMeta], AnyArray]
 
 
 # Depth ---------------------------------------------------------------------------------------------------------------
 
 
-def depth_scale_mm(depth: Array) -> float:
-    """Give the unit that a depth map, mm, is counted in; raise `ValueError` where it reaches too far for 16 bits."""
+def depth_scale_mm(depth: AnyArray) -> float:
+    """Return the unit, mm, in which a depth map, mm, is counted; raise `ValueError` if it reaches beyond 16 bits."""
     largest = float(np.nanmax(depth, initial=0.0))
     for scale in DEPTH_SCALES_MM:
         if largest <= scale * LEVELS:
@@ -76,12 +68,13 @@ def depth_scale_mm(depth: Array) -> float:
     raise ValueError(f"depth reaches {largest:g} mm; 16 bits hold {DEPTH_SCALES_MM[-1] * LEVELS:g} mm at most")
 
 
-def _encode_depth(depth: Array) -> bytes:
+def _encode_depth(depth: AnyArray) -> bytes:
+    # Adding one half makes the conversion to integers round; NaN becomes 0, no surface.
     counts = np.asarray(depth, dtype=np.float32) * np.float32(1 / depth_scale_mm(depth)) + np.float32(0.5)
     return encode(np.nan_to_num(counts, copy=False, nan=0.0).astype(np.uint16), "up")
 
 
-def _decode_depth(data: bytes, meta: dict[str, Any]) -> Array:
+def _decode_depth(data: bytes, meta: SampleMeta) -> AnyArray:
     counts = decode(data)
     depth = counts.astype(np.float32)
     depth *= meta["depth_scale_mm"]
@@ -92,11 +85,11 @@ def _decode_depth(data: bytes, meta: dict[str, Any]) -> Array:
 # Normals -------------------------------------------------------------------------------------------------------------
 
 
-def encode_octahedral(normal: Array) -> tuple[Array, Array]:
-    """Give unit vectors, shape (..., 3), as two coordinates in [-1, 1], each of shape (...): (0, 0) is (0, 0, -1).
+def encode_octahedral(normal: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Map unit vectors, shape (..., 3), to two coordinates in [-1, 1], each of shape (...); (0, 0, -1) to (0, 0).
 
     The octahedral map: (u, v) = (x, y) / (abs(x) + abs(y) + abs(z)); where z > 0,
-    (u, v) = (1 - abs(v), 1 - abs(u)) times their signs. Camera-facing normals lie about the square's middle.
+    (u, v) = (1 - abs(v), 1 - abs(u)) times their signs. Camera-facing normals lie around the middle of the square.
     """
     x, y, z = (np.asarray(normal[..., k], dtype=np.float32) for k in range(3))
     scale = 1 / (np.abs(x) + np.abs(y) + np.abs(z))
@@ -105,8 +98,8 @@ def encode_octahedral(normal: Array) -> tuple[Array, Array]:
     return u, v
 
 
-def decode_octahedral(pair: Array) -> Array:
-    """Give the unit vectors, shape (H, W, 3), of two coordinates in [-1, 1], shape (2, H, W), which are changed.
+def decode_octahedral(pair: AnyArray) -> AnyArray:
+    """Map two coordinates in [-1, 1], shape (2, H, W), overwritten, back to unit vectors, shape (H, W, 3).
 
     NaN stays NaN.
     """
@@ -115,7 +108,7 @@ def decode_octahedral(pair: Array) -> Array:
     work = np.abs(v)
     z += work
     z -= 1
-    # Where z > 0 the square's corners are folded back: 1 - abs(v) is abs(u) - z, and the other way round.
+    # Where z > 0 the corners are folded back: 1 - abs(v) is abs(u) - z, and 1 - abs(u) is abs(v) - z.
     np.maximum(z, 0, out=work)
     u -= np.copysign(work, u)
     v -= np.copysign(work, v)
@@ -127,9 +120,9 @@ def decode_octahedral(pair: Array) -> Array:
     return np.asarray(cv2.merge([u / work, v / work, z / work]))
 
 
-def _fold(u: Array, v: Array, outer: Array) -> None:
-    """Fold the square's corners over, where z > 0, in place."""
-    # Few pixels see a surface that turns so far away from the optical axis.
+def _fold(u: AnyArray, v: AnyArray, outer: AnyArray) -> None:
+    """Fold the corners of the square over where z > 0; changes its arguments."""
+    # Few pixels see a surface turned so far from the optical axis.
     if outer.any():
         a, b = u[outer], v[outer]
         u[outer] = np.copysign(1 - np.abs(b), a)
@@ -137,22 +130,22 @@ def _fold(u: Array, v: Array, outer: Array) -> None:
 
 
 NORMAL_LEVELS = 16383
-"""14 bits for each of the two coordinates: 0.015 deg at most, and a third smaller than 16 bits."""
+"""14 bits for each of the two coordinates: errors of at most 0.015 deg, and files a third smaller than with 16 bits."""
 
 
-def _encode_normal(normal: Array) -> bytes:
+def _encode_normal(normal: AnyArray) -> bytes:
     both = np.concatenate(encode_octahedral(normal), axis=0)
-    # 1 to the number of levels; what is not finite becomes 0.
+    # Levels count from 1; 0 stands for no surface.
     both *= (NORMAL_LEVELS - 1) / 2
     both += (NORMAL_LEVELS + 1) / 2 + 0.5
     return encode(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), "up")
 
 
 ROWS_AT_ONCE = 64
-"""Rows that are decoded together: their arrays then stay in the processor's cache, which halves the time."""
+"""Rows decoded together: their arrays then stay in the processor's cache, which halves the time."""
 
 
-def _decode_normal(data: bytes, _: dict[str, Any]) -> Array:
+def _decode_normal(data: bytes, _: SampleMeta) -> AnyArray:
     counts = decode(data)
     height = len(counts) // 2
     counts = counts.reshape(2, height, -1)
@@ -170,15 +163,16 @@ def _decode_normal(data: bytes, _: dict[str, Any]) -> Array:
 # Curvature -----------------------------------------------------------------------------------------------------------
 
 
-def _encode_curvature(curvature: Array) -> bytes:
+def _encode_curvature(curvature: AnyArray) -> bytes:
     both = np.concatenate([curvature[..., 0], curvature[..., 1]], axis=0, dtype=np.float32)
     both *= 1 / CURVATURE_SCALE
     both += OFFSET + 0.5
+    # The ends stand for all curvatures beyond; 0 stays free for unknown.
     np.clip(both, 1, LEVELS, out=both)
     return encode(np.nan_to_num(both, copy=False, nan=0.0).astype(np.uint16), "up")
 
 
-def _decode_curvature(data: bytes, _: dict[str, Any]) -> Array:
+def _decode_curvature(data: bytes, _: SampleMeta) -> AnyArray:
     counts = decode(data)
     both = counts.astype(np.float32)
     both -= OFFSET
@@ -190,26 +184,22 @@ def _decode_curvature(data: bytes, _: dict[str, Any]) -> Array:
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 
-def _encode_picture(picture: Array) -> bytes:
+def _encode_picture(picture: AnyArray) -> bytes:
     return encode(picture, "none")
 
 
-def _decode_picture(data: bytes, _: dict[str, Any]) -> Array:
+def _decode_picture(data: bytes, _: SampleMeta) -> AnyArray:
     return decode(data)
 
 
-def _encode_half(radiance: Array) -> bytes:
-    from io import BytesIO
-
+def _encode_half(radiance: AnyArray) -> bytes:
     file = BytesIO()
     largest = float(np.finfo(np.float16).max)
     np.save(file, np.clip(radiance, 0, largest).astype(np.float16), allow_pickle=False)
     return file.getvalue()
 
 
-def _decode_half(data: bytes, _: dict[str, Any]) -> Array:
-    from io import BytesIO
-
+def _decode_half(data: bytes, _: SampleMeta) -> AnyArray:
     return np.asarray(np.load(BytesIO(data), allow_pickle=False))
 
 

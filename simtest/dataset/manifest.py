@@ -1,17 +1,19 @@
-"""The manifest: what a dataset is, where it comes from, and which of its files are finished."""
+"""The manifest: what a dataset is, what it was made from, and which of its files are finished."""
 
 import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
+
+from pydantic import JsonValue
 
 from simtest.dataset.plan import Plan, spec_files
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
 from simtest.runtime.resources import shown
-from simtest.spec.dataset import Dataset
+from simtest.spec.dataset_recipe import Dataset
 
 NAME = "manifest.json"
 FORMAT = "simtest dataset, version 1"
@@ -19,20 +21,21 @@ MAX_BYTES = 1_000_000_000
 
 
 class ManifestError(Exception):
-    """A manifest that cannot be used; the text says why."""
+    """The manifest cannot be used; the text names the reason."""
+
+
+class Origin(TypedDict):
+    """What determines a dataset's bytes besides its specification: from the same origin the same bytes come."""
+
+    versions: dict[str, str]
+    source: str
+    variant: str
+    inputs: dict[str, str]
 
 
 @dataclass(frozen=True)
 class FileEntry:
-    """A finished file.
-
-    Parameters
-    ----------
-    bytes : int
-        Size.
-    sha256 : str
-        Of its content.
-    """
+    """A finished file: its size in bytes, and the SHA-256 of its content."""
 
     bytes: int
     sha256: str
@@ -40,35 +43,31 @@ class FileEntry:
 
 @dataclass
 class Manifest:
-    """The truth about a dataset's folder.
+    """Record of a dataset's folder, updated after each file.
 
     Parameters
     ----------
     dataset : dict
-        The whole specification.
-    origin : dict
-        Versions, source, variant and hashes of the inputs: with the same of them the same bytes come out.
+        The whole specification, as JSON.
+    origin : Origin
+        Versions, source, variant and hashes of the inputs.
     environment : dict
-        Commit and processor.
+        Commit, Python and processor.
     shards : dict
         Finished shards by name.
     tables : dict
         Finished tables and card by name; there once all shards are.
     """
 
-    dataset: dict[str, Any]
-    origin: dict[str, Any]
-    environment: dict[str, Any]
+    dataset: dict[str, JsonValue]
+    origin: Origin
+    environment: dict[str, str | None]
     shards: dict[str, FileEntry] = field(default_factory=dict)
     tables: dict[str, FileEntry] = field(default_factory=dict)
 
     def save(self, folder: Path) -> None:
         """Write the manifest, with a digest of its own content."""
-        content = self._content()
-        write_json(folder / NAME, {**content, "digest": _digest(content)})
-
-    def _content(self) -> dict[str, Any]:
-        return {
+        content = {
             "format": FORMAT,
             "complete": bool(self.tables),
             "dataset": self.dataset,
@@ -77,33 +76,28 @@ class Manifest:
             "shards": {name: vars(self.shards[name]) for name in sorted(self.shards)},
             "tables": {name: vars(self.tables[name]) for name in sorted(self.tables)},
         }
+        write_json(folder / NAME, {**content, "digest": _digest(content)})
 
     def plan(self) -> Plan:
-        """Lay the dataset out again."""
+        """Return the dataset's plan."""
         return Plan(Dataset.model_validate(self.dataset))
 
 
 def new_manifest(plan: Plan, variant: str) -> Manifest:
     """Describe a dataset that is about to be made."""
-    origin = {
+    origin: Origin = {
         "versions": provenance.versions(),
         "source": provenance.source_hash(),
         "variant": variant,
         "inputs": {path.name: provenance.file_hash(path) for path in spec_files(plan.dataset)},
     }
     found = provenance.environment()
-    environment = {key: found[key] for key in ("commit", "python", "processor", "system")}
+    environment = {name: found[name] for name in ("commit", "python", "processor", "system")}
     return Manifest(plan.dataset.model_dump(mode="json"), origin, environment)
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read a folder's manifest.
-
-    Raises
-    ------
-    ManifestError
-        If it is missing, is no manifest, or was changed by hand.
-    """
+    """Read a folder's manifest; raise `ManifestError` if it is missing, is no manifest, or was changed by hand."""
     path = folder / NAME
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -128,12 +122,13 @@ def read_manifest(folder: Path) -> Manifest:
     )
 
 
-def _digest(content: dict[str, Any]) -> str:
+def _digest(content: Any) -> str:
+    """Return the hash of the manifest's content: changes by hand show."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def check_same(folder: Path, there: Manifest, wanted: Manifest) -> None:
-    """Raise `InputError` where a folder holds another dataset, or the same made by other code."""
+    """Raise `InputError` if a folder holds another dataset, or the same one made by other code."""
     for what, old, new in (("dataset", there.dataset, wanted.dataset), ("origin", there.origin, wanted.origin)):
         difference = _first_difference(old, new)
         if difference is None:
@@ -147,6 +142,7 @@ def check_same(folder: Path, there: Manifest, wanted: Manifest) -> None:
 
 
 def _first_difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any] | None:
+    """Return key path and both values of the first difference of nested tables and lists; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in sorted({*old, *new}):
             found = _first_difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)

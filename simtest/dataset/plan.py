@@ -1,4 +1,4 @@
-"""Which sample is made of what: anatomies, splits, draws and shards, all known before anything is rendered."""
+"""Plan of a dataset: anatomies, splits, draws and shards of all samples, known before anything is rendered."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -7,24 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from pydantic import JsonValue
 
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
+from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
-from simtest.spec.dataset import Dataset, Distribution, Family
+from simtest.spec.dataset_recipe import Dataset, Distribution, Family
 from simtest.surfaces.recipe import load_recipe
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
-"""What tells one anatomy from the next."""
+"""Keys that determine an anatomy."""
 
 BYTES_PER_PIXEL = 4.5
-"""Of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
+"""Size of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
 
 RADIANCE_BYTES_PER_PIXEL = 6.0
-"""Of the linear radiance beside it: three halves."""
+"""Size of the linear radiance: three values of 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,11 @@ class Anatomy:
     Parameters
     ----------
     family : int
-        Its kind, from 0.
+        Index of its family.
     number : int
-        Which of the family's anatomies, from 0.
+        Index among the family's anatomies.
     seed : int or None
-        surface.seed; None where the family has only the scene's.
+        surface.seed; None if the family has only that of the scene.
     """
 
     family: int
@@ -48,16 +49,16 @@ class Anatomy:
 
 @dataclass(frozen=True)
 class Shard:
-    """The samples of one file.
+    """Samples of one file.
 
     Parameters
     ----------
     split : str
         train, validation or test.
     number : int
-        Of the split's shards, from 0.
+        Index among the split's shards.
     indices : tuple of int
-        Samples, rising.
+        Samples, in rising order.
     """
 
     split: str
@@ -72,7 +73,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Drawn:
-    """The scene of a sample.
+    """Scene drawn for a sample.
 
     Parameters
     ----------
@@ -81,16 +82,16 @@ class Drawn:
     anatomy : Anatomy
         Its anatomy.
     values : dict
-        What was drawn, by key path.
+        Drawn values by key path.
     """
 
     scene: Scene
     anatomy: Anatomy
-    values: dict[str, Any]
+    values: dict[str, JsonValue]
 
 
 class Plan:
-    """Lays out a dataset.
+    """Layout of a dataset: which sample is made of what, and stands in which shard.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ class Plan:
         return base
 
     def _check(self, number: int, family: Family) -> None:
-        """Try every drawn value's ends, one at a time and together, before anything is rendered."""
+        """Raise `InputError` if a scene would be malformed at an end of any range, alone or all together."""
         where = f"families.{number}"
         drawn = {**family.per_anatomy, **family.per_sample, **self.dataset.per_sample}
         scene = scene_from_dict(self._bases[number], where)
@@ -132,8 +133,10 @@ class Plan:
                     f"{where}: {path} is drawn for each sample, which makes anatomies that may be in two splits; "
                     "must be drawn by seeds or per_anatomy"
                 )
+        # One anatomy must not change between its samples.
         if twice := sorted({*family.per_anatomy} & {*family.per_sample, *self.dataset.per_sample}):
             raise InputError(f"{where}.per_anatomy: {twice[0]} is drawn for each sample too; must be in one of them")
+        # Ends of the ranges: each alone, then all lows and all highs at once.
         alone = [{path: value} for path, one in drawn.items() for value in one.ends]
         together = [{path: one.ends[end] for path, one in drawn.items()} for end in (0, -1)]
         for values in (*alone, *together):
@@ -142,7 +145,7 @@ class Plan:
                 load_recipe(file, tried.surface.recipe_values)
 
     def _check_shared(self) -> None:
-        """Refuse families that may have an anatomy in common, which might then be in two splits."""
+        """Raise `InputError` if two families may share an anatomy, which might then be in two splits."""
         held: list[tuple[int, Path, range | None]] = []
         for number, family in enumerate(self.dataset.families):
             surface = scene_from_dict(self._bases[number], f"families.{number}").surface
@@ -172,7 +175,7 @@ class Plan:
         return generator(self.dataset.seed, self.dataset.name, branch, number, Stage.SWEEP)
 
     def _lay_out(self) -> list[Anatomy]:
-        """Give the anatomy of each block of samples."""
+        """Return the anatomy of each block of `samples_per_anatomy` samples."""
         dataset = self.dataset
         count = -(-dataset.samples // dataset.samples_per_anatomy)
         counts = _shared(count, [family.weight for family in dataset.families])
@@ -188,11 +191,12 @@ class Plan:
                 )
             seeds = self._rng(f"seeds {k}").choice(family.seeds.count, size=wanted, replace=False)
             blocks += [Anatomy(k, n, family.seeds.low + int(seed)) for n, seed in enumerate(seeds)]
+        # Shuffled, so that neighbouring blocks are of different families.
         order = self._rng("order").permutation(len(blocks))
         return [blocks[i] for i in order]
 
     def _assign(self) -> dict[Anatomy, str]:
-        """Give the split of each anatomy: each in turn goes to the split that lacks most samples."""
+        """Return the split of each anatomy: each in turn goes to the split that lacks most samples."""
         sizes: dict[Anatomy, int] = {}
         for block, anatomy in enumerate(self._blocks):
             sizes[anatomy] = sizes.get(anatomy, 0) + len(self._block_indices(block))
@@ -205,7 +209,7 @@ class Plan:
         lacking = {name: share * self.dataset.samples for name, share in shares.items()}
         assigned: dict[Anatomy, str] = {}
         empty = set(shares)
-        # The largest first; where there are only as many left as splits without any, those get them.
+        # The largest first; once only as many are left as there are empty splits, the empty ones get them.
         for left, anatomy in zip(range(len(sizes), 0, -1), sorted(sizes, key=lambda a: -sizes[a]), strict=True):
             among = empty if left <= len(empty) else shares
             chosen = max((name for name in shares if name in among), key=lambda name: lacking[name])
@@ -219,18 +223,18 @@ class Plan:
         return range(block * size, min((block + 1) * size, self.dataset.samples))
 
     def anatomy(self, index: int) -> Anatomy:
-        """Give the anatomy of a sample."""
+        """Return the anatomy of a sample."""
         return self._blocks[index // self.dataset.samples_per_anatomy]
 
     def split(self, index: int) -> str:
-        """Give the split of a sample."""
+        """Return the split of a sample."""
         return self._splits[self.anatomy(index)]
 
     # Shards ----------------------------------------------------------------------------------------------------------
 
     @cached_property
     def samples_per_shard(self) -> int:
-        """How many samples of the expected size a shard holds; it hangs on the dataset alone."""
+        """How many samples of the expected size a shard holds; depends on the dataset alone."""
         camera = scene_from_dict(self._bases[0]).camera
         size = BYTES_PER_PIXEL + (RADIANCE_BYTES_PER_PIXEL if self.dataset.radiance else 0)
         return max(1, int(self.dataset.shard_mb * 1e6 / (size * camera.width * camera.height)))
@@ -243,13 +247,13 @@ class Plan:
             indices[self._splits[anatomy]] += self._block_indices(block)
         size = self.samples_per_shard
         return tuple(
-            Shard(split, number, tuple(all_of_it[first : first + size]))
-            for split, all_of_it in indices.items()
-            for number, first in enumerate(range(0, len(all_of_it), size))
+            Shard(split, number, tuple(members[first : first + size]))
+            for split, members in indices.items()
+            for number, first in enumerate(range(0, len(members), size))
         )
 
     def shard_of(self, index: int) -> Shard:
-        """Give the shard that holds a sample."""
+        """Return the shard that holds a sample."""
         return next(shard for shard in self.shards if index in shard.indices)
 
     # Scenes ----------------------------------------------------------------------------------------------------------
@@ -257,24 +261,12 @@ class Plan:
     def draw(self, index: int, attempt: int = 0) -> Drawn:
         """Draw a sample's scene.
 
-        Parameters
-        ----------
-        index : int
-            Sample, from 0.
-        attempt : int
-            Which draw of what differs between samples; the anatomy stays.
-
-        Returns
-        -------
-        Drawn
-
-        Raises
-        ------
-        InputError
-            If the drawn values do not go together.
+        `attempt` numbers the draws of all that differs between samples; the anatomy stays. Raises `InputError` if the
+        drawn values contradict each other.
         """
         dataset, anatomy = self.dataset, self.anatomy(index)
         family = dataset.families[anatomy.family]
+        # Each draw has a branch of the seed tree of its own, so no sample depends on another.
         values = _draw(family.per_anatomy, self._rng(f"anatomy {anatomy.family}", anatomy.number))
         if anatomy.seed is not None:
             values["surface.seed"] = anatomy.seed
@@ -288,22 +280,22 @@ class Plan:
         return Drawn(scene_from_dict(data, where), anatomy, values)
 
 
-def _draw(drawn: Mapping[str, Distribution], rng: np.random.Generator) -> dict[str, Any]:
+def _draw(drawn: Mapping[str, Distribution], rng: np.random.Generator) -> dict[str, JsonValue]:
     # By name, so that the order of keys in the file does not matter.
     return {path: drawn[path].draw(rng) for path in sorted(drawn)}
 
 
 def _shared(count: int, weights: list[float]) -> list[int]:
-    """Share a number out by weights, the largest remainders rounded up."""
+    """Divide a number by weights; the largest remainders are rounded up."""
     exact = count * np.asarray(weights) / sum(weights)
-    whole: npt.NDArray[np.int64] = np.floor(exact).astype(np.int64)
+    whole: IntArray = np.floor(exact).astype(np.int64)
     for i in np.argsort(whole - exact, kind="stable")[: count - int(whole.sum())]:
         whole[i] += 1
     return [int(n) for n in whole]
 
 
 def spec_files(dataset: Dataset) -> Iterator[Path]:
-    """Give the files that a dataset's content hangs on beside its own: base scenes, recipes and meshes."""
+    """Yield the files besides its own that determine a dataset's content: base scenes, recipes and meshes."""
     for family in dataset.families:
         path = find(family.scene, "scenes")
         yield path

@@ -1,18 +1,18 @@
-"""PNG files by ISA-L's deflate, which packs and unpacks several times faster than that of the usual libraries.
+"""PNG written and read by ISA-L: our own, since no library uses its deflate, several times faster than zlib's.
 
-What is written is plain PNG, which any reader opens. What is read may be any PNG: one that was not written here is
-left to OpenCV.
+With OpenCV encoding took most of the time of writing and reading a dataset (docs/datasets.md). The files are plain PNG,
+which any reader opens. Any PNG can be read: one that was not written here is left to OpenCV.
 """
 
 import struct
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from isal import isal_zlib
 
-Image = npt.NDArray[Any]
+from simtest.runtime.arrays import AnyArray
+
 Filter = Literal["none", "up"]
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -21,11 +21,11 @@ _COLOURS = {0: 1, 2: 3}
 """Channels by PNG's colour type: grey, and red, green, blue."""
 
 LEVEL = 1
-"""Of ISA-L's 0 to 3: higher ones take longer for 1 % less (docs/datasets.md)."""
+"""Of ISA-L's 0 to 3: higher ones take longer for files 1 % smaller (docs/datasets.md)."""
 
 
-def encode(image: Image, rows: Filter, level: int = LEVEL) -> bytes:
-    """Give the PNG file of an image.
+def encode(image: AnyArray, rows: Filter, level: int = LEVEL) -> bytes:
+    """Encode an image as a PNG file.
 
     Parameters
     ----------
@@ -35,10 +35,6 @@ def encode(image: Image, rows: Filter, level: int = LEVEL) -> bytes:
         Filter of all rows: "up" keeps differences to the row above, which are small where the image is smooth.
     level : int
         ISA-L's, 0 to 3.
-
-    Returns
-    -------
-    bytes
     """
     height, width = image.shape[:2]
     wide = image if image.dtype == np.uint8 else image.astype(">u2")
@@ -55,13 +51,13 @@ def encode(image: Image, rows: Filter, level: int = LEVEL) -> bytes:
     return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 
-def decode(data: bytes) -> Image:
-    """Give the image of a PNG file, as `encode` takes it; raise `ValueError` where the data are none."""
+def decode(data: bytes) -> AnyArray:
+    """Decode a PNG file to an image as `encode` takes it; raise `ValueError` if the data are none."""
     own = _decode_own(data)
     if own is not None:
         return own
     try:
-        # OpenCV makes room for a chunk of any length before it looks whether it is there.
+        # OpenCV allocates memory for a chunk of any stated length before it looks whether the chunk is there.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if _is_whole(data) else None
     except cv2.error:
         image = None
@@ -71,11 +67,11 @@ def decode(data: bytes) -> Image:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Tell whether the lengths that a file's chunks state are those of the file."""
-    place = len(_SIGNATURE)
-    while place + 8 <= len(data):
-        place += 12 + int(struct.unpack_from(">I", data, place)[0])
-    return data.startswith(_SIGNATURE) and place == len(data)
+    """Return whether the stated lengths of a file's chunks add up to the length of the file."""
+    offset = len(_SIGNATURE)
+    while offset + 8 <= len(data):
+        offset += 12 + int(struct.unpack_from(">I", data, offset)[0])
+    return data.startswith(_SIGNATURE) and offset == len(data)
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
@@ -83,8 +79,8 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return b"".join((struct.pack(">I", len(data)), kind, data, struct.pack(">I", crc)))
 
 
-def _decode_own(data: bytes) -> Image | None:
-    """Decode a file of `encode`; None where it is of another kind, or damaged."""
+def _decode_own(data: bytes) -> AnyArray | None:
+    """Decode a file of `encode`; return None if it is of another kind, or damaged."""
     found = _split(data)
     if found is None:
         return None
@@ -99,7 +95,7 @@ def _decode_own(data: bytes) -> Image | None:
     table = table.reshape(height, wide + 1)
     values = table[:, 1:].copy()
     if (table[:, 0] == _FILTERS["up"]).all():
-        # Row by row: six times as fast as NumPy's running sum along that axis.
+        # Row by row: six times as fast as NumPy's cumulative sum along that axis.
         last = values[0]
         for row in values[1:]:
             np.add(last, row, row)
@@ -112,7 +108,8 @@ def _decode_own(data: bytes) -> Image | None:
 
 
 def _split(data: bytes) -> tuple[tuple[int, int, int, int], bytes] | None:
-    """Give height, width, bytes a value and channels, and the packed rows; None where the file is of another kind."""
+    """Return (height, width, bytes per value, channels) and the packed rows; None if the file is of another kind."""
+    # One IDAT chunk right after IHDR, and IEND right after it, is what `encode` writes.
     if data[:8] != _SIGNATURE or data[12:16] != b"IHDR" or data[37:41] != b"IDAT":
         return None
     width, height, bits, colour, *rest = struct.unpack(">IIBBBBB", data[16:29])

@@ -1,43 +1,26 @@
-"""Makes one sample of a dataset again, alone, and compares it with the stored one."""
+"""Reproduces one sample of a dataset alone, and compares it with the stored one."""
 
 from pathlib import Path
 
+from simtest.dataset.maker import Maker
 from simtest.dataset.reader import open_manifest
-from simtest.dataset.sample import Maker, sample_key
+from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.files import make_folder
 
 
-def sample_again(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
-    """Make a sample again and write its members as files.
+def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
+    """Make a sample anew and write its members as files into a folder, created if needed; return their paths.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    index : int
-        Sample, from 0.
-    out : Path
-        Folder for the files, made if need be.
-    variant : str, optional
-        Mitsuba variant; default the dataset's.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If there is no such sample, or the folder cannot be written.
+    By default the dataset's Mitsuba variant renders it. Raises `InputError` if there is no such sample, or the folder
+    cannot be written.
     """
     manifest = open_manifest(folder)
     plan = manifest.plan()
     if not 0 <= index < plan.dataset.samples:
         raise InputError(f"INDEX = {index}: must be 0 to {plan.dataset.samples - 1}")
-    made = Maker(plan, variant or str(manifest.origin["variant"])).make(index)
+    made = Maker(plan, variant or manifest.origin["variant"]).make(index)
     make_folder(out)
     files = []
     try:
@@ -50,7 +33,7 @@ def sample_again(folder: Path, index: int, out: Path, variant: str | None = None
 
 
 def compare(folder: Path, index: int, out: Path) -> str:
-    """Say whether the files that `sample_again` wrote are the stored sample's."""
+    """Compare the files that `reproduce_sample` wrote with the stored sample; return one line."""
     shard, key = open_manifest(folder).plan().shard_of(index), sample_key(index)
     try:
         with (folder / shard.name).open("rb") as file:

@@ -1,257 +1,51 @@
-"""One sample: rendered, seen by the sensor, estimated on, and encoded."""
+"""A sample in memory, and its encoding as the members of a shard."""
 
 import hashlib
 import json
-import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import FIELDS, depth_scale_mm
-from simtest.dataset.plan import Anatomy, Drawn, Plan
-from simtest.errors import Failure
-from simtest.estimators import load_estimators
-from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
-from simtest.reconstruction.pipeline import Specularity, reconstruct
-from simtest.rendering import Frame, Session, backend
-from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.simulation.true_highlights import TrueHighlight, region_of
-from simtest.spec import describe_camera
-from simtest.surfaces import forget_meshes
-from simtest.validation.matching import match
-from simtest.validation.metrics import MISSED, rows
-from simtest.validation.results_table import ResultRow
-
-Array = npt.NDArray[Any]
-
-MAX_INSTANCES = 255
-
-DEFAULT_VARIANT = "llvm_ad_rgb"
-"""Learners want colour."""
+from simtest.dataset.fields import BY_SUFFIX, FIELDS
+from simtest.dataset.metadata import SampleMeta
+from simtest.runtime.arrays import AnyArray
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample before it is encoded.
+    """A sample: its metadata, written as JSON, and its decoded images by field name."""
 
-    Parameters
-    ----------
-    index : int
-        In the dataset.
-    meta : dict
-        What is written as JSON.
-    images : dict
-        Array by field name.
-    """
+    meta: SampleMeta
+    images: dict[str, AnyArray]
 
-    index: int
-    meta: dict[str, Any]
-    images: dict[str, Array]
+    @property
+    def index(self) -> int:
+        """Number of the sample in the dataset, from 0."""
+        return self.meta["index"]
 
     @property
     def key(self) -> str:
         """Name of the sample in its shard."""
-        return sample_key(self.index)
+        return self.meta["key"]
 
     def encode(self) -> dict[str, bytes]:
-        """Give the members of the shard by suffix, the metadata last, with the hashes of the others."""
-        here = [field for field in FIELDS if field.name in self.images]
+        """Return the shard's members by suffix, the metadata last, with the hashes of the others."""
+        fields = [field for field in FIELDS if field.name in self.images]
+        # The codecs release Python's lock, so two threads nearly halve the time.
         with ThreadPoolExecutor(2) as threads:
-            encoded = threads.map(lambda field: field.encode(self.images[field.name]), here)
-            members = {field.suffix: data for field, data in zip(here, encoded, strict=True)}
+            encoded = threads.map(lambda field: field.encode(self.images[field.name]), fields)
+            members = {field.suffix: data for field, data in zip(fields, encoded, strict=True)}
         hashes = {suffix: hashlib.sha256(data).hexdigest() for suffix, data in members.items()}
         text = json.dumps({**self.meta, "sha256": hashes}, allow_nan=False, separators=(",", ":"))
         return {**members, "json": text.encode()}
 
 
+def decode(members: Mapping[str, bytes], meta: SampleMeta) -> Sample:
+    """Decode a sample's images from the members of a shard, given by suffix."""
+    images = {BY_SUFFIX[s].name: BY_SUFFIX[s].decode(data, meta) for s, data in members.items() if s in BY_SUFFIX}
+    return Sample(meta, images)
+
+
 def sample_key(index: int) -> str:
-    """Give a sample's name in its shard."""
+    """Return the name of a sample in its shard."""
     return f"{index:09d}"
-
-
-class Maker:
-    """Makes samples one after the other; the rendering session stays.
-
-    Parameters
-    ----------
-    plan : Plan
-        Of the dataset.
-    variant : str, optional
-        Mitsuba variant, of colour; default `DEFAULT_VARIANT`.
-    """
-
-    def __init__(self, plan: Plan, variant: str | None = None) -> None:
-        self.plan = plan
-        self._variant = variant or DEFAULT_VARIANT
-        self._session: Session | None = None
-        self._anatomy: Anatomy | None = None
-        self._estimators = load_estimators(plan.dataset.estimators)
-
-    def make(self, index: int) -> Sample:
-        """Make a sample; the same index gives the same sample, whatever was made before.
-
-        Raises
-        ------
-        InputError
-            If the drawn scene cannot be rendered.
-        """
-        drawn, attempt, seen, frame = self._choose(index)
-        session = self._session
-        assert session is not None
-        picture = seen.frame(drawn.scene.sensor.seed)
-        specularities = reconstruct(picture, seen.calibration, self._estimators) if seen.full_scale > 0 else []
-        meta = self._describe(index, drawn, seen) | {"attempt": attempt}
-        meta["highlights"] = [_highlight(truth) for truth in seen.highlights]
-        meta["detections"] = [_detection(specularity) for specularity in specularities]
-        meta["estimates"] = self._estimates(index, drawn, seen, specularities)
-        images = self._images(drawn, seen, frame, picture)
-        meta["depth_scale_mm"] = depth_scale_mm(images["depth"])
-        return Sample(index, meta, images)
-
-    def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
-        """Draw until the frame shows enough isolated highlights, judged by one ray a pixel and direct light."""
-        dataset = self.plan.dataset
-        attempt, drawn = 0, self.plan.draw(index)
-        while dataset.highlights and attempt + 1 < dataset.tries and not self._shows_enough(drawn):
-            attempt += 1
-            drawn = self.plan.draw(index, attempt)
-        session = self._at(drawn)
-        frame = session.frame()
-        return drawn, attempt, render_view(session, drawn.scene, frame.radiance), frame
-
-    def _shows_enough(self, drawn: Drawn) -> bool:
-        quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
-        scene = drawn.scene.model_copy(update={"render": quick})
-        seen = render_view(self._at(replace(drawn, scene=scene)), scene)
-        return sum(truth.isolated for truth in seen.highlights) >= self.plan.dataset.highlights
-
-    def _at(self, drawn: Drawn) -> Session:
-        if self._session is not None and drawn.anatomy != self._anatomy:
-            # The next anatomy is another scene, and this one's does not come back: memory must not add up.
-            self._session = None
-            forget_meshes()
-            backend.release_memory()
-        if self._session is None:
-            self._anatomy = drawn.anatomy
-            self._session = Session(drawn.scene, self._variant, labelled=True)
-        self._session.update(drawn.scene)
-        return self._session
-
-    def _describe(self, index: int, drawn: Drawn, seen: RenderedView) -> dict[str, Any]:
-        scene, anatomy = drawn.scene, drawn.anatomy
-        return {
-            "key": sample_key(index),
-            "index": index,
-            "dataset": self.plan.dataset.name,
-            "split": self.plan.split(index),
-            "anatomy": {
-                "family": anatomy.family, "number": anatomy.number, "seed": anatomy.seed, "surface": scene.surface.label
-            },
-            "drawn": drawn.values,
-            "camera": describe_camera(scene.camera.model()),
-            "lights_mm": scene.rig.true_mm().tolist(),
-            "full_scale": seen.full_scale,
-            "scene": scene.model_dump(mode="json"),
-        }  # fmt: skip
-
-    def _estimates(
-        self, index: int, drawn: Drawn, seen: RenderedView, specularities: list[Specularity]
-    ) -> list[dict[str, Any]]:
-        """Give the rows of results.parquet; true_id is the highlight's place in the list of all."""
-        session = self._at(drawn)
-        counted = [i for i, truth in enumerate(seen.highlights) if truth.isolated]
-        truths = [seen.highlights[i] for i in counted]
-        common = ResultRow(experiment=self.plan.dataset.name, label=drawn.scene.surface.label, realisation=index,
-                           setting=self.plan.split(index), seed=drawn.scene.sensor.seed)  # fmt: skip
-        made = rows(session, common, specularities, truths, match(specularities, truths), list(self._estimators))
-        estimates = []
-        for row in made:
-            columns = row.to_row() | {"true_id": None if row.true_id is None else counted[row.true_id]}
-            if row.status == MISSED:
-                # Shards list a missed highlight's status before its estimator.
-                columns["estimator"] = columns.pop("estimator")
-            estimates.append({key: _plain(value) for key, value in columns.items() if _plain(value) is not None})
-        return estimates
-
-    def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame, picture: Array) -> dict[str, Array]:
-        radiance, scale = seen.radiance, seen.full_scale or 1.0
-        images = {"image": _bytes(picture, drawn.scene.sensor.encodes), **self._truth(drawn, frame)}
-        parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
-        images |= {name: _colour(to_uint8(part / np.float32(scale))) for name, part in parts.items()}
-        images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
-        if self.plan.dataset.radiance:
-            images["radiance"] = _colour(radiance.total / np.float32(scale))
-        return images
-
-    def _truth(self, drawn: Drawn, frame: Frame) -> dict[str, Array]:
-        if self.plan.dataset.exact:
-            truth = self._at(drawn).truth()
-            curvature = np.stack([truth.k_min, truth.k_max], axis=-1)
-            return {"depth": truth.depth, "normal": truth.normal, "curvature": curvature}
-        labels = frame.labels
-        # An interpolated normal may lean away from the camera next to a silhouette; the triangle's own does not.
-        away = np.sum(labels.normal * labels.position, axis=-1, keepdims=True) >= 0
-        normal = np.where(away, labels.geometric_normal, labels.normal)
-        return {
-            "depth": labels.depth,
-            "normal": normal,
-            "curvature": np.stack([labels.k_min, labels.k_max], axis=-1),
-        }
-
-
-def _bytes(picture: Array, encoded: bool) -> Array:
-    """Give the 8-bit picture: what the sensor itself encoded, or else sRGB."""
-    values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8) if encoded else to_uint8(picture)
-    return _colour(values)
-
-
-def _colour(image: Array) -> Array:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-
-def _instances(seen: RenderedView, mask: Array | None) -> Array:
-    """Give the isolated highlights' regions at half height, by 1 + their place in the list."""
-    light = seen.light if seen.light.ndim == 2 else seen.light.mean(axis=2, dtype=np.float32)
-    smoothed = smooth(light, DEFAULT_SMOOTHING_PX, mask)
-    numbers = np.zeros(light.shape, dtype=np.uint8)
-    for i, truth in enumerate(seen.highlights[:MAX_INSTANCES]):
-        component = region_of(truth, smoothed, mask) if truth.isolated else None
-        if component is not None:
-            height, width = component.mask.shape
-            numbers[component.y : component.y + height, component.x : component.x + width][component.mask] = i + 1
-    return numbers
-
-
-def _highlight(truth: TrueHighlight) -> dict[str, Any]:
-    return {**truth.to_json(), "direction_min": truth.direction_min.tolist(), "peak_snr": _plain(truth.peak_snr)}
-
-
-def _detection(specularity: Specularity) -> dict[str, Any]:
-    """Describe what was found in the frame: where, and the ellipse of its isophote at half height."""
-    found: dict[str, Any] = {"box_px": [int(v) for v in specularity.region.box], "peak_px": None, "ellipse": None}
-    if isinstance(specularity.patch, Failure):
-        return found
-    found["peak_px"] = specularity.patch.peak_px.tolist()
-    contour = specularity.patch.isophote(HIGHLIGHT_ISOVALUE)
-    fitted = contour if isinstance(contour, Failure) else fit_ellipse(contour)
-    if not isinstance(fitted, Failure):
-        ellipse = ellipse_of_conic(fitted.image)
-        found["ellipse"] = {
-            "isovalue": HIGHLIGHT_ISOVALUE,
-            "centre_px": ellipse.centre.tolist(),
-            "semi_axes_px": [ellipse.semi_major, ellipse.semi_minor],
-            "angle_deg": math.degrees(ellipse.angle),
-        }
-    return found
-
-
-def _plain(value: Any) -> Any:
-    """Give a value as JSON has it: numbers that are not finite are missing."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value

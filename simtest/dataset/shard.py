@@ -1,7 +1,7 @@
-"""Shards: tar files of samples that can be cut short anywhere and gone on with.
+"""Shards: tar files of samples whose writing can stop anywhere and be continued.
 
-A sample is whole when its last member, the metadata, is there and the hashes that it holds are those of the others. So
-a shard that was stopped in the middle needs no journal: it is cut after its last whole sample.
+A sample is whole if its last member, the metadata, is there and the hashes that it holds are those of the others. So a
+shard that was stopped in the middle needs no journal: it is cut after its last whole sample.
 """
 
 import fcntl
@@ -11,42 +11,32 @@ import os
 import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
+
+from simtest.dataset.metadata import SampleMeta
 
 BLOCK = tarfile.BLOCKSIZE
 MAX_MEMBER_BYTES = 1 << 31
 
 
-@dataclass
+@dataclass(frozen=True)
 class StoredSample:
-    """A sample in a shard.
-
-    Parameters
-    ----------
-    key : str
-        Its name.
-    members : dict
-        Where each member's bytes begin and how many there are, by suffix.
-    end : int
-        Offset after the sample.
-    meta : dict
-        Its metadata.
-    """
+    """A sample in a shard: its key, offset and size of each member by suffix, the offset after it, and its metadata."""
 
     key: str
-    members: dict[str, tuple[int, int]] = field(default_factory=dict)
-    end: int = 0
-    meta: dict[str, Any] = field(default_factory=dict)
+    members: dict[str, tuple[int, int]]
+    end: int
+    meta: SampleMeta
 
 
 class BrokenShardError(Exception):
-    """A shard that does not read as one; the text says where and why."""
+    """A shard cannot be read; the text says where and why."""
 
 
 def write_sample(file: IO[bytes], key: str, members: dict[str, bytes]) -> None:
-    """Append a sample; headers hold no time, owner or machine."""
+    """Append a sample; the headers hold neither time nor owner nor machine."""
     for suffix, data in members.items():
         header = tarfile.TarInfo(f"{key}.{suffix}")
         header.size = len(data)
@@ -56,38 +46,30 @@ def write_sample(file: IO[bytes], key: str, members: dict[str, bytes]) -> None:
 
 
 def finish(file: IO[bytes]) -> None:
-    """Write the end of the archive: two empty blocks, filled up to a record."""
+    """Write the end of the archive: two empty blocks, padded to a record."""
     file.write(bytes(2 * BLOCK))
     file.write(bytes(-file.tell() % tarfile.RECORDSIZE))
 
 
 def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
-    """Read a shard's samples.
+    """Read the samples of a shard from a file at its beginning.
 
-    Parameters
-    ----------
-    file : file
-        At its beginning.
-    check : bool
-        Read all members and compare their hashes; false reads the metadata alone.
-
-    Yields
-    ------
-    StoredSample
+    With `check` all members are read and their hashes compared; without, the metadata alone are read.
 
     Raises
     ------
     BrokenShardError
-        At the first thing that is not a whole sample, nor the archive's end.
+        At the first thing that is neither a whole sample nor the end of the archive.
     """
     size, offset = os.fstat(file.fileno()).st_size, 0
-    sample: StoredSample | None = None
+    # Key and members of the sample that is being read; its metadata end it.
+    current, members = "", dict[str, tuple[int, int]]()
     while True:
         file.seek(offset)
         block = file.read(BLOCK)
         if block == bytes(BLOCK):
-            if sample is not None:
-                raise BrokenShardError(f"sample {sample.key} ends without metadata")
+            if members:
+                raise BrokenShardError(f"sample {current} ends without metadata")
             _check_end(file, offset, size)
             return
         name, length = _header(block, offset)
@@ -96,22 +78,21 @@ def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
         offset = start + length + -length % BLOCK
         if offset > size:
             raise BrokenShardError(f"{name} is cut short")
-        if sample is None:
-            sample = StoredSample(key)
-        if key != sample.key:
-            raise BrokenShardError(f"{name} stands inside sample {sample.key}")
-        if suffix in sample.members:
+        if members and key != current:
+            raise BrokenShardError(f"{name} stands inside sample {current}")
+        if suffix in members:
             raise BrokenShardError(f"{name} is there twice")
-        sample.members[suffix] = (start, length)
+        current, members[suffix] = key, (start, length)
         if suffix == "json":
-            sample.end, sample.meta = offset, _meta(file, name, start, length)
+            sample = StoredSample(key, members, offset, _meta(file, name, start, length))
             if check:
                 _check_hashes(file, sample)
             yield sample
-            sample = None
+            members = {}
 
 
 def _header(block: bytes, offset: int) -> tuple[str, int]:
+    """Return name and size of the member whose header is a block."""
     if len(block) < BLOCK:
         raise BrokenShardError(f"ends at byte {offset + len(block)} without the archive's end")
     try:
@@ -123,10 +104,10 @@ def _header(block: bytes, offset: int) -> tuple[str, int]:
     return header.name, header.size
 
 
-def _meta(file: IO[bytes], name: str, start: int, length: int) -> dict[str, Any]:
+def _meta(file: IO[bytes], name: str, start: int, length: int) -> SampleMeta:
     file.seek(start)
     try:
-        meta = json.loads(file.read(length))
+        meta: SampleMeta = json.loads(file.read(length))
     except (json.JSONDecodeError, UnicodeDecodeError):
         raise BrokenShardError(f"{name} is no JSON") from None
     if not isinstance(meta, dict) or not isinstance(meta.get("sha256"), dict):
@@ -154,7 +135,7 @@ def _check_end(file: IO[bytes], offset: int, size: int) -> None:
 
 
 def whole_samples(file: IO[bytes]) -> tuple[list[StoredSample], bool]:
-    """Give the whole samples at a shard's beginning, and whether the shard is whole."""
+    """Return the whole samples at a shard's beginning, and whether the shard is whole."""
     found: list[StoredSample] = []
     try:
         for sample in samples(file):
@@ -166,20 +147,20 @@ def whole_samples(file: IO[bytes]) -> tuple[list[StoredSample], bool]:
 
 @contextmanager
 def locked(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file to append to, made if need be, that no other process writes meanwhile."""
+    """Open a file to append to, created if needed, that no other process writes meanwhile."""
     while True:
         path.touch()
         with path.open("r+b") as file:
-            # A writer whose parent was killed may live for a moment yet.
+            # A writer whose parent was killed may live for another moment.
             fcntl.flock(file, fcntl.LOCK_EX)
-            # It may have finished the file and given it its final name.
+            # It may have finished the file and renamed it.
             if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 yield file
                 return
 
 
 def read_member(file: IO[bytes], sample: StoredSample, suffix: str) -> bytes:
-    """Give the bytes of a sample's member."""
+    """Return the bytes of a sample's member."""
     start, length = sample.members[suffix]
     file.seek(start)
     return file.read(length)

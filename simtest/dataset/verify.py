@@ -1,9 +1,8 @@
-"""Checks a dataset's folder: every byte against its hash, every value against what it must be."""
+"""Verifies a dataset's folder: every byte against its hash, every value against its range and the other values."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -21,41 +20,31 @@ from simtest.dataset.manifest import (
     new_manifest,
     read_manifest,
 )
+from simtest.dataset.metadata import SampleMeta
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.reader import decode
-from simtest.dataset.sample import sample_key
+from simtest.dataset.sample import Sample, decode, sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
-from simtest.dataset.writer import PART, repair
+from simtest.dataset.shard_writer import PART, repair
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime import provenance
+from simtest.runtime.arrays import AnyArray
 from simtest.runtime.engines import Engine
 from simtest.spec.camera_spec import CameraSpec
 from simtest.validation.runner import Progress
 
-Array = np.ndarray[Any, Any]
-
 MAX_DEPTH_NORMAL_DEG = 5.0
 """The median angle between a sample's normals and those of its depth map is far below this, whatever its noise."""
 
-
 MAX_DEPTH_ERROR = 0.05
-"""The nearest pixel's depth differs from a highlight's distance by less than this share, but for another unit."""
+"""The nearest pixel's depth differs from a highlight's distance by less than this share, unless units differ."""
 
 REQUIRED = tuple(field.name for field in FIELDS if field.name != "radiance")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that is wrong.
-
-    Parameters
-    ----------
-    file : str
-        Name in the folder.
-    what : str
-        What is wrong with it.
-    """
+    """What is wrong with a file, named as in the folder."""
 
     file: str
     what: str
@@ -65,24 +54,10 @@ class Fault:
 
 
 def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
-    """Check a dataset.
+    """Check a dataset; return its faults, none if it is sound.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    progress : callable, optional
-        Told of samples checked, samples in all, and the shard.
-
-    Returns
-    -------
-    list of Fault
-        Empty where all is well.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist.
+    `progress` is called with samples checked, samples in all, and the shard. Raises `InputError` if there is no such
+    folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -97,7 +72,7 @@ def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
     done = 0
     for shard in plan.shards:
         if shard.name not in damaged and shard.name in manifest.shards:
-            found = list(_shard(folder, manifest, shard))
+            found = list(_shard(folder, shard))
             damaged |= {fault.file for fault in found}
             faults += found
         done += len(shard.indices)
@@ -110,16 +85,19 @@ def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
 
 
 def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
-    """Check which files are there."""
+    """Check which files exist, and their sizes and hashes."""
     planned = {shard.name for shard in plan.shards}
+    # manifest against plan
     for name in sorted(planned - set(manifest.shards)):
         yield Fault(name, "not finished; the dataset's command goes on with it")
     for name in sorted(set(manifest.shards) - planned):
         yield Fault(NAME, f"lists {name}, which the dataset does not have")
     if not planned - set(manifest.shards):
         yield from (Fault(name, "missing in the manifest") for name in (*TABLES, CARD) if name not in manifest.tables)
+    # files against manifest
     for name, entry in {**manifest.shards, **manifest.tables}.items():
         yield from _against(folder / name, entry)
+    # files that do not belong
     known = {NAME, *manifest.shards, *manifest.tables, *planned}
     for path in sorted(folder.iterdir()):
         if path.name in known:
@@ -141,28 +119,15 @@ def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
 
 
 def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
-    """Make broken files again, remove files that do not belong, and check once more.
+    """Make broken files anew, remove files that do not belong, and verify once more; return what is still broken.
 
-    Parameters
-    ----------
-    folder : Path
-        The dataset's.
-    faults : list of Fault
-        As `verify` gave them.
-    engine : Engine
-        Who does the work.
-    progress : callable, optional
-        Told of samples done, samples in all, and what is done.
-
-    Returns
-    -------
-    list of Fault
-        What is still broken.
+    `faults` are those of `verify`; `engine` runs the tasks; `progress` is called with samples done, samples in all, and
+    what is being done.
 
     Raises
     ------
     InputError
-        If the manifest is broken, which says what the dataset is: the dataset's own command makes it again.
+        If the manifest itself is broken: without it nobody knows which dataset this is.
     """
     if any(fault.file == NAME for fault in faults):
         raise InputError(f"{folder / NAME}: is broken; remove it with the other files, and give the dataset's command")
@@ -170,7 +135,7 @@ def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress |
     now = new_manifest(manifest.plan(), str(manifest.origin["variant"]))
     check_same(folder, manifest, now)
     known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD}
-    # A folder may hold anything: it stays, and is named again.
+    # A folder may hold anything: it stays, and is listed again.
     foreign = [folder / fault.file for fault in faults if fault.file not in known]
     for path in (path for path in foreign if path.is_symlink() or not path.is_dir()):
         path.unlink(missing_ok=True)
@@ -181,7 +146,7 @@ def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress |
 # Content ------------------------------------------------------------------------------------------------------------
 
 
-def _shard(folder: Path, manifest: Manifest, shard: Shard) -> Iterator[Fault]:
+def _shard(folder: Path, shard: Shard) -> Iterator[Fault]:
     indices: list[int] = []
     try:
         with (folder / shard.name).open("rb") as file:
@@ -198,51 +163,47 @@ def _shard(folder: Path, manifest: Manifest, shard: Shard) -> Iterator[Fault]:
         yield Fault(shard.name, f"holds {len(indices)} samples; must hold {len(shard.indices)}, in their order")
 
 
-def check_sample(members: dict[str, bytes], meta: dict[str, Any]) -> Iterator[str]:
-    """Check a sample's values: sizes, ranges, unit normals that face the camera, depth against normals, counts.
+def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
+    """Yield what is wrong with a sample's values, of which the metadata's may be missing or malformed.
 
-    Parameters
-    ----------
-    members : dict
-        Bytes by suffix.
-    meta : dict
-        Metadata.
-
-    Yields
-    ------
-    str
-        What is wrong.
+    Sizes, ranges, unit normals that face the camera, depth against normals, and counts are checked; `members` are bytes
+    by suffix.
     """
+    # decoding
     try:
-        record = decode(members, meta)
+        sample = decode(members, meta)
         camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
         highlights = meta["highlights"]
     except (ValueError, KeyError, TypeError) as error:
         yield f"cannot be decoded ({error})"
         return
-    if lacking := [name for name in REQUIRED if name not in record]:
+    if lacking := [name for name in REQUIRED if name not in sample.images]:
         yield f"has no {', '.join(lacking)}"
         return
+    # sizes
     size = (camera.height, camera.width)
-    for name, array in record.items():
-        if name != "meta" and array.shape[:2] != size:
+    for name, array in sample.images.items():
+        if array.shape[:2] != size:
             yield f"{name} is {array.shape[:2]}; must be {size}"
             return
-    yield from _surface(record, camera)
-    if record["instance"].max() > len(highlights):
-        yield f"instance names highlight {int(record['instance'].max())} of {len(highlights)}"
+    # depth, normals and curvatures
+    yield from _surface(sample, camera)
+    # highlights
+    depth, instance = sample.images["depth"], sample.images["instance"]
+    if instance.max() > len(highlights):
+        yield f"instance names highlight {int(instance.max())} of {len(highlights)}"
     for number, highlight in enumerate(highlights):
-        normal, place = np.asarray(highlight["normal"]), np.asarray(highlight["position_mm"])
-        if abs(float(np.linalg.norm(normal)) - 1) > 1e-6 or normal @ place >= 0:
+        normal, position = np.asarray(highlight["normal"]), np.asarray(highlight["position_mm"])
+        if abs(float(np.linalg.norm(normal)) - 1) > 1e-6 or normal @ position >= 0:
             yield f"highlight {number}: its normal is no unit vector that faces the camera"
         column, row = (min(int(v), end - 1) for v, end in zip(highlight["bp_px"], size[::-1], strict=True))
-        seen = float(record["depth"][row, column])
+        seen = float(depth[row, column])
         if highlight["isolated"] and not abs(seen / highlight["distance_mm"] - 1) < MAX_DEPTH_ERROR:
             yield f"highlight {number}: depth is {seen:g} mm and its distance {highlight['distance_mm']:g} mm"
 
 
-def _surface(record: dict[str, Any], camera: Camera) -> Iterator[str]:
-    depth, normal, curvature = record["depth"], record["normal"], record["curvature"]
+def _surface(sample: Sample, camera: Camera) -> Iterator[str]:
+    depth, normal, curvature = (sample.images[name] for name in ("depth", "normal", "curvature"))
     there = np.isfinite(depth)
     if not there.any():
         yield "shows no surface"
@@ -265,21 +226,21 @@ def _surface(record: dict[str, Any], camera: Camera) -> Iterator[str]:
         yield f"normals are {angle:.1f} deg from those of the depth map (median); at most {MAX_DEPTH_NORMAL_DEG:g}"
 
 
-def _angle_to_depth(points: Array, normal: Array) -> float:
-    """Give the median angle between normals and those of the depth map's own differences, deg."""
+def _angle_to_depth(points: AnyArray, normal: AnyArray) -> float:
+    """Return the median angle, deg, between normals and those of the differences between neighbouring points."""
     along_x = points[1:-1, 2:] - points[1:-1, :-2]
     along_y = points[2:, 1:-1] - points[:-2, 1:-1]
     own = np.cross(along_y, along_x)
     with np.errstate(invalid="ignore", divide="ignore"):
         own /= np.linalg.norm(own, axis=-1, keepdims=True)
     inner = normal[1:-1, 1:-1]
-    # Either sign: that they face the camera is checked apart.
+    # Of either sign: whether normals face the camera is checked separately.
     sine = np.linalg.norm(np.cross(own, inner), axis=-1)
     return float(np.degrees(np.nanmedian(np.arcsin(np.clip(sine, 0, 1)))))
 
 
 def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> Iterator[Fault]:
-    # Another version of simtest may write other columns and another card; their hashes are checked all the same.
+    # Another version of simtest may write other columns and another card; their hashes are checked in any case.
     same_code = manifest.origin.get("source") == provenance.source_hash()
     is_listed = CARD not in damaged and CARD in manifest.tables
     if same_code and is_listed and (folder / CARD).read_text(encoding="utf-8") != make_card(plan, manifest):

@@ -21,7 +21,7 @@ from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec import Scene
 from simtest.spec.reflectance import PhongReflectance
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Spec
 from simtest.surfaces import Shape, SurfaceModel, make_surface
 
 SCENE_FILE, MESH_FILE = "scene.xml", "surface.ply"

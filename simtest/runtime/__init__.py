@@ -1,1 +1,5 @@
-"""What everything stands on: files, resources, seeds, provenance, measuring, and engines that do the work."""
+"""What every package stands on.
+
+`files` writes atomically, `resources` finds shipped data, `seeds` holds the seed tree, `provenance` records versions
+and hashes, `measuring` takes times and memory, `arrays` names the array types, `engines` runs tasks in parallel.
+"""

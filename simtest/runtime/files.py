@@ -1,4 +1,4 @@
-"""Writing files so that a reader never meets half of one."""
+"""Atomic writing of files: a reader never meets half of one."""
 
 import json
 import os
@@ -14,13 +14,13 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 
 def refuse_file(folder: Path) -> None:
-    """Raise `InputError` where a folder for results is wanted and a file stands."""
+    """Raise `InputError` if the path of a results folder is a file."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for results; raise `InputError` where that cannot be."""
+    """Make a folder for results; raise `InputError` if that is impossible."""
     refuse_file(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -29,18 +29,14 @@ def make_folder(folder: Path) -> None:
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file under a temporary name, flush it to disk, then rename it into place.
+    """Write a file under a temporary name, flush it to disk, then rename it.
 
-    Parameters
-    ----------
-    path : Path
-        The final file.
-    write : callable
-        Writes to the path it is given, which has the final file's suffix.
+    `write` is called with the temporary path, which has the final file's suffix.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         write(part)
+        # The content must be on disk before the rename is, or a loss of power leaves an empty file.
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
@@ -49,7 +45,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder's list of files to disk: a rename into it then outlasts a loss of power."""
+    """Flush a folder's list of files to disk, so that a rename into it survives a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -58,7 +54,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_json(path: Path, value: Any, compact: bool = False) -> None:
-    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none."""
-    how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
-    text = json.dumps(value, allow_nan=False, **how) + "\n"
+    """Write JSON atomically, on one line if `compact`; raise `ValueError` for NaN and infinity, which JSON lacks."""
+    separators, indent = ((",", ":"), None) if compact else (None, 2)
+    text = json.dumps(value, allow_nan=False, separators=separators, indent=indent) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

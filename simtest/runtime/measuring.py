@@ -1,30 +1,18 @@
-"""Run time and memory: times taken in turns, and the memory of a process and all that it has started."""
+"""Run time and memory: interleaved timings, and the memory of a process with all its descendants."""
 
 import statistics
 import threading
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 
 def times_in_turns(
     functions: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, list[float]]:
-    """Time functions in turns, so that what slows the machine down for a while slows all of them.
+    """Return the times of functions by name, s, one per round.
 
-    Parameters
-    ----------
-    functions : mapping
-        Function without arguments by name; each is called once beforehand.
-    rounds : int
-        How many times each is timed.
-    clock : callable
-        Gives the time, s; default wall time.
-
-    Returns
-    -------
-    dict
-        Times by name, s, one a round.
+    The functions take turns, so that a slow spell of the machine slows all of them alike; each is called once
+    beforehand. `clock` returns the time, s.
     """
     for function in functions.values():
         function()
@@ -38,29 +26,46 @@ def times_in_turns(
 
 
 def in_turns(functions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Give the median wall time of functions by name, s; see `times_in_turns`."""
+    """Return the median wall time of each function by name, s; see `times_in_turns`."""
     return {name: statistics.median(times) for name, times in times_in_turns(functions, rounds).items()}
 
 
 def memory_of_tree_mib(pid: int) -> float | None:
-    """Give the memory of a process and its descendants, shared pages once, MiB; None where the system does not tell.
+    """Return the memory of a process and its descendants, MiB; None if the system does not report it.
 
-    What a page is shared by n processes counts for 1/n in each (Linux's proportional set size).
+    A page shared by n processes counts for 1/n in each of them (Linux's proportional set size).
     """
-    found = [_proportional_mib(member) for member in _tree(pid)]
-    known = [value for value in found if value is not None]
-    return sum(known) if known else None
+    import psutil  # 30 ms to import, and few commands measure memory
+
+    def proportional_size(process: psutil.Process) -> int | None:
+        try:
+            return getattr(process.memory_full_info(), "pss", None)
+        except psutil.Error:  # it ended meanwhile, or belongs to someone else
+            return None
+
+    try:
+        process = psutil.Process(pid)
+        sizes = [proportional_size(member) for member in (process, *process.children(recursive=True))]
+    except psutil.Error:
+        return None
+    known = [size for size in sizes if size is not None]
+    return sum(known) / 2**20 if known else None
 
 
 class PeakMemory:
-    """Watches the memory of a process and its descendants while the body of a `with` runs.
+    """Context manager that watches the memory of a process and its descendants.
 
     Parameters
     ----------
     pid : int
         The process.
     step_s : float
-        Time between two looks.
+        Time between two readings.
+
+    Attributes
+    ----------
+    peak_mib : float or None
+        The largest reading so far; None before the first.
     """
 
     def __init__(self, pid: int, step_s: float = 0.1) -> None:
@@ -84,20 +89,3 @@ class PeakMemory:
                 self.peak_mib = max(now, self.peak_mib or 0.0)
             if self._stop.wait(self._step_s):
                 return
-
-
-def _tree(pid: int) -> list[int]:
-    try:
-        # A thread other than the first may have started a process too.
-        listed = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
-    except OSError:
-        return [pid]
-    return [pid, *(descendant for children in listed for child in children for descendant in _tree(int(child)))]
-
-
-def _proportional_mib(pid: int) -> float | None:
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("Pss:")), None)

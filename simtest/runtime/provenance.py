@@ -1,4 +1,4 @@
-"""Where numbers come from: commit, versions, processor, and hashes of the inputs."""
+"""Origin of the numbers: commit, versions, processor, and hashes of the inputs."""
 
 import hashlib
 import importlib.metadata
@@ -6,28 +6,32 @@ import platform
 import subprocess
 from functools import cache
 from pathlib import Path
+from typing import TypedDict
 
 PACKAGES = (
-    "mitsuba",
-    "drjit",
-    "numpy",
-    "scipy",
-    "scikit-image",
-    "opencv-python-headless",
-    "trimesh",
-    "libigl",
-    "polars",
-)
+    "mitsuba", "drjit", "numpy", "scipy", "scikit-image", "opencv-python-headless", "trimesh", "libigl", "polars",
+)  # fmt: skip
 _ROOT = Path(__file__).resolve().parents[1]
 
 
+class Environment(TypedDict):
+    """What each report and JSON file states of its origin."""
+
+    commit: str | None
+    version: str
+    versions: dict[str, str]
+    python: str
+    processor: str
+    system: str
+
+
 def version() -> str:
-    """Give simtest's version."""
+    """Return simtest's version."""
     return importlib.metadata.version("simtest")
 
 
 def commit() -> str | None:
-    """Give the commit of the checkout that simtest runs from, with "+" where it is changed; None outside one."""
+    """Return the commit of simtest's checkout, with "+" if files are changed; None outside a checkout."""
     try:
         head = _git("rev-parse", "HEAD")
         return head + ("+" if _git("status", "--porcelain") else "")
@@ -36,7 +40,7 @@ def commit() -> str | None:
 
 
 def _git(*arguments: str) -> str:
-    # The package's own folder, not the caller's: a user's repository says nothing about simtest.
+    # The package's own folder, not the caller's: the commit of a user's repository means nothing here.
     if not (_ROOT.parent / ".git").exists():
         raise OSError("not a checkout")
     return subprocess.run(
@@ -45,7 +49,7 @@ def _git(*arguments: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Give the versions of the packages that numbers depend on."""
+    """Return the versions of the packages that numbers depend on."""
     found = {"simtest": version()}
     for name in PACKAGES:
         try:
@@ -56,7 +60,7 @@ def versions() -> dict[str, str]:
 
 
 def processor() -> str:
-    """Give the processor's name."""
+    """Return the processor's name."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -68,7 +72,7 @@ def processor() -> str:
 
 @cache
 def source_hash() -> str:
-    """Give a hash of simtest's own source: two runs are the same run only under the same code."""
+    """Return a hash of simtest's own source: two runs are the same run only under the same code."""
     digest = hashlib.sha256()
     for path in sorted(_ROOT.rglob("*.py")):
         digest.update(str(path.relative_to(_ROOT)).encode())
@@ -77,13 +81,13 @@ def source_hash() -> str:
 
 
 def file_hash(path: Path) -> str:
-    """Give the SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def environment() -> dict[str, str | dict[str, str] | None]:
-    """Give what a report prints of its origin."""
+def environment() -> Environment:
+    """Return commit, versions, processor and system of this run."""
     return {
         "commit": commit(),
         "version": version(),

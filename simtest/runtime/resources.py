@@ -1,4 +1,4 @@
-"""Finds the shipped scenes, experiments and mesh recipes by name, from a checkout or from an installed wheel."""
+"""Shipped scenes, experiments and mesh recipes found by name, in a checkout or an installed wheel."""
 
 from pathlib import Path
 
@@ -8,23 +8,19 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def data_root(kind: str) -> Path:
-    """Give the folder of the shipped data.
+    """Return the folder of the shipped data.
 
     Parameters
     ----------
     kind : {"scenes", "meshes"}
         Top-level folder of the checkout; inside a wheel it lies under ``simtest/_data``.
-
-    Returns
-    -------
-    pathlib.Path
     """
     installed = _PACKAGE / "_data" / kind
     return installed if installed.is_dir() else _PACKAGE.parent / kind
 
 
 def shown(text: object, limit: int = 300) -> str:
-    """Give a user's text as it stands in a message: on one line, and not longer than `limit`."""
+    """Return a user's text fit for a message: on one line, of at most `limit` characters."""
     line = str(text)
     if not line or not line.isprintable():
         line = repr(line)
@@ -32,20 +28,16 @@ def shown(text: object, limit: int = 300) -> str:
 
 
 def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...] = (".toml",)) -> Path:
-    """Find a file by path or by the name of a shipped one.
+    """Find a file by its path, or a shipped one by its name.
 
     Parameters
     ----------
     name : str or Path
         A path to a file, or the stem of a shipped file.
     kind, folder : str
-        Where shipped files lie: ``data_root(kind) / folder``.
+        Shipped files lie in ``data_root(kind) / folder``.
     suffixes : tuple of str
         Suffixes tried for a bare name.
-
-    Returns
-    -------
-    pathlib.Path
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """Writes a labelled frame: picture, radiance, ground truth, and what reconstruction may know of it."""
 
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.labelled_frame import LabelledFrame
 from simtest.spec import Scene, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
-from simtest.spec.toml_output import toml_tables
+from simtest.spec.toml_files import toml_tables
 
 FIELDS = {
     "frame.png": "sRGB-encoded picture of the sensor's frame, clipped to full scale",
@@ -121,7 +122,7 @@ def _description(frame: LabelledFrame) -> Json:
     scene, sensor, rig = frame.scene, frame.scene.sensor, frame.scene.rig
     described: dict[str, Json] = {
         "scene": scene.model_dump(mode="json"),
-        "camera": describe_camera(frame.camera),
+        "camera": cast(Json, describe_camera(frame.camera)),
         "full_scale": frame.full_scale,
     }
     fields: dict[str, Json] = {**FIELDS}
@@ -133,4 +134,5 @@ def _description(frame: LabelledFrame) -> Json:
     if rig.preset is not None or rig.is_drawn:
         described["lights_mm"] = rig.true_mm().tolist()
     described["highlights"] = [{**own.to_json(), "radiance": own.radiance} for own in frame.highlights]
-    return {**described, "fields": fields, "provenance": {**provenance.environment(), "variant": frame.variant}}
+    origin = cast("dict[str, Json]", provenance.environment())
+    return {**described, "fields": fields, "provenance": {**origin, "variant": frame.variant}}

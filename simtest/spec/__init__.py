@@ -1,8 +1,13 @@
-"""What to simulate: frozen, validated models read from TOML, and their JSON schema."""
+"""What to simulate: frozen, validated models read from TOML, and their JSON schema.
+
+`scene` gathers surface, reflectance, rig, camera and sensor; `experiment`, `dataset_recipe` and `profile` say which
+scenes are rendered; `calibration_file` and `camera_spec` read cameras, with `camera_formats` for files of others.
+`spec_model` is the base of all models, `toml_files` reads and writes TOML.
+"""
 
 from simtest.spec.calibration_file import CalibrationSpec, load_calibration
 from simtest.spec.camera_spec import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
-from simtest.spec.dataset import Dataset, load_dataset
+from simtest.spec.dataset_recipe import Dataset, load_dataset
 from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
 from simtest.spec.profile import Profile, ProfileEntry, experiments_of, load_profile
 from simtest.spec.rig import Emission, LightSpec, Rig
@@ -15,7 +20,7 @@ from simtest.spec.surface import (
     SphereSurface,
     Surface,
 )
-from simtest.spec.toml_input import apply_settings, parse_settings, read_toml
+from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
 __all__ = [
     "AnatomySurface",

@@ -8,10 +8,10 @@ from pydantic import Field, model_validator
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.falloff import CosineProfile, Profile
-from simtest.spec.ranges import Coordinate, Millimetres
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
-from simtest.spec.toml_input import Spec, read_toml, validate
+from simtest.spec.spec_model import Coordinate, Millimetres, Spec, validate
+from simtest.spec.toml_files import read_toml
 
 
 class SensorCalibration(Spec):
@@ -34,7 +34,7 @@ class RigCalibration(Spec):
     """What is known of the lights and of the working distance."""
 
     lights_mm: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(
-        (), max_length=32, description="places of the lights, camera frame, mm; default not known"
+        (), max_length=32, description="positions of the lights, camera frame, mm; default not known"
     )
     distance_mm: Millimetres | None = Field(
         None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
@@ -70,7 +70,7 @@ class CalibrationSpec(Spec):
     surface: SurfaceCalibration = SurfaceCalibration()
 
     def priors(self) -> Priors:
-        """Give what estimators are told of lights, distance and lobe."""
+        """Return the priors on lights, distance and lobe."""
         rig, exponent = self.rig, self.surface.phong_exponent
         distance = None if rig.distance_mm is None else Normal(rig.distance_mm, rig.distance_sd_mm)
         lobe = None if exponent is None else exactly(PhongReflectance(exponent=exponent).lobe_curvature)

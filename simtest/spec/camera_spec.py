@@ -3,16 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.resources import shown
-from simtest.spec.toml_input import Spec, read_toml, validate
-from simtest.spec.toml_output import toml_tables, toml_value
+from simtest.spec.spec_model import Spec, validate
+from simtest.spec.toml_files import read_toml, toml_tables, toml_value
 
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -43,7 +43,7 @@ class BrownConradySpec(Spec):
     k6: Coefficient = Field(0.0, description="radial, of the denominator")
 
     def model(self) -> BrownConrady:
-        """Give the lens as the geometry package uses it."""
+        """Return the lens as the geometry package uses it."""
         return BrownConrady(**self.model_dump(exclude={"type"}))
 
 
@@ -61,7 +61,7 @@ class KannalaBrandtSpec(Spec):
     k4: Coefficient = 0.0
 
     def model(self) -> KannalaBrandt:
-        """Give the lens as the geometry package uses it."""
+        """Return the lens as the geometry package uses it."""
         return KannalaBrandt(**self.model_dump(exclude={"type"}))
 
 
@@ -102,7 +102,7 @@ class CameraSpec(Spec):
         return self
 
     def model(self) -> Camera:
-        """Give the camera as the geometry package uses it."""
+        """Return the camera as the geometry package uses it."""
         middle = (self.width / 2, self.height / 2)
         cx, cy = _centre(self.cx, self.cy, middle)
         lens = None if self.distortion is None else self.distortion.model()
@@ -116,45 +116,60 @@ def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> 
     return middle[0] if cx is None else cx, middle[1] if cy is None else cy
 
 
-def camera_table(camera: Camera) -> dict[str, Any]:
-    """Give a camera as the nested table that `CameraSpec` reads; what is at its default is left out.
+class CameraTable(TypedDict):
+    """A camera as the nested table that `CameraSpec` reads."""
 
-    Parameters
-    ----------
-    camera : Camera
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    skew: float
+    distortion: NotRequired[dict[str, str | float]]
+    view_mask: NotRequired[dict[str, float]]
 
-    Returns
-    -------
-    dict
-    """
-    table: dict[str, Any] = {
-        name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "skew")
-    }
+
+class CameraDescription(TypedDict):
+    """A camera in the JSON files that simtest writes."""
+
+    width: int
+    height: int
+    K: list[list[float]]
+    pixel_centres: str
+    distortion: NotRequired[dict[str, str | float]]
+    view_mask: NotRequired[dict[str, float]]
+
+
+def camera_table(camera: Camera) -> CameraTable:
+    """Return a camera as the nested table that `CameraSpec` reads; lens and view mask only if there are any."""
+    table: CameraTable = {
+        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "cx": camera.cx, "cy": camera.cy, "skew": camera.skew,
+    }  # fmt: skip
     if camera.distortion is not None:
-        table["distortion"] = _lens_table(camera.distortion)
+        kind = "brown_conrady" if isinstance(camera.distortion, BrownConrady) else "kannala_brandt"
+        table["distortion"] = {"type": kind, **asdict(camera.distortion)}
     if camera.view_mask is not None:
         table["view_mask"] = asdict(camera.view_mask)
     return table
 
 
-def _lens_table(lens: Distortion) -> dict[str, Any]:
-    return {"type": "brown_conrady" if isinstance(lens, BrownConrady) else "kannala_brandt", **asdict(lens)}
-
-
-def describe_camera(camera: Camera) -> dict[str, Any]:
-    """Describe a camera for the JSON files that simtest writes: size, K, lens and view mask if any."""
+def describe_camera(camera: Camera) -> CameraDescription:
+    """Return a camera as simtest's JSON files describe it: size, K, and lens and view mask if there are any."""
     table = camera_table(camera)
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "K": camera.K.tolist(),
-        "pixel_centres": "integer + 0.5",
-        **{key: table[key] for key in ("distortion", "view_mask") if key in table},
-    }
+    described: CameraDescription = {
+        "width": camera.width, "height": camera.height, "K": camera.K.tolist(), "pixel_centres": "integer + 0.5",
+    }  # fmt: skip
+    if "distortion" in table:
+        described["distortion"] = table["distortion"]
+    if "view_mask" in table:
+        described["view_mask"] = table["view_mask"]
+    return described
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read a camera file; the half pixel between conventions is added or taken off here (docs/cameras.md).
+    """Read a camera file; the half pixel between conventions is added or subtracted here (docs/cameras.md).
 
     Parameters
     ----------
@@ -163,18 +178,14 @@ def load_camera(path: str | Path) -> Camera:
         struct of ``toStruct(cameraParams)``; anything else TOML with the keys of `CameraSpec`, at top level or under
         ``[camera]``.
 
-    Returns
-    -------
-    Camera
-
     Raises
     ------
     InputError
         If the file is missing or malformed, or describes a lens that simtest does not know.
     """
-    # Imported here: OpenCV and SciPy are slow to load, and scenes need neither.
     path = Path(path)
     kind = path.suffix.lower()
+    # Imported on demand: OpenCV and SciPy are slow to load, and scenes need neither.
     if kind in OPENCV_SUFFIXES:
         from simtest.spec.camera_formats.opencv import read_opencv
 
@@ -192,7 +203,7 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def is_toml(path: Path) -> bool:
-    """Tell whether `load_camera` reads a file as TOML: by its suffix it is none of OpenCV's, ROS' or MATLAB's."""
+    """Return whether `load_camera` reads a file as TOML: its suffix is none of OpenCV's, ROS' or MATLAB's."""
     return path.suffix.lower() not in (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
 
 
@@ -244,11 +255,11 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
 
 
 def camera_toml(camera: Camera) -> str:
-    """Give a camera as the text of simtest's own TOML file."""
+    """Return a camera as the text of simtest's own TOML file."""
     table = camera_table(camera)
-    inner: dict[str, dict[str, Any]] = {key: table.pop(key) for key in ("distortion", "view_mask") if key in table}
+    inner = {key: value for key, value in table.items() if isinstance(value, dict)}
     lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt"}
     kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]
-    lines += [f"{key} = {toml_value(value)}" for key, value in table.items()]
+    lines += [f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner]
     return "\n".join([*lines, "", toml_tables(inner)] if inner else [*lines, ""])

@@ -1,6 +1,5 @@
-"""The experiment: which scenes, which swept parameters, how many realisations, which estimators."""
+"""Validation experiments: which scenes, which swept parameters, how many realisations, which estimators."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -9,12 +8,12 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.resources import find
-from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
+from simtest.spec.spec_model import Name, Spec, load
 
 LawName = Literal[
     "circle_pose", "branch_point", "axis_ratio", "axis_ratio_seen", "offset", "bisector", "falloff", "look"
 ]
-"""Error laws of docs/theory.md, section 4, that a page compares with what was measured."""
+"""Error laws of docs/theory.md, section 4, that a page compares with measured errors."""
 
 
 class Uniform(Spec):
@@ -67,7 +66,7 @@ class Group(Spec):
 class Experiment(Spec):
     """A validation experiment."""
 
-    name: str = Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")
+    name: Name
     title: str = ""
     description: str = ""
     realisations: int = Field(20, ge=1, le=10**6)
@@ -90,10 +89,6 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
         Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced, realisations in all
         groups; all other paths are those of the scene and apply to each group, in place of a sweep over them.
 
-    Returns
-    -------
-    Experiment
-
     Raises
     ------
     InputError
@@ -102,9 +97,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     path = find(name, "scenes", "experiments")
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
-    data = apply_settings(read_toml(path), own, str(path))
-    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
-    experiment = validate(Experiment, data, place(path, own))
+    experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
     if "realisations" in own:
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
@@ -115,7 +108,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
-    """Fix scene values in a group; a swept or random value of the same path, or below it, gives way."""
+    """Fix scene values in a group; swept and random values of the same path, or below it, are dropped."""
     varied = [*group.random, *(key for table in (*group.sweep, *group.pool) for key in table)]
     for path in settings:
         for key in varied:

@@ -1,4 +1,4 @@
-"""A factor over the angle from an axis, as scene and calibration files give it."""
+"""Factors over the angle from an axis, as scene and calibration files hold them."""
 
 from typing import Annotated, Literal
 
@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.geometry.angular_profile import AngularProfile
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Spec
 
 
 class CosineProfile(Spec):
@@ -16,7 +16,7 @@ class CosineProfile(Spec):
     power: float = Field(0.0, ge=0, le=1000, description="k of cos^k; 0 is uniform in all directions")
 
     def model(self) -> AngularProfile:
-        """Give the profile as the geometry package uses it."""
+        """Return the profile as the geometry package uses it."""
         return AngularProfile(self.power)
 
 
@@ -42,7 +42,7 @@ class TableProfile(Spec):
         return self
 
     def model(self) -> AngularProfile:
-        """Give the profile as the geometry package uses it."""
+        """Return the profile as the geometry package uses it."""
         return AngularProfile(angles=tuple(np.radians(self.angle_deg).tolist()), values=self.value)
 
 

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.geometry.camera import Camera
-from simtest.spec.toml_input import Spec, validate
+from simtest.runtime.arrays import Array
+from simtest.spec.spec_model import Spec, validate
 
 
 class PaperSetting(Spec):
@@ -43,7 +43,7 @@ class PaperSetting(Spec):
         return Camera(size, size, float(size), float(size), size / 2, size / 2)
 
     @property
-    def normal(self) -> npt.NDArray[np.float64]:
+    def normal(self) -> Array:
         """The plane's normal in the imaging camera's frame, facing it, unit, shape (3,)."""
         theta = np.radians(self.theta_deg)
         return np.array([0.0, np.sin(theta), -np.cos(theta)])
@@ -57,10 +57,10 @@ class PaperScene(Spec):
 
 
 def is_paper(data: Mapping[str, Any]) -> bool:
-    """Tell whether a scene's tables are those of the published protocol."""
+    """Return whether a scene's tables are those of the published protocol."""
     return "paper" in data
 
 
 def paper_from_dict(data: Mapping[str, Any], where: str) -> PaperSetting:
-    """Validate a scene of the published protocol given as nested tables; raises `InputError`."""
+    """Validate a scene of the published protocol given as nested tables; raise `InputError` if it is malformed."""
     return validate(PaperScene, data, where).paper

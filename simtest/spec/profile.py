@@ -1,6 +1,5 @@
-"""The nightly's profile: a fixed list of experiments, and how much of each is run."""
+"""Profiles of the nightly: a fixed list of experiments, and how much of each is run."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,17 +9,16 @@ from pydantic import Field, model_validator
 from simtest.errors import InputError
 from simtest.runtime.resources import find, shown
 from simtest.spec.experiment import Experiment, Group, load_experiment
-from simtest.spec.toml_input import Spec, place, read_toml, validate
+from simtest.spec.spec_model import Name, Spec, load
 
 
 class ProfileEntry(Spec):
     """One experiment of a night."""
 
     experiment: str = Field(min_length=1, description="a shipped name, or a path; relative ones start at the profile")
-    name: str | None = Field(
-        None, min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$",
-        description="name in the results, where one experiment is run twice; seeds hang on it",
-    )  # fmt: skip
+    name: Name | None = Field(
+        None, description="name in the results, where one experiment is run twice; seeds hang on it"
+    )
     realisations: int | None = Field(None, ge=1, le=10**6, description="of each setting, in place of the experiment's")
     pool: int | None = Field(
         None, ge=1, description="how many pooled values (an anatomy's viewpoints) of each setting are kept, at most"
@@ -34,7 +32,7 @@ class ProfileEntry(Spec):
 class Profile(Spec):
     """What a night runs."""
 
-    name: str = Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")
+    name: Name
     title: str = ""
     description: str = ""
     experiments: tuple[ProfileEntry, ...] = Field(min_length=1, max_length=100)
@@ -52,27 +50,12 @@ class Profile(Spec):
 
 
 def load_profile(name: str | Path) -> Profile:
-    """Read a profile.
+    """Read a profile, by its path or the name of a shipped one; the paths of its experiments become absolute.
 
-    Parameters
-    ----------
-    name : str or Path
-        A path, or the name of a shipped profile.
-
-    Returns
-    -------
-    Profile
-        With the paths of its experiments made absolute.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    Raises `InputError` if the file is missing or malformed.
     """
     path = find(name, "scenes", "profiles")
-    data = read_toml(path)
-    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
-    profile = validate(Profile, data, place(path, {}))
+    profile = load(Profile, path)
     entries = (
         entry.model_copy(update={"experiment": _beside(path, entry.experiment)}) for entry in profile.experiments
     )
@@ -80,18 +63,15 @@ def load_profile(name: str | Path) -> Profile:
 
 
 def _beside(profile: Path, experiment: str) -> str:
-    """Give the path of an experiment that lies beside its profile; any other name as it is."""
+    """Return the path of an experiment that lies beside its profile; any other name as it is."""
     path = profile.resolve().parent / experiment
     return str(path) if path.is_file() else experiment
 
 
 def experiments_of(profile: Profile) -> list[Experiment]:
-    """Read a profile's experiments, cut down as it says.
+    """Read a profile's experiments, reduced as it demands.
 
-    Raises
-    ------
-    InputError
-        If an experiment is missing or malformed, or has no group of a label that is asked for.
+    Raises `InputError` if one is missing or malformed, or has no group of a demanded label.
     """
     return [_experiment(profile, entry) for entry in profile.experiments]
 
@@ -115,6 +95,6 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
 
 
 def _thinned(group: Group, count: int) -> Group:
-    """Keep the first pooled values of a group: seeds hang on their places."""
+    """Keep the first pooled values of a group: each value's seed depends on its index."""
     pool = tuple({key: values[:count] for key, values in table.items()} for table in group.pool)
     return group.model_copy(update={"pool": pool})

@@ -4,11 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from simtest.spec.ranges import Share
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Share, Spec
 
 ROUNDING = 1e-9
-"""What a sum of shares written in decimals may exceed 1 by."""
+"""By how much a sum of shares written in decimals may exceed 1."""
 
 
 class _Reflectance(Spec):

@@ -1,16 +1,17 @@
 """The lights that travel with the camera: given one by one, or by a preset."""
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec.falloff import CosineProfile, Profile, TableProfile
-from simtest.spec.ranges import Coordinate
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Coordinate, Spec
 
 Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
 Gain = Annotated[float, Field(ge=0, le=1e6)]
@@ -21,9 +22,9 @@ COLOCATED_MM = 1e-9
 """A light no farther than this from the camera centre is at the camera: it sees what the camera sees."""
 
 
-def is_at_camera(place_mm: npt.ArrayLike) -> bool:
-    """Tell whether a place, shape (3,), camera frame, mm, is the camera's."""
-    return float(np.linalg.norm(place_mm)) <= COLOCATED_MM
+def is_at_camera(position_mm: npt.ArrayLike) -> bool:
+    """Return whether a position, shape (3,), camera frame, mm, is the camera centre."""
+    return float(np.linalg.norm(position_mm)) <= COLOCATED_MM
 
 
 class Emission(Spec):
@@ -48,7 +49,7 @@ class Emission(Spec):
         0.0,
         ge=0,
         le=1e3,
-        description="standard deviation of the true place about the given one, along each axis, mm; drawn by rig.seed",
+        description="standard deviation of the true position about the nominal, along each axis, mm; drawn by rig.seed",
     )
 
     @model_validator(mode="after")
@@ -72,7 +73,7 @@ class Emission(Spec):
         return self
 
     @property
-    def axis(self) -> npt.NDArray[np.float64]:
+    def axis(self) -> Array:
         """Unit axis of profile and spot, shape (3,), camera frame."""
         # The squares of a very short direction would underflow.
         axis = np.array(self.direction) / np.abs(self.direction).max()
@@ -83,17 +84,13 @@ class Emission(Spec):
         """Whether the light emits alike in all directions."""
         return self.spot_deg is None and self.profile.model().is_uniform
 
-    def factor(self, directions: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Give the emission relative to that of an isotropic light of the same power.
+    def factor(self, directions: npt.ArrayLike) -> Array:
+        """Return the emission relative to that of an isotropic light of the same power, shape (N,).
 
         Parameters
         ----------
         directions : array_like, shape (N, 3)
             Unit directions away from the light, camera frame.
-
-        Returns
-        -------
-        ndarray, shape (N,)
         """
         away = np.asarray(directions, dtype=float)
         cosine, sine = away @ self.axis, np.linalg.norm(np.cross(away, self.axis), axis=1)
@@ -106,13 +103,13 @@ class Emission(Spec):
 
 
 class LightSpec(Emission):
-    """A light, small enough to be a point, placed in the camera frame.
+    """A light, small enough to be a point, in the camera frame.
 
-    Its place is `position_mm`, or `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0.
+    Its nominal position is `position_mm`, or `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0.
     """
 
     position_mm: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
-        None, description="place in the camera frame, mm"
+        None, description="position in the camera frame, mm"
     )
     offset_mm: float = Field(0.0, ge=0, le=1e6, description="distance from the camera centre, mm")
     azimuth_deg: float = Field(0.0, ge=-360, le=360, description="direction of the offset, deg from x to y")
@@ -125,8 +122,8 @@ class LightSpec(Emission):
         return self
 
     @property
-    def place_mm(self) -> Vector:
-        """Nominal position in the camera frame, mm: what estimators are told."""
+    def nominal_mm(self) -> Vector:
+        """Nominal position in the camera frame, mm, as estimators know it."""
         if self.position_mm is not None:
             return self.position_mm
         angle = math.radians(self.azimuth_deg)
@@ -134,26 +131,33 @@ class LightSpec(Emission):
 
     @property
     def profile_of_view(self) -> CosineProfile | TableProfile | None:
-        """The emission over the angle of the sightline from the optical axis; None where it is no function of that.
+        """The emission as a function of the sightline's angle from the optical axis; None if it is no such function.
 
-        It is one of a light at the camera that shines along the optical axis. A spot is left out: beyond its rim
-        there is nothing to divide.
+        It is one for a light at the camera that shines along the optical axis. A spot is left out: beyond its rim
+        there is nothing to divide by.
         """
         along = not any(self.direction[:2]) and self.direction[2] > 0
-        return self.profile if along and self.spot_deg is None and is_at_camera(self.place_mm) else None
+        return self.profile if along and self.spot_deg is None and is_at_camera(self.nominal_mm) else None
 
 
 Preset = Literal["colocated", "laparoscope", "colonoscope_2", "colonoscope_3"]
 
-PRESETS: dict[Preset, dict[str, float]] = {
-    "colocated": {"count": 1, "radius_mm": 0.0},
-    "laparoscope": {"count": 8, "radius_mm": 4.0},
-    "colonoscope_2": {"count": 2, "radius_mm": 4.0},
-    "colonoscope_3": {"count": 3, "radius_mm": 4.0},
-}
-"""Number of lights and radius of the ring that they stand on, evenly spaced around the camera.
 
-Sizes of the class, not of one instrument: in a 10 mm laparoscope the ends of the fibres lie 3 to 5 mm from the axis,
+@dataclass(frozen=True)
+class Ring:
+    """Number of lights and radius of the ring that they stand on, evenly spaced around the camera."""
+
+    count: int
+    radius_mm: float
+
+
+PRESETS: dict[Preset, Ring] = {
+    "colocated": Ring(1, 0.0),
+    "laparoscope": Ring(8, 4.0),
+    "colonoscope_2": Ring(2, 4.0),
+    "colonoscope_3": Ring(3, 4.0),
+}
+"""Sizes of the class, not of one instrument: in a 10 mm laparoscope the ends of the fibres lie 3 to 5 mm from the axis,
 in the 12 to 13 mm tip of a colonoscope the light guides about 4 mm from the lens.
 """
 
@@ -195,51 +199,51 @@ class Rig(Spec):
 
     @model_serializer(mode="wrap")
     def _as_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out the lights that a preset gives: beside them none of its numbers could be changed."""
+        """Leave out the lights of a preset: beside them none of its numbers could be changed."""
         dumped: dict[str, Any] = dump(self)
         if self.preset is not None:
             dumped.pop("lights", None)
         return dumped
 
     def _ring(self) -> tuple[LightSpec, ...]:
-        """Give the preset's lights."""
+        """Return the preset's lights."""
         assert self.preset is not None
-        sizes = PRESETS[self.preset]
-        count = int(sizes["count"]) if self.count is None else self.count
-        radius = sizes["radius_mm"] if self.radius_mm is None else self.radius_mm
+        ring = PRESETS[self.preset]
+        count = ring.count if self.count is None else self.count
+        radius = ring.radius_mm if self.radius_mm is None else self.radius_mm
         if count > 1 and radius == 0:
             raise ValueError(f"count = {count}: with radius_mm = 0 all lights would be in one place")
-        emission: dict[str, Any] = {} if self.each is None else dict(self.each)
+        emission = {} if self.each is None else dict(self.each)
         power = (1.0 if self.power is None else self.power) / count
         first, lights = math.radians(self.azimuth_deg or 0.0), []
         for i in range(count):
             angle = first + 2 * math.pi * i / count
-            place = (radius * math.cos(angle), radius * math.sin(angle), self.axial_mm or 0.0)
-            lights.append(LightSpec(position_mm=place, power=power, **emission))
+            position = (radius * math.cos(angle), radius * math.sin(angle), self.axial_mm or 0.0)
+            lights.append(LightSpec(position_mm=position, power=power, **emission))
         return tuple(lights)
 
     def known_emission(self) -> CosineProfile | TableProfile | None:
-        """Give the profile that reconstruction may divide by: of a single light at the camera, along the optical axis.
+        """Return the profile that reconstruction may divide by: of one light at the camera, along the optical axis.
 
-        None where it is uniform or not known, for a spot, and for other rigs, whose falloff hangs on the distance too.
+        None if it is uniform or not known, for a spot, and for other rigs, whose falloff depends on distance too.
         """
         profile = self.lights[0].profile_of_view if len(self.lights) == 1 else None
-        told = self.emission_known and profile is not None and not profile.model().is_uniform
-        return profile if told else None
+        usable = self.emission_known and profile is not None and not profile.model().is_uniform
+        return profile if usable else None
 
     @property
     def is_drawn(self) -> bool:
-        """Whether the true places hang on the seed."""
+        """Whether the true positions depend on the seed."""
         return any(light.position_error_mm > 0 for light in self.lights)
 
-    def nominal_mm(self) -> npt.NDArray[np.float64]:
-        """Give the places that estimators are told, shape (L, 3), camera frame, mm."""
-        return np.array([light.place_mm for light in self.lights])
+    def nominal_mm(self) -> Array:
+        """Return the nominal light positions, as estimators know them, shape (L, 3), camera frame, mm."""
+        return np.array([light.nominal_mm for light in self.lights])
 
-    def true_mm(self) -> npt.NDArray[np.float64]:
-        """Give the places that are rendered, shape (L, 3), camera frame, mm: the nominal ones plus their errors."""
-        places = self.nominal_mm()
+    def true_mm(self) -> Array:
+        """Return the rendered light positions, the nominal ones plus their errors, shape (L, 3), camera frame, mm."""
+        positions = self.nominal_mm()
         if not self.is_drawn:
-            return places
+            return positions
         deviations = np.array([[light.position_error_mm] for light in self.lights])
-        return places + deviations * from_integer(self.seed).standard_normal(places.shape)
+        return positions + deviations * from_integer(self.seed).standard_normal(positions.shape)

@@ -10,12 +10,12 @@ from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Respons
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.ranges import Millimetres
 from simtest.spec.reflectance import PhongReflectance, Reflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
+from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surface import Surface
-from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
+from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 
 class Effort(Spec):
@@ -29,7 +29,7 @@ class Effort(Spec):
 class KnownSpec(Spec):
     """What estimators are told beside the picture and the camera's calibration."""
 
-    lights: bool = Field(True, description="whether they are told the lights' nominal places")
+    lights: bool = Field(True, description="whether they are told the lights' nominal positions")
     lobe: bool = Field(True, description="whether they are told the exponent of a Phong lobe")
     distance_mm: Millimetres | None = Field(None, description="working distance that they are told, mm")
     distance_error: float | None = Field(
@@ -63,10 +63,10 @@ class Scene(Spec):
     known: KnownSpec = KnownSpec()
 
     def calibration(self, distance_mm: float | None = None) -> Calibration:
-        """Give what reconstruction is told of the scene's camera, sensor, light and surface.
+        """Return what reconstruction knows of the scene's camera, sensor, lights and surface.
 
-        See the keys ``sensor.*_known``, ``rig.emission_known`` and ``known``. White noise is not told: each frame shows
-        it.
+        See the keys ``sensor.*_known``, ``rig.emission_known`` and ``known``. White noise is not part of it: it is
+        estimated from each frame.
 
         Parameters
         ----------
@@ -86,38 +86,21 @@ class Scene(Spec):
         )
 
     def _priors(self, distance_mm: float | None) -> Priors:
-        told = self.known.distance_mm
+        mean = self.known.distance_mm
         if self.known.distance_error is not None and distance_mm is not None:
-            told = distance_mm * (1 + self.known.distance_error)
+            mean = distance_mm * (1 + self.known.distance_error)
         lobe = None
         if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
             lobe = exactly(self.reflectance.lobe_curvature)
         return Priors(
-            tuple(light.place_mm for light in self.rig.lights) if self.known.lights else (),
-            None if told is None else Normal(told, told * self.known.distance_sd),
+            tuple(light.nominal_mm for light in self.rig.lights) if self.known.lights else (),
+            None if mean is None else Normal(mean, mean * self.known.distance_sd),
             lobe,
         )
 
 
 def scene_from_dict(data: Mapping[str, Any], where: str = "scene") -> Scene:
-    """Validate a scene given as nested tables.
-
-    Parameters
-    ----------
-    data : mapping
-        The tables of a scene file.
-    where : str
-        Name for messages.
-
-    Returns
-    -------
-    Scene
-
-    Raises
-    ------
-    InputError
-        If the data do not fit the schema.
-    """
+    """Validate a scene given as nested tables; `where` names it in the `InputError` if they do not fit the schema."""
     return validate(Scene, data, where)
 
 
@@ -131,10 +114,6 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     settings : mapping, optional
         Values that replace those of the file, by key path.
 
-    Returns
-    -------
-    Scene
-
     Raises
     ------
     InputError
@@ -143,4 +122,4 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     path = find(name, "scenes")
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", path.stem[:80])
-    return scene_from_dict(data, place(path, settings or {}))
+    return scene_from_dict(data, source_name(path, settings))

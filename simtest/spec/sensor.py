@@ -1,4 +1,4 @@
-"""The sensor of a scene: what turns radiance into a frame."""
+"""The sensor of a scene, which turns radiance into a frame."""
 
 from typing import Annotated, Literal
 
@@ -8,8 +8,7 @@ from simtest.calibration import NoiseModel, Response
 from simtest.calibration.response import check_table
 from simtest.errors import InputError
 from simtest.spec.falloff import CosineProfile, Profile
-from simtest.spec.ranges import Share
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Share, Spec
 
 FullWell = Annotated[float, Field(ge=1, le=1e9)]
 ReadNoise = Annotated[float, Field(ge=0, le=1e6)]
@@ -17,7 +16,7 @@ Bits = Annotated[int, Field(ge=8, le=16)]
 
 
 def check_electrons(full_well: float | None, read_noise: float) -> None:
-    """Raise `ValueError` where a read noise in electrons has no full well that gives it its share of full scale."""
+    """Raise `ValueError` for a read noise in electrons without a full well, which relates it to full scale."""
     if read_noise > 0 and full_well is None:
         raise ValueError(f"read_noise = {read_noise:g} electrons: needs full_well as well")
 
@@ -28,7 +27,7 @@ class LinearResponse(Spec):
     type: Literal["linear"] = "linear"
 
     def model(self) -> Response:
-        """Give the response as reconstruction uses it."""
+        """Return the response as reconstruction uses it."""
         return Response()
 
 
@@ -39,7 +38,7 @@ class GammaResponse(Spec):
     gamma: float = Field(2.2, ge=0.1, le=10, description="2.2: dark values are spread, as in most pictures")
 
     def model(self) -> Response:
-        """Give the response as reconstruction uses it."""
+        """Return the response as reconstruction uses it."""
         return Response("gamma", self.gamma)
 
 
@@ -49,7 +48,7 @@ class SrgbResponse(Spec):
     type: Literal["srgb"] = "srgb"
 
     def model(self) -> Response:
-        """Give the response as reconstruction uses it."""
+        """Return the response as reconstruction uses it."""
         return Response("srgb")
 
 
@@ -69,7 +68,7 @@ class TableResponse(Spec):
         return self
 
     def model(self) -> Response:
-        """Give the response as reconstruction uses it."""
+        """Return the response as reconstruction uses it."""
         return Response("table", light=self.light, value=self.value)
 
 
@@ -140,5 +139,5 @@ class Sensor(Spec):
         return self.saturation or self.encodes
 
     def noise_model(self) -> NoiseModel:
-        """Give the noise of one channel of the linear frame by its level."""
+        """Return the noise of one channel of the linear frame as a function of its level."""
         return NoiseModel(self.noise_sigma, self.full_well, self.read_noise, self.bits, self.response.model())

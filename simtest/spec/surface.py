@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.runtime.resources import find
-from simtest.spec.ranges import Curvature, Millimetres
-from simtest.spec.toml_input import Spec
+from simtest.spec.spec_model import Curvature, Millimetres, Spec
 
 EdgeLength = Annotated[float, Field(ge=0.01, le=100)]
 
@@ -54,12 +53,12 @@ class _Round(_Placed):
         return self
 
     def _camera_from_centre(self) -> float:
-        """Distance of the camera from the centre, for side inside, mm: across the axis for a cylinder."""
+        """Return the camera's distance from the centre, mm, for side inside: across the axis for a cylinder."""
         tilt = math.radians(self.tilt_deg)
         return math.hypot(self.radius_mm - self.distance_mm * math.cos(tilt), self._sideways() * math.sin(tilt))
 
     def _sideways(self) -> float:
-        """Part of the camera's distance from the anchor that counts when it is seen aslant, mm."""
+        """Return the part of the camera's distance from the anchor, mm, that counts when it is seen aslant."""
         return self.distance_mm
 
 
@@ -117,7 +116,7 @@ class AnatomySurface(Spec):
         description="auto: the pose numbered by viewpoint; in a lumen also path: on the camera path, looking ahead; "
         "off_axis: the same from beside it; wall: on it, looking across",
     )
-    path_share: float = Field(0.5, ge=0, le=1, description="place along the camera path, from one end to the other")
+    path_share: float = Field(0.5, ge=0, le=1, description="position along the camera path, from one end to the other")
     look_ahead_mm: float = Field(
         30.0, ge=1, le=200, description="how far on along the path the camera looks, mm; for path and off_axis"
     )
@@ -141,11 +140,11 @@ class AnatomySurface(Spec):
 
     @property
     def recipe_values(self) -> dict[str, Any]:
-        """The values that replace those of the recipe, the seed among them."""
+        """Values that replace those of the recipe, the seed among them."""
         return {**self.recipe, **({} if self.seed is None else {"seed": self.seed})}
 
     def file(self) -> Path:
-        """Give the recipe's or mesh's file; raise `InputError` where there is none."""
+        """Return the path of the recipe or mesh; raise `InputError` if there is no such file."""
         return find(self.path, "meshes")
 
 

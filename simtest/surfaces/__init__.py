@@ -1,4 +1,10 @@
-"""Surfaces with exact position, normal and curvature."""
+"""Surfaces with exact position, normal and curvature.
+
+`model` is what every surface offers, `factory` makes one from its description. `analytic` holds plane, sphere, cylinder
+and quadric; `colon` (with `tube`, `stalk`, `jets`) and `liver` are generated from a `recipe`; `mesh_surface` is a
+user's mesh, read by `mesh_file`, mended by `repair`, refined by `subdivision`, judged by `mesh_check`. `poses` and
+`centreline` place cameras.
+"""
 
 from simtest.surfaces.factory import forget_meshes, make_surface
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh

@@ -7,10 +7,9 @@ first principal direction.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from simtest.runtime.arrays import Array, IntArray
 from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
 from simtest.surfaces.model import (
-    Array,
-    IntArray,
     RayHits,
     Shape,
     SurfaceModel,
@@ -18,7 +17,7 @@ from simtest.surfaces.model import (
     TriangleMesh,
     implicit_shape_operator,
     pack_points,
-)
+)  # fmt: skip
 
 PLANE_REACH = 1000.0
 """Half-size of the rendered plane over the anchor's distance: beyond the view even at grazing tilt."""
@@ -30,11 +29,11 @@ QUADRIC_REACH = 1.0
 """Half-size of the rendered quadric patch over the anchor's distance."""
 
 QUADRIC_CELLS = 400
-"""Cells along one side of the quadric's mesh; about 2 px a cell at f = 406."""
+"""Cells along one side of the quadric's mesh; a cell is about 2 px wide at f = 406."""
 
 
 def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg: float) -> Array:
-    """Give model_from_camera, shape (4, 4), of a surface anchored on the optical axis.
+    """Return model_from_camera, shape (4, 4), of a surface anchored on the optical axis.
 
     The anchor is (0, 0, distance); its normal is (0, 0, -1) leaned by `tilt_deg` towards image direction
     `azimuth_deg`; at tilt 0 the model's x axis is image direction `spin_deg`.
@@ -43,6 +42,7 @@ def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg:
     x = np.array([np.cos(spin), np.sin(spin), 0.0])
     z = np.array([0.0, 0.0, -1.0])
     frame = np.stack([x, np.cross(z, x), z], axis=1)
+    # Tilted about the axis perpendicular to the direction in which the normal leans.
     lean = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     axis = np.cross(z, lean)
     rotation = Rotation.from_rotvec(tilt * axis).as_matrix()
@@ -64,12 +64,12 @@ class Plane(_Analytic):
     """The plane z = 0."""
 
     def shape(self) -> Shape:
-        """Give Mitsuba's rectangle, scaled beyond the view."""
+        """Return Mitsuba's rectangle, scaled beyond the view."""
         reach = PLANE_REACH * self.distance
         return Shape("plane", False, {"to_model": np.diag([reach, reach, 1.0, 1.0])}, None, "plane")
 
     def clearance(self, points: Array) -> Array:
-        """Give z (see `SurfaceModel.clearance`)."""
+        """Return z (see `SurfaceModel.clearance`)."""
         return np.asarray(points[:, 2])
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
@@ -94,12 +94,12 @@ class _Round(_Analytic):
         self.centre = np.array([0.0, 0.0, self.radius if self.inside else -self.radius])
 
     def clearance(self, points: Array) -> Array:
-        """Give the distance to the wall (see `SurfaceModel.clearance`)."""
+        """Return the distance to the wall (see `SurfaceModel.clearance`)."""
         outwards = np.linalg.norm((points - self.centre) * self._across, axis=1) - self.radius
         return -outwards if self.inside else outwards
 
     def _distance(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Root of |o + t d - centre|^2 = R^2: the near one from outside, the far one from inside."""
+        """Return the root of |o + t d - centre|^2 = R^2: the near one from outside, the far one from inside."""
         o = origins - self.centre
         a = np.sum(directions**2, axis=1)
         b = np.sum(o * directions, axis=1)
@@ -115,7 +115,7 @@ class Sphere(_Round):
     """A sphere through the anchor."""
 
     def shape(self) -> Shape:
-        """Give Mitsuba's sphere."""
+        """Return Mitsuba's sphere."""
         to_model = np.diag([self.radius, self.radius, self.radius, 1.0])
         to_model[:3, 3] = self.centre
         return Shape("sphere", self.inside, {"to_model": to_model}, None, f"sphere {self.inside}")
@@ -135,7 +135,7 @@ class Cylinder(_Round):
     _across = np.array([1.0, 0.0, 1.0])
 
     def shape(self) -> Shape:
-        """Give Mitsuba's cylinder: unit radius about z from 0 to 1, turned to y."""
+        """Return Mitsuba's cylinder: of unit radius about z from 0 to 1, turned to y."""
         half = CYLINDER_REACH * self.distance
         to_model = np.eye(4)
         to_model[:3, 0] = [self.radius, 0, 0]
@@ -162,7 +162,7 @@ class Quadric(_Analytic):
         self.curvatures = np.array([spec.k1_per_mm, spec.k2_per_mm, 0.0])
 
     def shape(self) -> Shape:
-        """Give a grid mesh with the exact vertex normals."""
+        """Return a grid mesh with the exact vertex normals."""
         reach = QUADRIC_REACH * self.distance
         side = np.linspace(-reach, reach, QUADRIC_CELLS + 1)
         x, y = (grid.ravel() for grid in np.meshgrid(side, side))
@@ -174,13 +174,13 @@ class Quadric(_Analytic):
         return Shape("mesh", False, {}, mesh, f"quadric {k1!r} {k2!r} {reach!r}")
 
     def clearance(self, points: Array) -> Array:
-        """Give F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""
+        """Return F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""
         k = self.curvatures
         value = points[:, 2] + np.sum(k * points**2, axis=1) / 2
         return np.asarray(value / np.linalg.norm(k * points + [0.0, 0.0, 1.0], axis=1))
 
     def vertex_shape_operators(self) -> Array:
-        """Give S at the grid's vertices (see `SurfaceModel.vertex_shape_operators`)."""
+        """Return S at the grid's vertices (see `SurfaceModel.vertex_shape_operators`)."""
         mesh = self.shape().mesh
         assert mesh is not None
         return self._shape_operator(mesh.vertices)[1]
@@ -192,11 +192,13 @@ class Quadric(_Analytic):
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the quadric at the root next to the rendered hit (see `SurfaceModel.points`)."""
         k = self.curvatures
+        # a t^2 + b t + c = 0 on the ray
         a = np.sum(k * directions**2, axis=1) / 2
         b = directions[:, 2] + np.sum(k * origins * directions, axis=1)
         c = origins[:, 2] + np.sum(k * origins**2, axis=1) / 2
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             root = np.sqrt(b**2 - 4 * a * c)
+            # Both roots without cancellation; a = 0 leaves one of them infinite.
             q = -(b + np.copysign(root, b)) / 2
             roots = np.stack([c / q, q / a])
             gap = np.abs(roots - hits.distance)
@@ -209,11 +211,9 @@ class Quadric(_Analytic):
 
 
 def grid_faces(columns: int, rows: int) -> IntArray:
-    """Triangulate a grid of (rows + 1) x (columns + 1) vertices stored row by row, counter-clockwise about +z.
+    """Triangulate a grid of (rows + 1) x (columns + 1) vertices stored row by row; shape (2 rows columns, 3).
 
-    Returns
-    -------
-    ndarray of int, shape (2 rows columns, 3)
+    The triangles are counter-clockwise about +z.
     """
     row, column = np.divmod(np.arange(rows * columns, dtype=np.int64), columns)
     corner = row * (columns + 1) + column

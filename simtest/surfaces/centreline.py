@@ -1,6 +1,6 @@
 """A camera path through a lumen: the centreline of its mesh, and poses along it.
 
-The lumen's inside is sampled on a grid; the path runs between the two places farthest apart in it along the way that
+The inside of the lumen is sampled on a grid. The path joins the two cells that are farthest apart, by the route that
 keeps farthest from the wall, and is then smoothed.
 """
 
@@ -10,28 +10,28 @@ from functools import lru_cache
 
 import igl
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage, sparse
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.surface import AnatomySurface
-from simtest.surfaces.model import Array, IntArray, SurfaceModel, TriangleMesh
+from simtest.surfaces.model import SurfaceModel, TriangleMesh
 from simtest.surfaces.poses import CLEARANCE_SHARE, MIN_CLEARANCE_MM, MeshProbe
 
 MAX_CELLS = 1_500_000
-"""Of the grid over the mesh's bounding box."""
+"""Cells of the grid over the mesh's bounding box, at most."""
 
 MIN_PITCH_MM = 1.0
 STEP_MM = 1.0
-"""Between the path's points."""
+"""Distance between the path's points."""
 
 SMOOTHING_MM = 6.0
-"""Standard deviation of the Gaussian along the path that takes the grid's steps out of it."""
+"""Standard deviation of the Gaussian along the path that removes the steps of the grid."""
 
 MIN_LENGTH_MM = 20.0
 WALL_MM = 1.0
-"""The path comes nowhere closer to the wall: where it would, it is cut and the longest piece kept."""
+"""The path is cut where it comes closer to the wall, and its longest piece is kept."""
 
 _NEIGHBOURS = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)]
 """Half of a cell's 26: each pair of cells is joined once."""
@@ -39,7 +39,7 @@ _NEIGHBOURS = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A smooth curve inside a lumen with a frame that turns no more than the curve does.
+    """A smooth curve inside a lumen, with a frame that turns no more than the curve does.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ class CameraPath:
     sides: Array
     length: float
 
-    def at(self, place: float) -> tuple[Array, Array, Array]:
-        """Give point, mm, and unit tangent and side at a place from 0 to `length`, mm; straight on beyond the ends."""
-        inside = min(max(place, 0.0), self.length)
+    def at(self, position: float) -> tuple[Array, Array, Array]:
+        """Return point, mm, unit tangent and side at a position of 0 to `length`, mm; straight on beyond the ends."""
+        inside = min(max(position, 0.0), self.length)
         index = inside / self.length * (len(self.points) - 1)
         low = min(int(index), len(self.points) - 2)
         share = index - low
@@ -67,11 +67,11 @@ class CameraPath:
         )
         tangent /= np.linalg.norm(tangent)
         side -= (side @ tangent) * tangent
-        return point + (place - inside) * tangent, tangent, side / np.linalg.norm(side)
+        return point + (position - inside) * tangent, tangent, side / np.linalg.norm(side)
 
 
 class _Keyed:
-    """A mesh that a cache can hold by its key."""
+    """A mesh that a cache can find by its key."""
 
     def __init__(self, key: str, mesh: TriangleMesh) -> None:
         self.key, self.mesh = key, mesh
@@ -84,22 +84,9 @@ class _Keyed:
 
 
 def camera_path(surface: SurfaceModel) -> CameraPath:
-    """Find the camera path through a surface's mesh; the last few are kept.
+    """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached.
 
-    Parameters
-    ----------
-    surface : SurfaceModel
-        A lumen with a mesh, closed or open at its ends.
-
-    Returns
-    -------
-    CameraPath
-        The same for the same mesh.
-
-    Raises
-    ------
-    InputError
-        If the mesh has no inside that a path of `MIN_LENGTH_MM` fits into.
+    Raises `InputError` if no path of `MIN_LENGTH_MM` fits into the mesh.
     """
     shape = surface.shape()
     assert shape.mesh is not None
@@ -109,14 +96,16 @@ def camera_path(surface: SurfaceModel) -> CameraPath:
 @lru_cache(maxsize=4)
 def _camera_path(keyed: _Keyed) -> CameraPath:
     mesh = keyed.mesh
+    # grid
     probe = MeshProbe(mesh)
     pitch = max(MIN_PITCH_MM, float(np.prod(np.ptp(mesh.vertices, axis=0)) / MAX_CELLS) ** (1 / 3))
     cells, corner = _inside(mesh, pitch)
     centres = corner + pitch * cells
     if not len(centres):
         raise InputError("surface.view: the mesh has no inside for a camera path; view = auto places single cameras")
+    # route and smooth path
     room = probe.distance(centres)
-    rough = centres[_way(cells, room)]
+    rough = centres[_route(cells, room)]
     path = _resampled(rough, pitch)
     path = _without_ends(path, probe.distance(path))
     length = STEP_MM * (len(path) - 1)
@@ -131,12 +120,12 @@ def _camera_path(keyed: _Keyed) -> CameraPath:
 
 
 def _inside(mesh: TriangleMesh, pitch: float) -> tuple[IntArray, Array]:
-    """Give the grid's cells inside the mesh's largest cavity, shape (N, 3), and the place of cell (0, 0, 0), mm."""
+    """Return the grid's cells inside the mesh's largest cavity, shape (N, 3), and the centre of cell (0, 0, 0), mm."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     counts = np.maximum(np.ceil((high - low) / pitch).astype(int), 1)
     corner = low + pitch / 2
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
-    # The winding number tells the inside of an open tube too: it is 1/2 where its end would be closed.
+    # The winding number identifies the inside of an open tube too: it is 1/2 where a cap would close the end.
     winding = igl.fast_winding_number(
         np.ascontiguousarray(mesh.vertices),
         np.ascontiguousarray(mesh.faces),
@@ -145,12 +134,14 @@ def _inside(mesh: TriangleMesh, pitch: float) -> tuple[IntArray, Array]:
     inside = np.abs(np.asarray(winding)).reshape(counts) > 0.5
     labels, count = ndimage.label(inside, np.ones((3, 3, 3)))
     if count > 1:
+        # The largest cavity; label 0 is the outside.
         inside = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
     return np.argwhere(inside), corner
 
 
-def _way(cells: IntArray, room: Array) -> IntArray:
-    """Give the cells' numbers along the roomiest way between the two cells farthest apart."""
+def _route(cells: IntArray, room: Array) -> IntArray:
+    """Return the cells' numbers along the roomiest route between the two cells farthest apart."""
+    # Graph of the cells: each is joined to its 26 neighbours. A border of empty cells saves the check of the ends.
     size = cells.max(axis=0) + 3
     number = np.full(size, -1, dtype=np.int64)
     number[tuple((cells + 1).T)] = np.arange(len(cells))
@@ -170,33 +161,35 @@ def _way(cells: IntArray, room: Array) -> IntArray:
         distance = sparse.csgraph.dijkstra(graph(steps), directed=False, indices=start)
         return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
 
+    # Farthest from the roomiest cell is one end, farthest from that one the other.
     start = farthest(int(np.argmax(room)))
     end = farthest(start)
     # Cubed, so that a detour through the middle is cheaper than a short cut along the wall.
     cost = steps / np.maximum((room[i] + room[j]) / 2, 1e-3) ** 3
     _, before = sparse.csgraph.dijkstra(graph(cost), directed=False, indices=start, return_predecessors=True)
-    way = [end]
-    while way[-1] != start and before[way[-1]] >= 0:
-        way.append(int(before[way[-1]]))
-    return np.array(way[::-1])
+    route = [end]
+    while route[-1] != start and before[route[-1]] >= 0:
+        route.append(int(before[route[-1]]))
+    return np.array(route[::-1])
 
 
 def _resampled(rough: Array, pitch: float) -> Array:
     """Smooth a row of points and space it evenly by `STEP_MM`."""
     for width in (pitch, SMOOTHING_MM):
-        place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
-        even = np.arange(0.0, place[-1], STEP_MM)
-        rough = np.stack([np.interp(even, place, column) for column in rough.T], axis=1)
-        rough = np.asarray(ndimage.gaussian_filter1d(rough, width / STEP_MM, axis=0, mode="nearest"))
-    place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
-    even = np.arange(0.0, place[-1], STEP_MM)
-    return np.stack([np.interp(even, place, column) for column in rough.T], axis=1)
+        rough = np.asarray(ndimage.gaussian_filter1d(_evenly(rough), width / STEP_MM, axis=0, mode="nearest"))
+    return _evenly(rough)
+
+
+def _evenly(points: Array) -> Array:
+    position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    even = np.arange(0.0, position[-1], STEP_MM)
+    return np.stack([np.interp(even, position, column) for column in points.T], axis=1)
 
 
 def _without_ends(path: Array, room: Array) -> Array:
-    """Keep the longest piece clear of the wall, less its ends.
+    """Keep the longest piece clear of the wall, without its ends.
 
-    The two places farthest apart lie in corners, and the path turns into them within about its own width.
+    The two cells farthest apart lie in corners, into which the path turns within about its own width.
     """
     kept = _longest_run(room >= WALL_MM)
     path, room = path[kept], room[kept]
@@ -208,7 +201,8 @@ def _without_ends(path: Array, room: Array) -> Array:
     return path[max(wide[0], cut) : min(wide[-1] + 1, len(path) - cut)]
 
 
-def _longest_run(flags: npt.NDArray[np.bool_]) -> slice:
+def _longest_run(flags: Mask) -> slice:
+    """Return the longest run of true values."""
     labels, count = ndimage.label(flags)
     if not count:
         return slice(0, 0)
@@ -216,7 +210,7 @@ def _longest_run(flags: npt.NDArray[np.bool_]) -> slice:
 
 
 def _sides(tangents: Array) -> Array:
-    """Carry a side vector along the path with as little turning as the tangents ask for."""
+    """Transport a side vector along the path, turning it no more than the tangents turn."""
     sides = np.empty_like(tangents)
     sides[0] = tangent_basis(tangents[:1])[0][0]
     for n in range(1, len(tangents)):
@@ -226,42 +220,30 @@ def _sides(tangents: Array) -> Array:
 
 
 def path_pose(spec: AnatomySurface, surface: SurfaceModel) -> Array:
-    """Give the pose of a camera on or beside the camera path.
+    """Return model_from_camera, shape (4, 4), of a camera on or beside the camera path.
 
-    Parameters
-    ----------
-    spec : AnatomySurface
-        `view` path: on the path, looking at its point `look_ahead_mm` on. off_axis: the same from beside the path,
-        by `off_axis_share` of the room up to `MIN_CLEARANCE_MM` before the wall. wall: on the path, looking across
-        it. `around_deg` is the direction across.
-    surface : SurfaceModel
-        The lumen.
+    With `view` path it is on the path and looks at the point `look_ahead_mm` ahead; with off_axis it does so from
+    beside the path, by `off_axis_share` of the room up to `MIN_CLEARANCE_MM` before the wall; with wall it is on the
+    path and looks across it. `around_deg` is the direction across. The pose changes smoothly with it and with
+    `path_share`.
 
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        model_from_camera; it changes smoothly with `path_share` and `around_deg`.
-
-    Raises
-    ------
-    InputError
-        If the surface is an organ, or its mesh has no room for a path.
+    Raises `InputError` if the surface is an organ, or its mesh has no room for a path.
     """
     if surface.solid:
         raise InputError(f"surface.view = {spec.view}: {spec.label} is an organ; a path needs a lumen; allowed: auto")
     path = camera_path(surface)
-    place = spec.path_share * path.length
-    site, tangent, side = path.at(place)
+    position = spec.path_share * path.length
+    site, tangent, side = path.at(position)
     other = np.cross(tangent, side)
     angle = math.radians(spec.around_deg)
     across = math.cos(angle) * side + math.sin(angle) * other
-    target = path.at(place + spec.look_ahead_mm)[0]
+    target = path.at(position + spec.look_ahead_mm)[0]
     if spec.view == "wall":
         target = site + across
     elif spec.view == "off_axis":
         site = site + spec.off_axis_share * _room(surface, site, across) * across
     forward = (target - site) / np.linalg.norm(target - site)
-    # The picture's x axis: the path's side, or for a view across it the path's direction.
+    # The picture's x axis: the path's side, or its direction for a view across it.
     right = tangent if spec.view == "wall" else side
     right = right - (right @ forward) * forward
     right /= np.linalg.norm(right)
@@ -272,7 +254,7 @@ def path_pose(spec: AnatomySurface, surface: SurfaceModel) -> Array:
 
 
 def _room(surface: SurfaceModel, site: Array, across: Array) -> float:
-    """Give how far a camera may move from a site along a direction and keep its clearance, mm."""
+    """Return how far, mm, a camera may move from a site along a direction and keep its clearance."""
     steps = np.arange(0.0, 100.0, 0.25)
     least = min(MIN_CLEARANCE_MM, float(surface.clearance(site[None])[0]))
     blocked = surface.clearance(site + steps[:, None] * across) < least - 1e-9

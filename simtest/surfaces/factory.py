@@ -1,8 +1,9 @@
-"""From the description of a surface to its model."""
+"""From the description of a surface to its model, and from a recipe to a mesh."""
 
 from pathlib import Path
 
 from simtest.errors import InputError
+from simtest.runtime.arrays import Array
 from simtest.spec.surface import (
     AnatomySurface,
     CylinderSurface,
@@ -13,26 +14,12 @@ from simtest.spec.surface import (
 )
 from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
-from simtest.surfaces.model import SurfaceModel
+from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
+from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 
 def make_surface(spec: Surface) -> SurfaceModel:
-    """Make the model of a surface.
-
-    Parameters
-    ----------
-    spec : Surface
-        From a scene.
-
-    Returns
-    -------
-    SurfaceModel
-
-    Raises
-    ------
-    InputError
-        If a recipe or mesh file is missing or malformed.
-    """
+    """Make the model of a scene's surface; raise `InputError` if a recipe or mesh file is missing or malformed."""
     match spec:
         case PlaneSurface():
             return Plane(spec)
@@ -53,12 +40,12 @@ def make_surface(spec: Surface) -> SurfaceModel:
 
 
 def forget_meshes() -> None:
-    """Let go of the meshes that are kept for further scenes of the last few anatomies."""
+    """Free the meshes that are cached for further scenes of the last few anatomies."""
     from simtest.surfaces import centreline, colon, liver
     from simtest.surfaces import mesh_surface as mesh
 
-    for kept in (centreline._camera_path, colon.build, liver.build, mesh._prepare):
-        kept.cache_clear()
+    for cached in (centreline._camera_path, colon.build, liver.build, mesh._prepare):
+        cached.cache_clear()
 
 
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
@@ -66,7 +53,6 @@ def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
     from simtest.surfaces.colon import Colon
     from simtest.surfaces.liver import Liver
     from simtest.surfaces.mesh_surface import MeshSurface
-    from simtest.surfaces.recipe import ColonRecipe, load_recipe
 
     suffix = Path(spec.path).suffix.lower()
     if suffix in MESH_SUFFIXES:
@@ -80,3 +66,32 @@ def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
         )
     recipe = load_recipe(spec.file(), spec.recipe_values)
     return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)
+
+
+def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -> tuple[TriangleMesh, Array, Array]:
+    """Triangulate the smooth surface of a recipe.
+
+    Parameters
+    ----------
+    recipe : ColonRecipe or LiverRecipe
+    edge_mm : float, optional
+        Desired edge length, mm; default that of the scenes.
+
+    Returns
+    -------
+    mesh : TriangleMesh
+        Vertices on the surface, mm, exact normals on the camera's side.
+    k_min, k_max : ndarray, shape (V,)
+        Exact principal curvatures at the vertices, 1/mm.
+
+    Raises
+    ------
+    InputError
+        If the recipe gives no usable surface, or too many triangles.
+    """
+    from simtest.surfaces import colon, liver
+
+    if edge_mm is not None and not 0.01 <= edge_mm <= 20:
+        raise InputError(f"edge_mm = {edge_mm:g}: must be 0.01 to 20 mm")
+    build = colon.build(recipe, edge_mm) if isinstance(recipe, ColonRecipe) else liver.build(recipe, edge_mm)
+    return build.mesh, *principal_curvatures(build.shape_operators)

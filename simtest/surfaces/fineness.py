@@ -1,4 +1,4 @@
-"""How fine a mesh has to be for the highlights on it (theory.md, section 3)."""
+"""How fine a mesh must be for the highlights on it (docs/theory.md, section 3)."""
 
 import math
 from typing import overload
@@ -6,31 +6,31 @@ from typing import overload
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.surfaces.model import Array
+from simtest.runtime.arrays import Array
 
 DEFAULT_EXPONENT = 200.0
-"""That of the shipped anatomy scene."""
+"""Phong exponent of the shipped anatomy scene."""
 
 ISOVALUE = 0.5
-"""Level at which a highlight's half-width counts: the middle of the default isovalues."""
+"""Level at which half-widths are taken: the middle of the default isovalues."""
 
 EDGES_PER_HALF_WIDTH = 2.0
-"""Edges that a half-width needs: with two, triangles alone cost below 0.05 deg and 1 % (docs/meshes.md)."""
+"""Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/meshes.md)."""
 
 LEAST_STRETCH = 0.25
-"""Below this |1 + d k| there is no isolated highlight (theory.md, section 6)."""
+"""Below this |1 + d k| there is no isolated highlight (docs/theory.md, section 6)."""
 
 
 def phong_concentration(exponent: float) -> float:
-    """Give c = -(log f)''(0) of Phong's lobe as a function of the angle between normal and view: 4 n."""
+    """Return c = -(log f)''(0) of Phong's lobe as a function of the angle between normal and view: 4 n."""
     return 4.0 * exponent
 
 
 def ggx_concentration(alpha: float) -> float:
-    """Give c = -(log f)''(0) of the GGX lobe under a light at the camera.
+    """Return c = -(log f)''(0) of the GGX lobe under a light at the camera.
 
-    The half vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2, c = 4 (1/alpha^2 - 1); what
-    masking and Fresnel reflection add is of order 1.
+    The half vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2, c = 4 (1/alpha^2 - 1);
+    masking and Fresnel reflection add a term of order 1.
     """
     return 4.0 * (1.0 / alpha**2 - 1.0)
 
@@ -40,7 +40,7 @@ def half_width(distance_mm: float, concentration: float, curvature: float) -> fl
 @overload
 def half_width(distance_mm: float, concentration: float, curvature: Array) -> Array: ...
 def half_width(distance_mm: float, concentration: float, curvature: float | Array) -> float | Array:
-    """Give the half-width of a highlight on the surface: d sqrt(-2 ln t / c) / |1 + d k|.
+    """Return the half-width of a highlight on the surface at `ISOVALUE`, mm: d sqrt(-2 ln t / c) / |1 + d k|.
 
     Parameters
     ----------
@@ -50,18 +50,13 @@ def half_width(distance_mm: float, concentration: float, curvature: float | Arra
         c of the lobe.
     curvature : float or ndarray
         k across the highlight, 1/mm, convex towards the camera positive.
-
-    Returns
-    -------
-    float or ndarray
-        mm, at `ISOVALUE`.
     """
     angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
     return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
 
 
 def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: Array) -> Array:
-    """Give the edge length that a surface needs at each of its points, mm, shape (N,).
+    """Return the edge length that a surface needs at each of its points, mm, shape (N,).
 
     Parameters
     ----------
@@ -75,7 +70,7 @@ def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: A
 
 
 def concentration(exponent: float | None, alpha: float | None) -> float:
-    """Give c of a lobe from a Phong exponent or a GGX roughness; by default that of exponent `DEFAULT_EXPONENT`.
+    """Return c of a lobe from a Phong exponent or a GGX roughness; by default that of `DEFAULT_EXPONENT`.
 
     Raises
     ------

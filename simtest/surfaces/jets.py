@@ -1,10 +1,10 @@
-"""Functions of (u, v) with their first and second partial derivatives, and how these pass through formulas."""
+"""Functions of (u, v) with their first and second partial derivatives: sums, products and the chain rule."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.surfaces.model import Array, IntArray
+from simtest.runtime.arrays import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -19,19 +19,19 @@ class Jet:
     vv: Array
 
     def __add__(self, other: "Jet") -> "Jet":
-        """Give the sum of two functions."""
+        """Return the sum of two functions."""
         return Jet(*(a + b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
     def parts(self) -> tuple[Array, ...]:
-        """Give value and derivatives: f, u, v, uu, uv, vv."""
+        """Return value and derivatives: f, u, v, uu, uv, vv."""
         return self.f, self.u, self.v, self.uu, self.uv, self.vv
 
     def rows(self, chosen: IntArray) -> "Jet":
-        """Give the function at some of the places."""
+        """Return the function at some of the points."""
         return Jet(*(part[chosen] for part in self.parts()))
 
     def with_rows(self, chosen: IntArray, other: "Jet") -> "Jet":
-        """Give the function with the values of another at some of the places."""
+        """Return the function with the values of another at some of the points."""
         made = []
         for part, new in zip(self.parts(), other.parts(), strict=True):
             copy = part.copy()
@@ -40,11 +40,11 @@ class Jet:
         return Jet(*made)
 
     def along(self, axis: Array) -> "Jet":
-        """Give the component of a vector along a fixed one, shape (3,)."""
+        """Return the component of a vector along a fixed one, shape (3,)."""
         return Jet(*(part @ axis for part in self.parts()))
 
     def chain(self, value: Array, first: Array, second: Array) -> "Jet":
-        """Give g(f) of a scalar f from g, g' and g'' at f, each of shape (N,)."""
+        """Return g(f) of a scalar f from g, g' and g'' at f, each of shape (N,)."""
         return Jet(
             f=value,
             u=first * self.u,
@@ -56,7 +56,7 @@ class Jet:
 
 
 def times(a: Jet, b: Jet) -> Jet:
-    """Give the product of a scalar and a scalar or a vector."""
+    """Return the product of a scalar and a scalar or vector."""
     A = a if b.f.ndim == 1 else Jet(*(part[:, None] for part in a.parts()))
     return Jet(
         f=A.f * b.f,
@@ -69,7 +69,7 @@ def times(a: Jet, b: Jet) -> Jet:
 
 
 def squared(x: Jet) -> Jet:
-    """Give the squared length of a vector."""
+    """Return the squared length of a vector."""
 
     def dot(a: Array, b: Array) -> Array:
         return np.asarray(np.einsum("ni,ni->n", a, b))

@@ -14,33 +14,26 @@ All are lengths in mm; F < 0 in the tissue.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.cutting import face_edges, halve, rough_edges
-from simtest.surfaces.model import (
-    Array,
-    IntArray,
-    RayHits,
-    Shape,
-    SurfaceModel,
-    SurfacePoints,
-    TriangleMesh,
-    implicit_shape_operator,
-    pack_points,
-)
-from simtest.surfaces.poses import MeshProbe, organ_pose
+from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
+from simtest.surfaces.cutting import halve, rough_edges
+from simtest.surfaces.mesh_geometry import face_edges
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator
+from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
 
 GRID_MM = 1.15
 """Spacing of the marching cubes: about 150,000 triangles at the default sizes."""
 
 MAX_NORMAL_ERROR_DEG = 0.1
-"""Largest error of the interpolated normal at an edge's middle that is left as it is, as far as `_SPLITS` go."""
+"""Edges with a larger error of the interpolated normal at their middle are halved, up to `_SPLITS` times."""
 
 MAX_CELLS = 12_000_000
 NEWTON_STEPS = 12
@@ -55,7 +48,7 @@ _SPLITS = 3
 
 @dataclass(frozen=True)
 class _Value:
-    """A function with its gradient and Hessian: shapes (N,), (N, 3), (N, 3, 3), or (0, 3, 3) where it is not wanted."""
+    """A function with gradient and Hessian, of shapes (N,), (N, 3), and (N, 3, 3) or, if not wanted, (0, 3, 3)."""
 
     f: Array
     gradient: Array
@@ -63,7 +56,8 @@ class _Value:
 
 
 def _soft_max(parts: list[_Value], width: float) -> _Value:
-    """Give width log sum exp(part / width) with its derivatives; a negative width gives the smooth minimum."""
+    """Return width log sum exp(part / width) with its derivatives; a negative width makes it a smooth minimum."""
+    # Relative to the largest exponent, so that none overflows.
     values = np.stack([part.f for part in parts]) / width
     top = values.max(axis=0)
     weights = np.exp(values - top)
@@ -86,12 +80,7 @@ def _outer(vectors: Array) -> Array:
 
 
 class Body:
-    """The level-set function of a recipe.
-
-    Parameters
-    ----------
-    recipe : LiverRecipe
-    """
+    """The level-set function of a recipe."""
 
     def __init__(self, recipe: LiverRecipe) -> None:
         self.recipe = recipe
@@ -108,19 +97,19 @@ class Body:
         self._phases = rng.uniform(0, 2 * math.pi, size=_WAVES)
 
     def box(self) -> tuple[Array, Array]:
-        """Give two opposite corners, mm, of a box that holds the body with a margin."""
+        """Return two opposite corners, mm, of a box that holds the body with a margin."""
         reach = np.array([np.sqrt(np.diagonal(np.linalg.inv(A))) for _, A, _ in self._lobes])
         centres = np.array([centre for centre, _, _ in self._lobes])
         margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * _WAVES * self.recipe.relief_mm
         return (centres - reach).min(axis=0) - margin, (centres + reach).max(axis=0) + margin
 
     def normals(self, points: Array) -> Array:
-        """Give the unit outward normals of the level sets through points, shape (N, 3)."""
+        """Return the unit outward normals of the level sets through points, shape (N, 3)."""
         gradient = self.evaluate(points, second=False).gradient
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def values(self, points: Array) -> Array:
-        """Give F, mm, at points of shape (N, 3): the formula alone, for large grids."""
+        """Return F, mm, at points of shape (N, 3), without derivatives, for large grids."""
         blend, edge = self.recipe.blend_mm, self.recipe.edge_mm
         union = np.full(len(points), -np.inf)
         for centre, A, scale in self._lobes:
@@ -136,7 +125,7 @@ class Body:
         return f + self.recipe.relief_mm * np.cos(points @ self._waves.T + self._phases).sum(axis=1)
 
     def evaluate(self, points: Array, second: bool = True) -> _Value:
-        """Give F, mm, its gradient, and its Hessian, 1/mm, at points of shape (N, 3); without `second` no Hessian."""
+        """Return F, mm, with gradient and, if `second`, Hessian, 1/mm, at points of shape (N, 3)."""
         count = len(points) if second else 0
 
         def same(matrix: Array) -> Array:
@@ -148,6 +137,7 @@ class Body:
             Ad = d @ A
             return _Value(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, same(scale * A))
 
+        # B, V, D and G of the module's head, then the waves
         face, gradient = self._face(points)
         lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
         visceral = _Value(face, gradient, same(-np.eye(3) / self.recipe.visceral_radius_mm))
@@ -160,32 +150,22 @@ class Body:
         return _Value(body.f + cosine.sum(axis=1), body.gradient - sine @ self._waves, hessian)
 
     def _face(self, points: Array) -> tuple[Array, Array]:
-        """Give V, mm, and its gradient at points of shape (N, 3)."""
+        """Return V, mm, and its gradient at points of shape (N, 3)."""
         offset, radius = self.recipe.visceral_offset_mm, self.recipe.visceral_radius_mm
         rest = points - offset * self._normal
         return rest @ self._normal - (rest * rest).sum(axis=1) / (2 * radius), self._normal - rest / radius
 
     def solve(self, origins: Array, directions: Array, distance: Array) -> Array:
-        """Solve F(origin + t direction) = 0 by Newton's method from a start close by.
+        """Solve F(origin + t direction) = 0 by Newton's method; return t, mm, shape (N,), NaN if there is no solution.
 
-        Parameters
-        ----------
-        origins, directions : ndarray, shape (N, 3)
-            Rays, mm; unit directions.
-        distance : ndarray, shape (N,)
-            The start, mm.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            mm; NaN where there is no solution.
+        The rays are of shape (N, 3), in mm, with unit directions; `distance`, shape (N,), is a start close by.
         """
         t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             at = self.evaluate(origins[active] + t[active, None] * directions[active], second=False)
             slope = np.einsum("ni,ni->n", at.gradient, directions[active])
-            # A grazing ray has a nearly flat F: bound the step to the mesh's neighbourhood.
+            # On a grazing ray F is nearly flat: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
             step = np.clip(-at.f / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
             t[active] += step
@@ -198,48 +178,52 @@ class Body:
 
 
 def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
-    """Give centre, matrix A of the unit level set, 1/mm^2, and scale, mm, of a lobe."""
+    """Return centre, matrix A of the unit level set, 1/mm^2, and scale a, mm, of a lobe."""
     angle, axes = math.radians(lobe.turn_deg), np.array(lobe.semi_axes_mm)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
     return np.array(lobe.centre_mm), turn @ np.diag(axes**-2.0) @ turn.T, float(np.cbrt(axes.prod()))
 
 
 @dataclass(frozen=True)
-class _Build:
+class BuiltLiver(BuiltMesh):
+    """A recipe's level set `body` and mesh."""
+
     body: Body
-    mesh: TriangleMesh
-    key: str
 
-    @cached_property
-    def probe(self) -> MeshProbe:
-        return MeshProbe(self.mesh)
-
-    def clearance(self, points: Array) -> Array:
-        """Give the distance of points, shape (N, 3), to the mesh, mm, with the exact sign of F."""
-        return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
-
+    @property
     def shape_operators(self) -> Array:
-        """Give S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
+        """S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
         at = self.body.evaluate(self.mesh.vertices)
         return implicit_shape_operator(at.gradient, at.hessian)[1]
 
+    def clearance(self, points: Array) -> Array:
+        """Return the distance to the mesh, mm, with the exact sign of F; positive outside."""
+        return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
+
+    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
+        """Return the exact points of the smooth surface (see `BuiltMesh.at_hits`).
+
+        Newton's method on F along the ray, to 1e-10 mm, from the mesh's hit. A ray that grazes the mesh but misses
+        the smooth surface has no point.
+        """
+        distance = self.body.solve(origins, directions, hits.distance)
+        normals, operators = np.full((len(distance), 3), np.nan), np.full((len(distance), 3, 3), np.nan)
+        good = np.isfinite(distance)
+        at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
+        normals[good], operators[good] = implicit_shape_operator(at.gradient, at.hessian)
+        return distance, normals, operators
+
 
 @lru_cache(maxsize=4)
-def build(recipe: LiverRecipe, edge_mm: float | None = None) -> _Build:
-    """Make the level set and the mesh of a recipe.
+def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
+    """Make the level set and the mesh of a recipe; normals outward.
 
     Parameters
     ----------
     recipe : LiverRecipe
     edge_mm : float, optional
-        Spacing of the marching cubes and about the length of the edges, mm; default `GRID_MM`. Where the surface bends
-        so sharply that normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`, the default
-        mesh has shorter ones.
-
-    Returns
-    -------
-    object
-        With the fields ``body``, ``mesh`` (mm, normals outward) and ``key``.
+        Spacing of the marching cubes and about the length of the edges, mm; default `GRID_MM`, with shorter edges
+        where normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`.
 
     Raises
     ------
@@ -253,11 +237,11 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> _Build:
         vertices, faces = _split(body, vertices, faces)
     normals = body.normals(vertices)
     digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
-    return _Build(body, TriangleMesh(vertices, faces, normals), f"liver-{digest}")
+    return BuiltLiver(TriangleMesh(vertices, faces, normals), f"liver-{digest}", body)
 
 
 def _march(body: Body, spacing: float) -> tuple[Array, IntArray]:
-    """Give vertices, shape (V, 3), and faces, shape (F, 3), outward, of the level set on a grid."""
+    """Return vertices, shape (V, 3), and outward faces, shape (F, 3), of the level set on a grid."""
     from skimage.measure import marching_cubes  # slow to import
 
     low, high = body.box()
@@ -291,7 +275,7 @@ def _even(body: Body, vertices: Array, faces: IntArray) -> Array:
 
 
 def _split(body: Body, vertices: Array, faces: IntArray) -> tuple[Array, IntArray]:
-    """Halve the edges at whose middle the mean of the end normals is off, and cut the triangles that have such."""
+    """Halve the edges at whose middle the mean of the end normals is wrong, and cut their triangles."""
     edges, index = face_edges(faces)
 
     def middles(chosen: IntArray) -> Array:
@@ -302,54 +286,20 @@ def _split(body: Body, vertices: Array, faces: IntArray) -> tuple[Array, IntArra
 
 
 def _project(body: Body, points: Array, steps: int) -> Array:
+    """Move points along the gradient onto F = 0, by steps of Newton's method."""
     for _ in range(steps):
         at = body.evaluate(points, second=False)
         points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
     return points
 
 
-class Liver(SurfaceModel):
-    """A generated liver with a camera outside.
+class Liver(MeshedSurface):
+    """A generated liver with a camera outside, at the pose numbered by `viewpoint`.
 
-    Parameters
-    ----------
-    recipe : LiverRecipe
-        The sizes. The mesh is cached by recipe.
-    viewpoint : int
-        Number of the camera pose, >= 0.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no body.
+    Raises `InputError` if the recipe gives no body.
     """
 
     def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:
         self._build = build(recipe)
         probe = self._build.probe
         self.model_from_camera = organ_pose(recipe.type, viewpoint, probe.targets, self._build.clearance, probe.cast)
-
-    def shape(self) -> Shape:
-        """Give the closed mesh of even triangles, with exact vertices and normals."""
-        return Shape("mesh", False, {}, self._build.mesh, self._build.key)
-
-    def vertex_shape_operators(self) -> Array:
-        """Give S at the mesh's vertices by the level set (see `SurfaceModel.vertex_shape_operators`)."""
-        return self._build.shape_operators()
-
-    def clearance(self, points: Array) -> Array:
-        """Give the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive outside."""
-        return self._build.clearance(points)
-
-    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-        """Give the exact points where rays meet the smooth surface (see `SurfaceModel.points`).
-
-        Newton's method on F along the ray, to 1e-10 mm, from the mesh's hit; a ray that grazes the mesh but misses
-        the smooth surface has no point.
-        """
-        distance = self._build.body.solve(origins, directions, hits.distance)
-        good = np.flatnonzero(np.isfinite(distance))
-        normals, operators = np.full((len(origins), 3), np.nan), np.full((len(origins), 3, 3), np.nan)
-        at = self._build.body.evaluate(origins[good] + distance[good, None] * directions[good])
-        normals[good], operators[good] = implicit_shape_operator(at.gradient, at.hessian)
-        return pack_points(origins, directions, distance, normals, operators)

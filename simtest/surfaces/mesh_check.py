@@ -1,4 +1,4 @@
-"""The verdict on a user's mesh: what is wrong with it, what was mended, and whether it is fine for highlights."""
+"""Verdict on a user's mesh: faults, repairs, and whether it is fine enough for highlights."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -7,23 +7,25 @@ from typing import Any
 
 import numpy as np
 
+from simtest.runtime.arrays import Array, IntArray
 from simtest.surfaces.fineness import EDGES_PER_HALF_WIDTH, needed_edge
 from simtest.surfaces.mesh_file import other_unit, read_mesh
-from simtest.surfaces.mesh_surface import area_quantile, is_lumen
-from simtest.surfaces.model import Array, IntArray, principal_curvatures
-from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, edge_uses, examine
-from simtest.surfaces.subdivision import edge_lengths, shape_operators
+from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, edge_uses, vertex_areas
+from simtest.surfaces.mesh_surface import is_lumen
+from simtest.surfaces.model import principal_curvatures
+from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, examine
+from simtest.surfaces.subdivision import shape_operators
 
 FINE_SHARE = 0.95
-"""Share of the surface that must be fine enough for a mesh to be called so."""
+"""A mesh is fine enough if this share of its surface is."""
 
 MAX_CURVATURE_FACES = 2_000_000
-"""Above this many faces the curvature, and with it the fineness, is not looked at (about 15 s at the limit)."""
+"""Above this many faces curvature and fineness are not computed (about 15 s at the limit)."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What `check_mesh` found.
+    """Result of `check_mesh`.
 
     Parameters
     ----------
@@ -37,11 +39,11 @@ class Verdict:
     repairs : Repairs
     condition : Condition
     edge_median_mm, edge_p95_mm : float
-        Of the edges' lengths.
+        Quantiles of the edges' lengths.
     distance_mm, concentration : float
-        For which highlights.
+        Of the highlights in question.
     curvature_median_per_mm, curvature_p95_per_mm : float or None
-        Of the larger absolute principal curvature, by area; None where the mesh is too large to look.
+        Quantiles of the larger absolute principal curvature, by area; None if the mesh is too large.
     needed_edge_mm : float or None
         Edge length with which all but 5 % of the surface is fine enough.
     fine_share : float or None
@@ -74,7 +76,7 @@ class Verdict:
 
     @property
     def problems(self) -> list[str]:
-        """What is found and not mended, worst first."""
+        """Faults that are not repaired, worst first."""
         found, problems = self.condition, []
         if found.crossing_faces:
             problems.append(f"{found.crossing_faces} faces cut through others: normals around them mean nothing")
@@ -86,21 +88,21 @@ class Verdict:
 
     @property
     def usable(self) -> bool:
-        """Whether the verdict is good: fine enough, and nothing wrong that would spoil the truth."""
+        """Whether the mesh is fine enough and has no fault that would spoil the truth."""
         return self.fine and not self.problems
 
-    def as_dict(self) -> dict[str, Any]:
-        """Give all numbers, for JSON."""
+    def to_json(self) -> dict[str, Any]:
+        """Return all numbers as JSON holds them."""
         return {
             **asdict(self),
-            "condition": self.condition.as_dict(),
+            "condition": self.condition.to_json(),
             "fine": self.fine,
             "problems": self.problems,
             "usable": self.usable,
         }
 
     def lines(self) -> Iterator[str]:
-        """Say it in words, with numbers."""
+        """Yield the verdict in words, with numbers."""
         found, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
         yield f"file        {self.file}"
         yield f"size        {self.vertices} vertices, {self.faces} faces, {size} mm"
@@ -142,7 +144,7 @@ class Verdict:
 
 
 def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind: str = "auto") -> Verdict:
-    """Check a mesh file.
+    """Judge a mesh file.
 
     Parameters
     ----------
@@ -155,27 +157,23 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
     kind : {"auto", "lumen", "organ"}
         Which side the camera is on.
 
-    Returns
-    -------
-    Verdict
-
     Raises
     ------
     InputError
-        If the file is missing or is no mesh that can be used.
+        If the file is missing or no usable mesh.
     """
     vertices, faces, repairs = read_mesh(path)
     lumen = is_lumen(vertices, faces, kind)
     lengths, extents = edge_lengths(vertices, faces), np.ptp(vertices, axis=0)
-    bends: tuple[float, float] | None = None
-    needed = share = None
+    # Curvature, and the edges that highlights need because of it
+    median = p95 = needed = share = None
     if len(faces) <= MAX_CURVATURE_FACES:
         k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
         wanted = needed_edge(distance_mm, concentration, k_min, k_max)
         needed = area_quantile(wanted, vertices, faces, 1 - FINE_SHARE)
         share = _fine_share(wanted, vertices, faces)
         larger = np.maximum(np.abs(k_min), np.abs(k_max))
-        bends = (area_quantile(larger, vertices, faces, 0.5), area_quantile(larger, vertices, faces, 0.95))
+        median, p95 = (area_quantile(larger, vertices, faces, level) for level in (0.5, 0.95))
     return Verdict(
         file=str(path),
         vertices=len(vertices),
@@ -188,8 +186,8 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
         edge_p95_mm=float(np.quantile(lengths, 0.95)),
         distance_mm=distance_mm,
         concentration=concentration,
-        curvature_median_per_mm=bends[0] if bends else None,
-        curvature_p95_per_mm=bends[1] if bends else None,
+        curvature_median_per_mm=median,
+        curvature_p95_per_mm=p95,
         needed_edge_mm=needed,
         fine_share=share,
         other_unit=other_unit(float(extents.max())),
@@ -197,13 +195,11 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
 
 
 def _fine_share(wanted: Array, vertices: Array, faces: IntArray) -> float:
-    """Give the share of the area whose edges are at most as long as wanted there; `wanted` at the vertices."""
+    """Return the share of the area whose edges are at most as long as wanted there; `wanted` at the vertices."""
     edges, _ = edge_uses(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     count = np.bincount(edges.ravel(), minlength=len(vertices))
     mean = np.bincount(edges.ravel(), np.repeat(length, 2), len(vertices)) / count
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    weight = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
-    # Unknown curvature counts as too coarse.
+    weight = vertex_areas(vertices, faces)
+    # Unknown curvature, NaN, counts as too coarse.
     return float(weight[mean <= wanted].sum() / weight.sum())

@@ -1,46 +1,43 @@
-"""Reading a user's mesh file: PLY, OBJ, STL or VTK, with one-line errors for whatever is wrong with it."""
+"""Mesh files: PLY, OBJ, STL and VTK read, with errors of one line; PLY, OBJ and STL written."""
 
 import logging
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.surfaces.model import Array, IntArray
+from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.files import write_atomically
+from simtest.runtime.resources import shown
+from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.repair import Repairs, repair
 
-__all__ = ["MESH_SUFFIXES", "read_mesh"]
-
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
+WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
+
 MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
 
 MAX_FACES = 5_000_000
 MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
-"""What `MAX_FACES` faces take at most as text, about; reading takes some ten times as much memory."""
+"""About the size of `MAX_FACES` faces as text; reading takes some ten times as much memory."""
 
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
 
 ORGAN_RANGE_MM = (60.0, 2000.0)
-"""Largest extent of a liver, a colon or a good piece of one: for a guess at another unit."""
+"""Largest extent of a liver, a colon or a large piece of one: for a guess at another unit."""
 
 
 def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
-    """Read a triangle mesh and mend what is safely mended.
+    """Read a PLY, OBJ, STL or VTK file (PolyData, UnstructuredGrid), in mm, and repair what can be repaired safely.
 
-    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons
-    are cut into triangles; the winding is made consistent within each piece, normals outward.
-
-    Parameters
-    ----------
-    path : str or Path
-        A PLY, OBJ, STL or VTK (PolyData, UnstructuredGrid) file; lengths in mm.
+    Equal vertices are merged; faces without area, repeated faces and vertices without a face are left out; polygons are
+    cut into triangles; the winding is made consistent within each piece, normals outward.
 
     Returns
     -------
@@ -48,12 +45,12 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
         mm.
     faces : ndarray of int, shape (F, 3)
     repairs : Repairs
-        What was mended.
+        What was repaired.
 
     Raises
     ------
     InputError
-        If the file is missing or is no mesh that can be used; one line with the file, the value and what is allowed.
+        If the file is missing or no usable mesh; one line with the file, the value and what is allowed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -78,17 +75,9 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
 
 
 def other_unit(extent: float) -> str:
-    """Guess the unit of a mesh whose largest extent is hardly that of an organ in mm.
+    """Guess the unit of a mesh whose largest extent, in the file's unit, is hardly that of an organ in mm.
 
-    Parameters
-    ----------
-    extent : float
-        Largest extent, in the file's unit.
-
-    Returns
-    -------
-    str
-        Such as "metres, 214 mm"; empty where mm are as likely as anything.
+    The answer is such as "metres, 214 mm"; empty if no other unit is likelier than mm.
     """
     low, high = ORGAN_RANGE_MM
     if extent >= 10.0 and extent <= high:
@@ -100,6 +89,7 @@ def other_unit(extent: float) -> str:
 
 
 def _check_file(path: Path, suffix: str) -> None:
+    """Check what can be checked without parsing the file: size, and number of faces where the header holds it."""
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder; a file is needed' if path.is_dir() else 'no such file'}")
     try:
@@ -123,7 +113,7 @@ def _check_file(path: Path, suffix: str) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the mesh libraries: what they have to say ends up in our one line."""
+    """Silence the mesh libraries: their messages go into our one line."""
     disabled = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -137,8 +127,9 @@ def _quiet() -> Iterator[None]:
 def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
     import trimesh  # slow to import
 
-    options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-    loaded = trimesh.load(path, file_type=path.suffix[1:].lower(), process=False, **options)
+    kind = path.suffix[1:].lower()
+    options = {"skip_materials": True} if kind == "obj" else {}
+    loaded = trimesh.load(path, file_type=kind, process=False, **options)
     if isinstance(loaded, trimesh.Scene):
         parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
         if not parts:
@@ -152,7 +143,7 @@ def _load_vtk(path: Path) -> tuple[Array, IntArray]:
     import pyvista  # slow to import
     from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
 
-    shown, verbosity = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
+    displayed, verbosity = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     vtkObject.GlobalWarningDisplayOff()
     try:
@@ -162,14 +153,14 @@ def _load_vtk(path: Path) -> tuple[Array, IntArray]:
             data = data.extract_surface(algorithm="dataset_surface")
         if not isinstance(data, pyvista.PolyData):
             raise InputError(f"{path}: a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
-        # VTK's filters trust the indices: check them first.
+        # VTK's filters trust the indices, so they are checked first.
         for cells in (data.GetPolys(), data.GetStrips()):
             _check_indices(path, pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
         data = data.triangulate()
         faces = np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
         return np.array(data.points, dtype=np.float64), faces
     finally:
-        vtkObject.SetGlobalWarningDisplay(shown)
+        vtkObject.SetGlobalWarningDisplay(displayed)
         vtkLogger.SetStderrVerbosity(verbosity)
 
 
@@ -191,8 +182,8 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
     _check_indices(path, faces.ravel(), len(vertices))
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        place = ", ".join(f"{x:g}" for x in vertices[row])
-        raise InputError(f"{path}: vertex {row} is ({place}); finite coordinates are needed")
+        values = ", ".join(f"{x:g}" for x in vertices[row])
+        raise InputError(f"{path}: vertex {row} is ({values}); finite coordinates are needed")
     extent, (low, high) = float(np.ptp(vertices, axis=0).max()), EXTENT_RANGE_MM
     if not low <= extent <= high:
         unit = other_unit(extent)
@@ -205,3 +196,53 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
 def _first_line(error: Exception) -> str:
     lines = str(error).strip().splitlines()
     return (lines[0] if lines else type(error).__name__)[:160]
+
+
+# Writing -------------------------------------------------------------------------------------------------------------
+
+
+def check_target(path: Path) -> None:
+    """Raise `InputError` if a mesh cannot be written to a path; called before any work is done."""
+    if path.suffix.lower() not in WRITTEN_SUFFIXES:
+        raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
+    if path.is_dir():
+        raise InputError(f"--out {shown(path)}: is a folder; must be a file")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
+
+
+def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:
+    """Write a mesh; single precision in PLY and STL, the same bytes for the same mesh.
+
+    Parameters
+    ----------
+    path : Path
+        The suffix selects the format: PLY holds vertex normals and attributes, OBJ vertex normals, STL neither.
+    mesh : TriangleMesh
+        mm.
+    attributes : mapping, optional
+        Numbers at the vertices by name, each of shape (V,), for PLY.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    import trimesh  # slow to import
+
+    check_target(path)
+    built = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        for name, values in (attributes or {}).items():
+            built.vertex_attributes[name] = values.astype("f4")
+        data = built.export(file_type="ply", vertex_normal=True)
+    elif suffix == ".obj":
+        # Eight digits: single precision, like the others.
+        data = built.export(file_type="obj", include_normals=True, digits=8, header=None).encode()
+    else:
+        data = built.export(file_type="stl")
+    try:
+        write_atomically(path, lambda part: part.write_bytes(data))
+    except OSError as error:
+        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error

@@ -1,28 +1,24 @@
-"""What every surface offers: its place in front of the camera, exact points on rays, and a shape to render."""
+"""What every surface offers: its pose relative to the camera, exact points on rays, and a shape to render."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.geometry.vectors import tangent_basis
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from simtest.runtime.arrays import Array, IntArray, Mask
 
 
 @dataclass(frozen=True)
 class RayHits:
-    """Where a ray tracer saw rays meet the rendered shape: the start for the exact solution.
+    """Hits of rays on the rendered shape, by a ray tracer: the start for the exact solution.
 
     Parameters
     ----------
     distance : ndarray, shape (N,)
         Distance along each unit ray, mm; inf where the ray misses.
     face : ndarray of int, shape (N,)
-        Triangle hit (0 for shapes that are no meshes).
+        Triangle that was hit (0 for shapes that are no meshes).
     barycentric : ndarray, shape (N, 2)
         Weights of the triangle's second and third corners.
     """
@@ -30,6 +26,12 @@ class RayHits:
     distance: Array
     face: IntArray
     barycentric: Array
+
+    @property
+    def weights(self) -> Array:
+        """Weights of all three corners, shape (N, 3)."""
+        second, third = self.barycentric.T
+        return np.stack([1 - second - third, second, third], axis=1)
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class SurfacePoints:
     Parameters
     ----------
     distance : ndarray, shape (N,)
-        Distance along the ray, mm; NaN where there is none.
+        Distance along the ray, mm; NaN if there is no point.
     position, normal : ndarray, shape (N, 3)
         Point, mm, and unit normal facing the ray's origin.
     k_min, k_max : ndarray, shape (N,)
@@ -47,7 +49,7 @@ class SurfacePoints:
     direction_min, direction_max : ndarray, shape (N, 3)
         Unit principal directions.
     valid : ndarray of bool, shape (N,)
-        False where the ray misses or no solution was found; all other fields are NaN there.
+        False if the ray misses or no solution was found; all other fields are NaN there.
     """
 
     distance: Array
@@ -57,7 +59,7 @@ class SurfacePoints:
     k_max: Array
     direction_min: Array
     direction_max: Array
-    valid: npt.NDArray[np.bool_]
+    valid: Mask
 
 
 @dataclass(frozen=True)
@@ -81,31 +83,31 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class Shape:
-    """What the renderer builds.
+    """Shape that the renderer builds.
 
     Parameters
     ----------
     kind : {"plane", "sphere", "cylinder", "mesh"}
         Mitsuba's analytic shape, or a mesh.
     flip : bool
-        Whether the analytic shape is seen from its inside.
+        Whether the analytic shape is seen from inside.
     parameters : dict
         For an analytic shape: ``to_model``, a (4, 4) matrix from the unit shape to the model frame.
     mesh : TriangleMesh, optional
         For kind "mesh".
     key : str
-        Identity of what has to be rebuilt; two shapes with equal keys differ in `parameters` alone.
+        Identity of what the renderer builds; two shapes with equal keys differ in `parameters` alone.
     """
 
     kind: str
     flip: bool
-    parameters: dict[str, Any]
+    parameters: dict[str, Array]
     mesh: TriangleMesh | None
     key: str
 
 
 class SurfaceModel(ABC):
-    """A surface in its own model frame with the camera's pose.
+    """A surface in its own model frame, with the camera's pose.
 
     Attributes
     ----------
@@ -121,48 +123,43 @@ class SurfaceModel(ABC):
 
     @abstractmethod
     def shape(self) -> Shape:
-        """Give what the renderer builds, in the model frame."""
+        """Return the shape that the renderer builds, in the model frame."""
 
     @abstractmethod
     def clearance(self, points: Array) -> Array:
-        """Give the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive on its free side.
+        """Return the signed distance of points, shape (N, 3), model frame, to the surface, mm; positive in free space.
 
-        The sign is exact; the amount may be that of the first order.
+        The sign is exact; the magnitude may be of first order.
         """
 
     def vertex_shape_operators(self) -> Array | None:
-        """Give S at the vertices of the rendered mesh, shape (V, 3, 3), 1/mm, for its normals; None without a mesh."""
+        """Return S at the rendered mesh's vertices for its normals, 1/mm, shape (V, 3, 3); None without a mesh."""
         return None
 
     @abstractmethod
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-        """Give the exact points where rays meet the surface.
+        """Return the exact points where rays meet the surface, in the model frame.
 
         Parameters
         ----------
         origins, directions : ndarray, shape (N, 3)
             Rays in the model frame, mm; unit directions.
         hits : RayHits
-            Where a ray tracer saw them meet the rendered shape. Closed forms ignore all but the misses.
-
-        Returns
-        -------
-        SurfacePoints
-            In the model frame.
+            Their hits on the rendered shape. Closed forms use the misses only.
         """
 
 
 def pack_points(
     origins: Array, directions: Array, distance: Array, normal: Array, shape_operator: Array
 ) -> SurfacePoints:
-    """Make `SurfacePoints` from distances, normals and shape operators; turns them to face the rays' origins.
+    """Make `SurfacePoints` from distances, normals and shape operators, turned to face the rays' origins.
 
     Parameters
     ----------
     origins, directions : ndarray, shape (N, 3)
         Rays; unit directions.
     distance : ndarray, shape (N,)
-        mm; NaN or inf where there is no point.
+        mm; NaN or inf if there is no point.
     normal : ndarray, shape (N, 3)
         Unit normals of either sign.
     shape_operator : ndarray, shape (N, 3, 3)
@@ -173,9 +170,11 @@ def pack_points(
     SurfacePoints
         k_min, k_max are the eigenvalues of S in the tangent plane (theory.md section 0).
     """
+    # Facing the origin; S changes its sign with the normal.
     sign = np.where(np.einsum("ij,ij->i", normal, directions) > 0, -1.0, 1.0)
     normal = normal * sign[:, None]
     S = shape_operator * sign[:, None, None]
+    # Eigenvalues and eigenvectors of the 2 x 2 matrix (a b; b c) of S in a tangent basis.
     tangent, other = tangent_basis(normal)
     a = np.einsum("ni,nij,nj->n", tangent, S, tangent)
     b = np.einsum("ni,nij,nj->n", tangent, S, other)
@@ -203,7 +202,7 @@ def pack_points(
 
 
 def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:
-    """Give k_min and k_max, 1/mm, two arrays of shape (N,), of shape operators, shape (N, 3, 3); NaN stays NaN.
+    """Return k_min and k_max, 1/mm, two arrays of shape (N,), of shape operators, shape (N, 3, 3); NaN stays NaN.
 
     With the trace t and the Frobenius norm f, the two curvatures in the tangent plane are (t +- sqrt(2 f^2 - t^2))/2.
     """
@@ -214,14 +213,9 @@ def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:
 
 
 def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Array]:
-    """Give normal and shape operator of a level set from gradient, shape (N, 3), and Hessian, shape (N, 3, 3).
+    """Return normal, shape (N, 3), and shape operator, shape (N, 3, 3), of a level set from gradient and Hessian.
 
-    N = g/|g|, dN = (I - N N^T) H dP / |g|, restricted to the tangent plane.
-
-    Returns
-    -------
-    normal : ndarray, shape (N, 3)
-    shape_operator : ndarray, shape (N, 3, 3)
+    N = g/|g|, dN = (I - N N^T) H dP / |g|, restricted to the tangent plane; the inputs have the same shapes.
     """
     length = np.linalg.norm(gradient, axis=1)
     normal = gradient / length[:, None]

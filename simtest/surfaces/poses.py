@@ -1,7 +1,7 @@
-"""Camera poses by number: inside a lumen, or outside an organ, never in tissue.
+"""Camera poses by number: inside a lumen or outside an organ, never in tissue.
 
-The same label and number give the same pose. The surface comes in through callables, so that the generated
-anatomies and a user's mesh share the two pose functions.
+The same label and number give the same pose. The surface is passed as callables, so that generated anatomies and a
+user's mesh share the two pose functions.
 """
 
 import math
@@ -11,17 +11,20 @@ import igl
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.model import Array, TriangleMesh, tangent_basis
+from simtest.surfaces.mesh_geometry import area_vectors
+from simtest.surfaces.model import TriangleMesh
 
 MIN_CLEARANCE_MM = 5.0
-"""A camera in a lumen keeps this distance from the wall where the lumen is wide enough."""
+"""A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
 
 CLEARANCE_SHARE = 0.6
 """In a narrower lumen: share of the largest clearance found."""
 
 AXIS_RANGE_MM = (10.0, 45.0)
-"""Where a camera in a lumen prefers its optical axis to meet the wall: working distances of a colonoscope."""
+"""Preferred distance along the optical axis to the wall of a lumen: working distances of a colonoscope."""
 
 ORGAN_RANGE_MM = (40.0, 150.0)
 """Distance of a camera outside an organ from the point it looks at."""
@@ -43,7 +46,7 @@ class MeshProbe:
     Parameters
     ----------
     mesh : TriangleMesh
-        Its normals face the space in which the camera may be.
+        Its normals face the space of the camera.
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
@@ -54,7 +57,7 @@ class MeshProbe:
         self._tree.init(self._vertices, self._faces)
 
     def clearance(self, points: Array) -> Array:
-        """Give the signed distance of points, shape (N, 3), to the mesh, mm; positive on the camera's side.
+        """Return the signed distance of points, shape (N, 3), to the mesh, mm; positive on the camera's side.
 
         The sign is that of the interpolated vertex normal at the closest point, so an open mesh works too.
         """
@@ -66,12 +69,12 @@ class MeshProbe:
         return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
 
     def distance(self, points: Array) -> Array:
-        """Give the unsigned distance of points, shape (N, 3), to the mesh, mm."""
+        """Return the unsigned distance of points, shape (N, 3), to the mesh, mm."""
         squared, _, _ = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
         return np.sqrt(squared)
 
     def cast(self, origins: Array, directions: Array) -> Array:
-        """Give the distance along unit rays, shape (N, 3), to the first wall, mm; inf where there is none."""
+        """Return the distance along unit rays, shape (N, 3), to the first wall, mm; inf if there is none."""
         face, distance, _ = self._tree.intersect_ray_first(
             self._vertices, self._faces, np.ascontiguousarray(origins), np.ascontiguousarray(directions)
         )
@@ -80,7 +83,8 @@ class MeshProbe:
     def targets(self, rng: Generator, count: int) -> tuple[Array, Array]:
         """Draw points of the mesh, even by area, with unit normals of their faces; two arrays of shape (count, 3)."""
         corners = self._mesh.vertices[self._mesh.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cross = area_vectors(self._mesh.vertices, self._mesh.faces)
+        # A face is drawn in proportion to its area, then a point in it by the square-root rule.
         cumulative = np.cumsum(np.linalg.norm(cross, axis=1))
         face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right").clip(max=len(cross) - 1)
         a, b = np.sqrt(rng.random(count)), rng.random(count)
@@ -92,15 +96,15 @@ class MeshProbe:
         """Draw points well inside a lumen, shape (N, 3): between a random point of the wall and the wall opposite."""
         points, normals = self.targets(rng, 16)
         width = self.cast(points + 1e-3 * normals, normals)
-        # The middle of a chord is the safest, other shares give variety; an open end gives no chord.
+        # The middle of a chord is the safest, other shares add variety; an open end has no chord.
         width = np.where(np.isfinite(width), width, 2 * MIN_CLEARANCE_MM)
         shares = np.array([0.25, 0.4, 0.5, 0.6, 0.75])
-        places = points[:, None] + (shares[None, :, None] * width[:, None, None]) * normals[:, None]
-        return places.reshape(-1, 3)
+        sites = points[:, None] + (shares[None, :, None] * width[:, None, None]) * normals[:, None]
+        return sites.reshape(-1, 3)
 
 
 def _barycentric(points: Array, corners: Array) -> Array:
-    """Give barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
+    """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
     pa, pb = np.einsum("ni,ni->n", p, a), np.einsum("ni,ni->n", p, b)
@@ -112,7 +116,7 @@ def _barycentric(points: Array, corners: Array) -> Array:
 def lumen_pose(
     label: str, viewpoint: int, sites: Callable[[Generator], Array], clearance: Clearance, cast: Cast
 ) -> Array:
-    """Give the pose of a camera inside a lumen.
+    """Return model_from_camera, shape (4, 4), of a camera inside a lumen.
 
     The site keeps `MIN_CLEARANCE_MM` or, in a narrow lumen, `CLEARANCE_SHARE` of the largest clearance found. The
     direction is random among those whose axis meets the wall within `AXIS_RANGE_MM`; if there are none, the one
@@ -125,16 +129,11 @@ def lumen_pose(
     viewpoint : int
         Number of the pose, >= 0.
     sites : callable
-        Draws candidate sites, shape (N, 3), mm.
+        Draws candidates, shape (N, 3), mm.
     clearance : callable
         Signed distance of points to the wall, mm; positive in the lumen.
     cast : callable
         Distance from origins along directions to the wall, mm; inf if there is none.
-
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        model_from_camera.
 
     Raises
     ------
@@ -142,13 +141,15 @@ def lumen_pose(
         If no candidate lies in the lumen.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
+    # site
     candidates = sites(rng)
     room = clearance(candidates)
     if not room.max() > 0:
         raise InputError(f"{label}: viewpoint {viewpoint}: no free place for the camera; kind lumen needs a cavity")
     allowed = np.flatnonzero(room >= min(MIN_CLEARANCE_MM, CLEARANCE_SHARE * float(room.max())))
-    # Roomier sites more often: those at the limit show little but one patch of wall.
+    # Roomier sites are likelier: those at the limit show little but one patch of wall.
     site = candidates[rng.choice(allowed, p=room[allowed] / room[allowed].sum())]
+    # direction
     directions = rng.normal(size=(_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distance = cast(np.broadcast_to(site, directions.shape), directions)
@@ -164,17 +165,15 @@ def organ_pose(
     clearance: Clearance,
     cast: Cast,
 ) -> Array:
-    """Give the pose of a camera outside an organ, looking at a random point of it.
+    """Return model_from_camera, shape (4, 4), of a camera outside an organ, looking at a random point of it.
 
-    The distance is random in `ORGAN_RANGE_MM`, the sightline within `ORGAN_TILT_DEG` of the normal, and the way
-    between is free.
+    The distance is random in `ORGAN_RANGE_MM`, the sightline within `ORGAN_TILT_DEG` of the normal and free of
+    obstacles.
 
     Parameters
     ----------
-    label : str
-        Name of the surface; a branch of the seed tree.
-    viewpoint : int
-        Number of the pose, >= 0.
+    label, viewpoint
+        See `lumen_pose`.
     targets : callable
         Draws surface points and outward unit normals, two arrays of shape (count, 3).
     clearance : callable
@@ -182,22 +181,17 @@ def organ_pose(
     cast : callable
         Distance from origins along directions to the surface, mm; inf if there is none.
 
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        model_from_camera.
-
     Raises
     ------
     InputError
-        If no drawn point can be seen from such a place.
+        If no drawn point can be seen from such a position.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     points, normals = targets(rng, _TARGETS)
     away = _cap(normals, math.radians(ORGAN_TILT_DEG), rng)
     distance = rng.uniform(*ORGAN_RANGE_MM, size=_TARGETS)
     cameras = points + distance[:, None] * away
-    # A hit well short of the target means that something else is in the way.
+    # A hit well before the target means that something else is in the way.
     free = (clearance(cameras) > 0) & (cast(cameras, -away) > distance - 0.5)
     if not free.any():
         raise InputError(f"{label}: viewpoint {viewpoint}: no free view of the surface found; kind organ needs one")
@@ -215,7 +209,7 @@ def _cap(axes: Array, half_angle: float, rng: Generator) -> Array:
 
 
 def _pose(site: Array, forward: Array, rng: Generator) -> Array:
-    """Give model_from_camera, shape (4, 4), of a camera at a site looking forward, with a random roll."""
+    """Return model_from_camera, shape (4, 4), of a camera at a site looking forward, with a random roll."""
     first, second = (vector[0] for vector in tangent_basis(forward[None]))
     roll = rng.uniform(0, 2 * math.pi)
     pose = np.eye(4)

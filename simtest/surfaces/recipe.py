@@ -1,4 +1,4 @@
-"""Recipes of the generated anatomies: the sizes a colon or a liver is made from."""
+"""Recipes of the generated anatomies: the sizes that a colon or a liver is made from."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
+from simtest.runtime.resources import find
+from simtest.spec.spec_model import Spec, validate
+from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
@@ -19,13 +21,13 @@ HalfExtent = Annotated[float, Field(ge=10, le=200)]
 
 
 class Polyp(Spec):
-    """A polyp, at its place whatever folds are there.
+    """A polyp, at its position whatever folds are there.
 
     Sessile: a round bump of Gaussian profile on the wall. With a neck it is pedunculated: a head on a stalk.
     """
 
-    along_mm: float = Field(ge=0, le=500, description="place along the centreline, mm")
-    around_deg: float = Field(ge=-360, le=360, description="place around the tube, deg")
+    along_mm: float = Field(ge=0, le=500, description="position along the centreline, mm")
+    around_deg: float = Field(ge=-360, le=360, description="position around the tube, deg")
     height_mm: float = Field(4.0, ge=0.2, le=20, description="height over the wall, mm")
     width_mm: float = Field(8.0, ge=1, le=40, description="width at half height; of a pedunculated one its head's, mm")
     neck_mm: float | None = Field(None, ge=0.5, le=30, description="width of the neck, mm; none given: sessile")
@@ -63,7 +65,7 @@ class ColonRecipe(Spec):
     fold_edge_mm: float = Field(4.5, ge=0.5, le=10, description="mean radius of curvature of a lone fold's edge, mm")
     fold_spacing_mm: float = Field(22.0, ge=5, le=100, description="mean distance between rings of folds, mm")
     fold_concentration: float = Field(4.0, ge=0, le=50, description="how short a fold is around the tube; 0: a ring")
-    irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and place")
+    irregularity: float = Field(0.25, ge=0, le=0.5, description="relative spread of depth, edge radius and position")
     polyps: tuple[Polyp, ...] = Field((), max_length=20, description="polyps")
     relief_mm: float = Field(0.0, ge=0, le=0.2, description="amplitude of each wave of the mucosa's fine relief, mm")
     relief_length_mm: float = Field(4.0, ge=2, le=30, description="mean wavelength of the relief, mm")
@@ -126,30 +128,17 @@ class LiverRecipe(Spec):
 
 
 def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> ColonRecipe | LiverRecipe:
-    """Read a recipe file.
+    """Read a TOML file with the keys of `ColonRecipe` or `LiverRecipe`, which its ``type`` selects.
 
-    Parameters
-    ----------
-    path : str or Path
-        A TOML file with the keys of `ColonRecipe` or `LiverRecipe`; ``type`` says which. Lengths in mm.
-    settings : mapping, optional
-        Values that replace those of the file, by key path; or nested tables of such values.
-
-    Returns
-    -------
-    ColonRecipe or LiverRecipe
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    `settings` replace values of the file, by key path or as nested tables. Raises `InputError` if the file is missing
+    or malformed.
     """
     path, values = Path(path), dict(_flat(settings or {}))
-    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), place(path, values))
+    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), source_name(path, values))
 
 
 def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Give nested tables as values by key path."""
+    """Yield the values of nested tables by key path."""
     for key, value in tables.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{above}{key}.")
@@ -158,7 +147,7 @@ def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 
 def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | LiverRecipe:
-    """Validate a recipe given as nested tables, `where` from, for messages; raises `InputError` if it is malformed."""
+    """Validate a recipe given as nested tables; `where` names the file in the `InputError` if it is malformed."""
     kind = data.get("type")
     if kind == "colon":
         return validate(ColonRecipe, data, where)
@@ -166,3 +155,18 @@ def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | Liver
         return validate(LiverRecipe, data, where)
     got = f"type = {kind!r}" if "type" in data else "type: missing"
     raise InputError(f"{where}: {got}; allowed: colon, liver")
+
+
+def load_anatomy(
+    kind: str, recipe: str | Path | None = None, seed: int | None = None, settings: Mapping[str, Any] | None = None
+) -> ColonRecipe | LiverRecipe:
+    """Read a recipe of one kind, colon or liver; by default the shipped one.
+
+    `seed` and `settings`, values by key path, replace those of the file. Raises `InputError` if the file is missing,
+    malformed, or of the other kind.
+    """
+    path = find(recipe if recipe is not None else kind, "meshes")
+    described = load_recipe(path, {**(settings or {}), **({} if seed is None else {"seed": seed})})
+    if described.type != kind:
+        raise InputError(f"{path}: type = {described.type!r}; simtest mesh {kind} needs {kind!r}")
+    return described

@@ -1,27 +1,28 @@
-"""What is wrong with a user's triangles: what is safely mended, and what is found and left."""
+"""Faults of a user's triangles: repaired if that is safe, else counted."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from simtest.surfaces.model import Array, IntArray
+from simtest.runtime.arrays import Array, IntArray
+from simtest.surfaces.mesh_geometry import edge_uses
 
 SLIVER = 1e-14
-"""Area over the squared extent below which a face has no direction: rounding decides it."""
+"""Area over the squared extent below which rounding decides the direction of a face."""
 
 MAX_CROSSING_FACES = 1_000_000
-"""Above this many faces self-intersections are not looked for (about 5 s and 2 GB at the limit)."""
+"""Above this many faces self-intersections are not searched for (about 5 s and 2 GB at the limit)."""
 
 
 @dataclass(frozen=True)
 class Repairs:
-    """What was mended, each a count.
+    """Counts of what was repaired.
 
     Parameters
     ----------
     merged_vertices : int
-        Vertices at the place of another one; each triangle of an STL file has its own three, which counts 0.
+        Vertices at the position of another; the three that each triangle of an STL file has of its own do not count.
     repeated_faces, faces_without_area : int
         Faces left out.
     reversed_faces : int
@@ -37,7 +38,7 @@ class Repairs:
     turned_pieces: int = 0
 
     def sentences(self, lumen: bool = False) -> Iterator[str]:
-        """Say each repair that was made; that a lumen's faces wind inward or outward is a matter of taste."""
+        """Yield a sentence for each repair; for a lumen, faces may wind inward or outward."""
         if self.merged_vertices:
             yield f"merged {_many(self.merged_vertices, 'repeated vertex', 'repeated vertices')}"
         if self.faces_without_area:
@@ -52,7 +53,7 @@ class Repairs:
 
 @dataclass(frozen=True)
 class Condition:
-    """What is found in the mended mesh and left as it is.
+    """Faults of the repaired mesh that are left as they are.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ class Condition:
     non_manifold_edges : int
         Edges of more than two faces.
     crossing_faces : int or None
-        Faces that cut through another; None where it was not looked for.
+        Faces that cut through another; None if they were not searched for.
     """
 
     pieces: int
@@ -76,8 +77,8 @@ class Condition:
         """Whether each edge belongs to two faces."""
         return self.open_edges == 0 and self.non_manifold_edges == 0
 
-    def as_dict(self) -> dict[str, int | bool | None]:
-        """Give the fields, and whether the mesh is watertight."""
+    def to_json(self) -> dict[str, int | bool | None]:
+        """Return the fields, and whether the mesh is watertight."""
         return {"watertight": self.watertight, **asdict(self)}
 
 
@@ -86,39 +87,34 @@ def _many(count: int, one: str, more: str) -> str:
 
 
 def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array, IntArray, Repairs]:
-    """Mend what can be mended without a guess at the shape.
+    """Repair what can be repaired without a guess at the shape.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        Of either winding.
-    soup : bool
-        Whether the file's format gives each face its own vertices, so that merging them is no repair.
+    `soup` says that by the file's format each face has its own vertices, so that merging them is no repair.
 
     Returns
     -------
     vertices : ndarray, shape (V', 3)
-        Each used, none twice.
+        mm; each is used, and none repeated.
     faces : ndarray of int, shape (F', 3)
         Winding consistent within each piece, normals outward: positive volume about the piece's centroid.
     repairs : Repairs
     """
     import trimesh  # slow to import
 
+    # vertices
     used = len(np.unique(faces))
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     merged = 0 if soup else used - len(np.unique(mesh.faces))
     before = len(mesh.faces)
-    # Relative to the extent: a sliver below rounding has no direction.
+    # Faces without area, relative to the extent, and repeated faces
     mesh.update_faces(mesh.area_faces > SLIVER * float(np.ptp(vertices, axis=0).max()) ** 2)
     flat = before - len(mesh.faces)
     before = len(mesh.faces)
     mesh.update_faces(mesh.unique_faces())
     repeated = before - len(mesh.faces)
     mesh.remove_unreferenced_vertices()
+    # winding
     points = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     triangles = np.ascontiguousarray(mesh.faces, dtype=np.int64)
     if not len(triangles):
@@ -128,15 +124,9 @@ def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array,
 
 
 def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
-    """Make the winding consistent within each connected piece, and each piece's normals point outward.
+    """Make the winding consistent within each connected piece, and the normals of each piece point outward.
 
-    Returns
-    -------
-    faces : ndarray of int, shape (F, 3)
-    against : int
-        Faces that wound against the majority of their piece.
-    turned : int
-        Pieces whose majority pointed inward.
+    Returns the faces, how many of them wound against the majority of their piece, and how many pieces pointed inward.
     """
     import igl
 
@@ -144,7 +134,7 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     piece = np.asarray(piece).ravel()
     count = int(piece.max()) + 1
     corners = vertices[oriented]
-    # About each piece's own centroid, so that an open piece has a meaningful sign.
+    # Volumes about each piece's own centroid, so that an open piece has a meaningful sign.
     size = np.maximum(np.bincount(piece, minlength=count), 1)
     middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
     a, b, c = (corners[:, i] - middle[piece] for i in range(3))
@@ -158,40 +148,18 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
 
 
 def _follower(faces: IntArray) -> IntArray:
-    """Give the corner that comes after the smallest one in each face, shape (F,)."""
+    """Return the corner that comes after the smallest one in each face, shape (F,)."""
     after = (np.argmin(faces, axis=1) + 1) % 3
     return faces[np.arange(len(faces)), after]
 
 
-def edge_uses(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Give the edges, shape (E, 2), smaller vertex first, and how many faces each belongs to, shape (E,)."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    span = int(faces.max()) + 1
-    codes, uses = np.unique(edges[:, 0] * span + edges[:, 1], return_counts=True)
-    return np.stack(np.divmod(codes, span), axis=1), uses
-
-
 def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
-    """Look a mended mesh over.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        From `repair`.
-    crossings : bool
-        Whether to look for self-intersections too, which takes the longest.
-
-    Returns
-    -------
-    Condition
-    """
+    """Find the faults of a mesh from `repair`; `crossings`, the search for self-intersections, takes longest."""
     import igl
     from igl import predicates
 
     _, uses = edge_uses(faces)
-    # By faces that share a vertex: two pieces that touch in one vertex count as one.
+    # Connected by shared vertices: two pieces that touch in one vertex count as one.
     pieces = int(np.max(igl.vertex_components(faces))) + 1
     crossing = None
     if crossings and len(faces) <= MAX_CROSSING_FACES:

@@ -1,4 +1,4 @@
-"""A pedunculated polyp: a map of space that draws a mushroom out of the wall; every derivative by closed formula.
+"""A pedunculated polyp: a map of space that raises a mushroom from the wall; all derivatives in closed form.
 
 With z the height over the polyp's foot along its axis a, x the vector across it, q = |x|^2 and h the polyp's height,
 
@@ -6,9 +6,9 @@ With z the height over the polyp's foot along its axis a, x the vector across it
     stricture: x' = (1 - A g(z') w(q)) x,   g = exp(-((z' - 0.3 h) / 0.3 h)^4),   w = exp(-q^2 / l^4), l = 2.4 s
 
 The lift raises a bump with steep sides, the stricture narrows it at the height of the neck and leaves the head above.
-Each is invertible: d(z')/dz > 0, as h |psi'| < 0.77, and d(|x'|)/d|x| >= 1 - A > 0. So the wall cannot run through
-itself, whatever folds are at the polyp's place, and where a point came from can be told. Far from the polyp both are
-the identity to rounding. The surface there is no radius over the centreline: the head overhangs the neck.
+Both are invertible: d(z')/dz > 0, as h |psi'| < 0.77, and d(|x'|)/d|x| >= 1 - A > 0. So the wall cannot intersect
+itself, whatever folds are at the polyp's position, and the origin of each point can be found. Far from the polyp both
+are the identity to rounding. On the polyp the surface is no radius over the centreline: the head overhangs the neck.
 """
 
 import math
@@ -16,14 +16,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from simtest.runtime.arrays import Array, Mask
 from simtest.surfaces.jets import Jet, squared, times
-from simtest.surfaces.model import Array
 
 NECK_AT = 0.3
 NECK_REACH = 0.3
-"""Place and half length of the neck, as shares of the height."""
+"""Height and half length of the neck, as shares of the polyp's height."""
 
 ACROSS = 2.4
 """Reach of the stricture across the axis, over the bump's width s."""
@@ -32,7 +31,7 @@ LIFT_REACH = 2.0
 """Height at which the lift has fallen to 1/e, over the polyp's height."""
 
 FAR = 40.0
-"""Where an exponent is beyond this its exponential is below rounding."""
+"""With an exponent beyond this an exponential is below rounding."""
 
 _STEPS = 80
 _PROFILE = np.linspace(0.01, 0.9999, 4000)
@@ -61,7 +60,7 @@ class Stalk:
 
     @classmethod
     def of_size(cls, foot: Array, axis: Array, height: float, head: float, neck: float) -> "Stalk":
-        """Make the polyp of a height, mm, and diameters of head and neck, mm, as they are on a flat wall."""
+        """Return the polyp of a height and diameters of head and neck, mm, as measured on a flat wall."""
         # The radius is s times a function of A and z / h alone, so A follows from the ratio of the two diameters.
         narrow, wide = 0.0, 1.0
         for _ in range(_STEPS):
@@ -78,25 +77,28 @@ class Stalk:
         near = np.flatnonzero(self.moves(p.f))
         return p.with_rows(near, self._applied(p.rows(near))) if near.size else p
 
-    def moves(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Tell which points, shape (N, 3), mm, are so near that the map moves them by more than rounding."""
+    def moves(self, points: Array) -> Mask:
+        """Return which points, shape (N, 3), mm, are so near that the map moves them by more than rounding."""
         z, x = self._split(points)
-        # Of E and w, and of g and psi, the one named last reaches farther.
+        # Of E and w the latter reaches farther, and of g and psi.
         across, along = math.sqrt(FAR) * (ACROSS * self.width) ** 2, FAR**0.25 * LIFT_REACH * self.height
         return np.asarray((np.einsum("ni,ni->n", x, x) < across) & (np.abs(z) < along))
 
     def _applied(self, p: Jet) -> Jet:
+        # coordinates about the foot
         from_foot = p + _constant(-self.foot, len(p.f))
         z = from_foot.along(self.axis)
         x = from_foot + times(z, _constant(-self.axis, len(p.f)))
         q = squared(x)
+        # lift, then stricture
         raised = z + times(self._bump(q), self._fading(z))
         share = times(self._neck(raised), self._reach(q))
         narrowed = x + times(share, x)
         return narrowed + times(raised, _constant(self.axis, len(p.f))) + _constant(self.foot, len(p.f))
 
     def undo(self, points: Array) -> Array:
-        """Give where points, shape (N, 3), mm, come from, to rounding."""
+        """Return where points, shape (N, 3), mm, come from, to rounding."""
+        # The stricture first, at the known height z'; then the lift, at the distance from the axis found there.
         z, x = self._split(points)
         length = np.linalg.norm(x, axis=1)
         g = self.depth * np.exp(-(((z / self.height - NECK_AT) / NECK_REACH) ** 4).clip(max=700))
@@ -105,7 +107,7 @@ class Stalk:
         def narrowed(r: Array) -> Array:
             return r * (1 - g * np.exp(-((r / across) ** 4).clip(max=700)))
 
-        # x' is the shorter, by no more than A of it.
+        # x' is shorter than x, by a share of at most A.
         r = _bisect(narrowed, length, length, length / (1 - self.depth) + 1e-12)
         bump = self._bump(_scalar(r * r)).f
 
@@ -118,44 +120,44 @@ class Stalk:
         return self.foot + source[:, None] * self.axis + stretch[:, None] * x
 
     def _split(self, points: Array) -> tuple[Array, Array]:
-        """Give z and x of points."""
+        """Return z and x of points."""
         from_foot = points - self.foot
         z = from_foot @ self.axis
         return z, from_foot - z[:, None] * self.axis
 
     def _bump(self, q: Jet) -> Jet:
-        """Give E."""
+        """Return E."""
         scale = 1 / (2 * self.width**2)
         tau = q.f * scale
         e, slope = np.exp(-(tau + tau**2) / 2), -(0.5 + tau) * scale
         return q.chain(e, e * slope, e * (slope**2 - scale**2))
 
     def _fading(self, z: Jet) -> Jet:
-        """Give h psi(z); the wall outside, z < 0, is lifted as well, which moves no wall through another."""
+        """Return h psi(z); the wall outside, z < 0, is lifted as well, which makes no two walls intersect."""
         f, first, second = _quartic(z.f, LIFT_REACH * self.height)
         h = self.height
         return z.chain(h * f, h * first, h * second)
 
     def _neck(self, z: Jet) -> Jet:
-        """Give -A g(z)."""
+        """Return -A g(z)."""
         f, first, second = _quartic(z.f - NECK_AT * self.height, NECK_REACH * self.height)
         return z.chain(-self.depth * f, -self.depth * first, -self.depth * second)
 
     def _reach(self, q: Jet) -> Jet:
-        """Give w."""
+        """Return w."""
         scale = (self.width * ACROSS) ** 4
         w, slope = np.exp(-(q.f**2) / scale), -2 * q.f / scale
         return q.chain(w, w * slope, w * (slope**2 - 2 / scale))
 
 
 def _quartic(x: Array, reach: float) -> tuple[Array, Array, Array]:
-    """Give exp(-(x / reach)^4) and its first and second derivative."""
+    """Return exp(-(x / reach)^4) and its first and second derivatives."""
     f, slope = np.exp(-((x / reach) ** 4)), -4 * x**3 / reach**4
     return f, f * slope, f * (slope**2 - 12 * x**2 / reach**4)
 
 
 def _widths(depth: float) -> tuple[float, float]:
-    """Give the radii of neck and head on a flat wall over the width s."""
+    """Return the radii of neck and head on a flat wall, over the width s."""
     z = _PROFILE
     tau = (np.sqrt(1 - 8 * np.log(z)) - 1) / 2
     r = np.sqrt(2 * tau)

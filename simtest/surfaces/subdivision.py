@@ -1,4 +1,4 @@
-"""Making a user's mesh smooth and fine: fair smoothing, Loop subdivision, normals and principal curvatures."""
+"""Refinement of a user's mesh: fair smoothing, Loop subdivision, normals and principal curvatures."""
 
 import math
 import warnings
@@ -7,47 +7,28 @@ from typing import Any
 import igl
 import numpy as np
 
-from simtest.surfaces.model import Array, IntArray
-from simtest.surfaces.repair import edge_uses
+from simtest.runtime.arrays import Array, IntArray
+from simtest.surfaces.mesh_geometry import edge_lengths, edge_uses
 
 MAX_SUBDIVIDED_FACES = 1_600_000
 
 CURVATURE_RINGS = 2
 """Rings of neighbours to which the quadric is fitted for the curvature.
 
-Few, so that the curvature is that of the normals which make the highlights: compared with the change of the vertex
+Few, so that the curvature agrees with the normals that make the highlights: compared with the change of the vertex
 normals along the edges of a colon from CT, subdivided once, 2 rings give 0.85 of the curvature, 5 give 0.55.
 """
 
 MAX_SMOOTHED_FACES = 400_000
-"""Up to this many faces are smoothed: 7 s and 1 GB at the limit."""
-
-
-def edge_lengths(vertices: Array, faces: IntArray) -> Array:
-    """Give the length of each edge, mm, shape (E,)."""
-    edges, _ = edge_uses(faces)
-    return np.asarray(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1))
+"""Meshes of up to this many faces are smoothed: 7 s and 1 GB at the limit."""
 
 
 def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
-    """Smooth a mesh: a wave of this length keeps half of its height, a longer one nearly all, a shorter one little.
+    """Smooth a manifold: a wave of this length keeps half of its height, a longer one nearly all, a shorter one little.
 
-    Minimises sum m |x - x0|^2 + s sum |L x|^2 / m, with L the cotangent Laplacian, m the Voronoi areas and
-    s = (wavelength / 2 pi)^4, which damps a wave of wave number q by 1 / (1 + s q^4). At a rim the Laplacian is left
-    out, so that an open mesh does not shrink.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-        A manifold.
-    wavelength_mm : float
-        > 0.
-
-    Returns
-    -------
-    ndarray, shape (V, 3)
+    Minimises sum m |x - x0|^2 + s sum |L x|^2 / m, with L the cotangent Laplacian, m the Voronoi areas and s =
+    (wavelength / 2 pi)^4, which damps a wave of wave number q by 1 / (1 + s q^4). At a rim the Laplacian is left out,
+    so that an open mesh does not shrink.
     """
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
@@ -62,21 +43,22 @@ def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
     # Symmetric and positive definite. Thin triangles make it so stiff that conjugate gradients take thousands of steps.
     options = {"SymmetricMode": True}
     solver = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    # About the centroid: rounding is then relative to the size, not to the place.
+    # About the centroid, so that rounding is relative to the size, not to the distance from the origin.
     middle = vertices.mean(axis=0)
     return np.ascontiguousarray(solver.solve(mass[:, None] * (vertices - middle)) + middle)
 
 
 def halvings(vertices: Array, faces: IntArray, edge_mm: float) -> int:
-    """Give how often edges have to be halved for 95 % of them to be at most `edge_mm` long."""
+    """Return how often edges must be halved for 95 % of them to be at most `edge_mm` long."""
     length = float(np.quantile(edge_lengths(vertices, faces), 0.95))
-    # A hair of tolerance, so that the mesh's own edge length asks for nothing.
+    # With a small tolerance, so that the mesh's own edge length needs no halving.
     return max(0, math.ceil(math.log2(length / edge_mm) - 1e-6))
 
 
 def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
-    """Give how often a mesh may be subdivided: `wanted`, or fewer with a warning that says why."""
+    """Return how often a mesh may be subdivided: `wanted`, or fewer with a warning that names the reason."""
     allowed = wanted
+    # Each subdivision makes four faces of one.
     while allowed and len(faces) * 4**allowed > MAX_SUBDIVIDED_FACES:
         allowed -= 1
     if allowed < wanted:
@@ -94,7 +76,7 @@ def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
 
 
 def allowed_smoothing(path: str, faces: IntArray, wanted: float) -> float:
-    """Give the wavelength that may be smoothed, mm: `wanted`, or 0 with a warning that says why."""
+    """Return the wavelength that may be smoothed, mm: `wanted`, or 0 with a warning that names the reason."""
     problem = ""
     if len(faces) > MAX_SMOOTHED_FACES:
         problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
@@ -107,25 +89,10 @@ def allowed_smoothing(path: str, faces: IntArray, wanted: float) -> float:
 
 
 def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
-    """Subdivide by Loop's scheme, `times` times, and smooth fairly.
+    """Subdivide by Loop's scheme, `times` times, and smooth fairly unless `smoothing_mm` (see `fair`) is 0.
 
     The smoothing comes after the first subdivision, where it also evens out what Loop's scheme leaves around vertices
-    of other than six neighbours; before it where there would be more than `MAX_SMOOTHED_FACES`.
-
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        mm.
-    faces : ndarray of int, shape (F, 3)
-    times : int
-        >= 0.
-    smoothing_mm : float
-        See `fair`; 0: none.
-
-    Returns
-    -------
-    vertices : ndarray, shape (V', 3)
-    faces : ndarray of int, shape (4^times F, 3)
+    of other than six neighbours; before it if there would be more than `MAX_SMOOTHED_FACES`.
     """
     if smoothing_mm:
         if times and 4 * len(faces) <= MAX_SMOOTHED_FACES:
@@ -136,15 +103,15 @@ def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) ->
 
 
 def vertex_normals(vertices: Array, faces: IntArray) -> Array:
-    """Give unit vertex normals, shape (V, 3): the faces' normals weighted by their angle at the vertex."""
+    """Return unit vertex normals, shape (V, 3): the faces' normals weighted by their angles at the vertex."""
     normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def shape_operators(vertices: Array, faces: IntArray) -> Array:
-    """Give S at the vertices for outward normals, 1/mm, shape (V, 3, 3), by a quadric fitted to the neighbours.
+    """Return S at the vertices for outward normals, 1/mm, shape (V, 3, 3), from a quadric fitted to the neighbours.
 
-    libigl counts a surface convex towards its normals positive, as we do (the tests check it on a sphere).
+    For libigl a surface convex towards its normals has positive curvature, as for us (the tests check it on a sphere).
     """
     fitted: Any = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
     first, second, k1, k2 = fitted[:4]

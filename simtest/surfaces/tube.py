@@ -1,4 +1,4 @@
-"""A bent tube with haustral folds, the surface of a generated colon; every derivative by closed formula.
+"""A bent tube with haustral folds, the surface of a generated colon; all derivatives in closed form.
 
 P(u, v) = C(u) + r(u, v) rho(u, v), rho = cos v e1(u) + sin v e2, with C' = T = (sin psi, 0, cos psi),
 e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T' = psi' e1 and e1' = -psi' T,
@@ -10,7 +10,7 @@ e1 = (cos psi, 0, -sin psi), e2 = (0, 1, 0) and tau = -sin v e1 + cos v e2. As T
     P_vv = (r_vv - r) rho + 2 r_v tau
 
 P_u x P_v points into the lumen while 1 - psi' r cos v > 0. Pedunculated polyps are maps of space applied to P
-(simtest.surfaces.stalk); they keep the sense of P_u x P_v.
+(simtest.surfaces.stalk), which preserve the sense of P_u x P_v.
 """
 
 import math
@@ -18,12 +18,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import Array
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.stalk import Stalk
 
@@ -39,9 +38,9 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 @dataclass(frozen=True)
 class _Fold:
-    """A fold d exp(-(u - place - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1))."""
+    """A fold d exp(-(u - along - slant sin(v - centre))^2 / (2 w^2) + kappa (cos(v - centre) - 1))."""
 
-    place: float
+    along: float
     centre: float
     depth: float
     width: float
@@ -52,14 +51,7 @@ class _Fold:
 class Tube:
     """The surface of a recipe as a function of (u, v): u along the centreline, mm; v around it, rad.
 
-    Parameters
-    ----------
-    recipe : ColonRecipe
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen or the tube bends into itself.
+    Raises `InputError` if the folds close the lumen or the tube bends into itself.
     """
 
     def __init__(self, recipe: ColonRecipe) -> None:
@@ -71,7 +63,7 @@ class Tube:
         self._relief = self._draw_relief(rng)
         self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
         steps = self._integrate(self._knots[:-1], self._knots[1:])
-        self._knot_places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._knot_points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         self._stalks: tuple[Stalk, ...] = ()
         self._check()
         self._stalks = tuple(self._draw_stalks())
@@ -82,7 +74,7 @@ class Tube:
         pitch = recipe.length_mm / rings
         for ring in range(rings):
             for third in range(3):
-                depth, edge, place, turn = 1 + spread * rng.uniform(-1, 1, size=4)
+                depth, edge, shift, turn = 1 + spread * rng.uniform(-1, 1, size=4)
                 slant = spread * recipe.fold_spacing_mm * rng.uniform(-0.5, 0.5)
                 kappa = recipe.fold_concentration * (1 + spread * rng.uniform(-1, 1))
                 # The taeniae are where r is largest, cos(3 (v - phase)) = 1; a fold lies between two of them.
@@ -90,11 +82,11 @@ class Tube:
                 depth *= recipe.fold_depth_mm
                 # The crest's radius of curvature along u is width^2 / depth.
                 width = math.sqrt(max(depth, 1e-6) * edge * recipe.fold_edge_mm)
-                folds.append(_Fold((ring + 0.5 + place - 1) * pitch, centre, depth, width, slant, kappa))
+                folds.append(_Fold((ring + 0.5 + shift - 1) * pitch, centre, depth, width, slant, kappa))
         return tuple(folds)
 
     def _polyps(self) -> Iterator[_Fold]:
-        """Give the sessile polyps: folds that are as wide around the tube as along it, and not slanted."""
+        """Yield the sessile polyps: folds that are as wide around the tube as along it, and not slanted."""
         for polyp in self.recipe.polyps:
             if polyp.neck_mm is not None:
                 continue
@@ -103,7 +95,7 @@ class Tube:
             yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
 
     def _draw_stalks(self) -> Iterator[Stalk]:
-        """Give the pedunculated polyps, each on the wall as it is without any of them, towards the centreline."""
+        """Yield the pedunculated polyps, each on the wall as it is without them, towards the centreline."""
         for polyp in self.recipe.polyps:
             if polyp.neck_mm is not None:
                 u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
@@ -111,7 +103,7 @@ class Tube:
                 yield Stalk.of_size(foot, axis, polyp.height_mm, polyp.width_mm, polyp.neck_mm)
 
     def _draw_relief(self, rng: np.random.Generator) -> tuple[tuple[float, int, float], ...]:
-        """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is whole, so that they close."""
+        """Draw the waves cos(q u + m v + phase) of the mucosa's relief; m is an integer, so that they close."""
         recipe = self.recipe
         if not recipe.relief_mm:
             return ()
@@ -123,6 +115,7 @@ class Tube:
         return tuple(waves)
 
     def _check(self) -> None:
+        """Raise `InputError` if the folds close the lumen or the tube bends into itself."""
         u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
         r = self.radius(u.ravel(), v.ravel()).f
         if r.min() < 0.1 * self.recipe.radius_mm:
@@ -138,56 +131,62 @@ class Tube:
             )
 
     def heading(self, u: Array) -> tuple[Array, Array, Array]:
-        """Give psi, rad, and its first and second derivatives at u, mm, shape (N,)."""
+        """Return psi, rad, and its first and second derivatives at u, mm, shape (N,)."""
         rate = math.radians(self.recipe.bend_deg) / self.recipe.length_mm
         sway, omega = math.radians(self.recipe.sway_deg), 2 * math.pi / self.recipe.sway_length_mm
         sine, cosine = np.sin(omega * u + self._phase), np.cos(omega * u + self._phase)
         return rate * u + sway * sine, rate + sway * omega * cosine, -sway * omega**2 * sine
 
     def _integrate(self, start: Array, stop: Array) -> Array:
+        """Return C(stop) - C(start), mm, shape (N, 3)."""
         half = (stop - start) / 2
         psi = self.heading(((start + stop) / 2)[:, None] + half[:, None] * _GAUSS_NODES)[0]
         x, z = (half * (part(psi) @ _GAUSS_WEIGHTS) for part in (np.sin, np.cos))
         return np.stack([x, np.zeros_like(x), z], axis=1)
 
     def centreline(self, u: Array) -> Array:
-        """Give C(u), mm, shape (N, 3), by Gauss-Legendre quadrature from the nearest knot: exact to rounding."""
+        """Return C(u), mm, shape (N, 3), by Gauss-Legendre quadrature from the nearest knot: exact to rounding."""
         spacing = self._knots[1] - self._knots[0]
         knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
-        return self._knot_places[knot] + self._integrate(self._knots[knot], u)
+        return self._knot_points[knot] + self._integrate(self._knots[knot], u)
 
     def slice_of(self, points: Array) -> tuple[Array, Array, Array]:
-        """Give (u, v) and the distance from the centreline, mm, of points, shape (N, 3), near the tube.
+        """Return (u, v) and the distance from the centreline, mm, of points, shape (N, 3), near the tube.
 
-        Of a point that a pedunculated polyp has moved, those of where it came from. u solves (x - C(u)) . T(u) = 0:
-        started at the nearest of a row of centreline points, then by Newton's method.
+        A point that a pedunculated polyp has moved counts where it came from. u solves (x - C(u)) . T(u) = 0 by
+        Newton's method, started at the nearest of a row of centreline points.
         """
         for stalk in reversed(self._stalks):
             points = stalk.undo(points)
+        # start
         row = np.linspace(0, self.recipe.length_mm, 129)
         gaps = points[:, None] - self.centreline(row)
         u = row[np.argmin(np.einsum("nki,nki->nk", gaps, gaps), axis=1)]
+        # refine
         for _ in range(20):
             psi, bend, _ = self.heading(u)
             s, c = np.sin(psi), np.cos(psi)
             x, z = (points - self.centreline(u))[:, [0, 2]].T
             slope = np.maximum(1 - bend * (x * c - z * s), 0.1)  # the tube keeps it positive
             u = u + np.clip((x * s + z * c) / slope, -5.0, 5.0)
+        # angle and distance in the slice
         psi = self.heading(u)[0]
         x, y, z = (points - self.centreline(u)).T
         across = x * np.cos(psi) - z * np.sin(psi)
         return u, np.arctan2(y, across), np.hypot(across, y)
 
     def radius(self, u: Array, v: Array) -> Jet:
-        """Give r(u, v), mm, and its derivatives; u, v of shape (N,)."""
+        """Return r(u, v), mm, and its derivatives; u, v of shape (N,)."""
+        # taeniae
         amplitude, angle = self.recipe.taenia_mm, 3 * (v - self._taenia_phase)
         sine, cosine = np.sin(angle), np.cos(angle)
         zero = np.zeros_like(u)
         f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
         fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
+        # folds and sessile polyps
         for fold in self._folds:
             sine, cosine = np.sin(v - fold.centre), np.cos(v - fold.centre)
-            x, w2 = u - fold.place - fold.slant * sine, fold.width**2
+            x, w2 = u - fold.along - fold.slant * sine, fold.width**2
             bump = fold.depth * np.exp(-(x**2) / (2 * w2) + fold.kappa * (cosine - 1))
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
@@ -199,6 +198,7 @@ class Tube:
             fuu -= bump * (eu * eu - 1 / w2)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
+        # relief
         for q, m, phase in self._relief:
             angle = q * u + m * v + phase
             sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
@@ -211,7 +211,7 @@ class Tube:
         return Jet(f, fu, fv, fuu, fuv, fvv)
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Give T, rho and tau, three arrays of shape (N, 3)."""
+        """Return T, rho and tau, three arrays of shape (N, 3)."""
         psi = self.heading(u)[0]
         s, c, zero = np.sin(psi), np.cos(psi), np.zeros_like(psi)
         e1, e2 = np.stack([c, zero, -s], axis=1), np.array([0.0, 1.0, 0.0])
@@ -219,7 +219,7 @@ class Tube:
         return np.stack([s, zero, c], axis=1), cv * e1 + sv * e2, cv * e2 - sv * e1
 
     def tangents(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Give P, mm, P_u and P_v, three arrays of shape (N, 3)."""
+        """Return P, mm, P_u and P_v, three arrays of shape (N, 3)."""
         r, bend = self.radius(u, v), self.heading(u)[1]
         T, rho, tau = self.frame(u, v)
         along = (1 - bend * r.f * np.cos(v))[:, None]
@@ -228,11 +228,11 @@ class Tube:
         if not self._stalks:
             return position, first, second
         none = np.zeros_like(position)
-        moved = self._draw_out(Jet(position, first, second, none, none, none))
+        moved = self._with_stalks(Jet(position, first, second, none, none, none))
         return moved.f, moved.u, moved.v
 
     def jet(self, u: Array, v: Array) -> Jet:
-        """Give P, mm, and its derivatives by the formulas of this module's head; u, v of shape (N,)."""
+        """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
         r = self.radius(u, v)
         _, bend, twist = self.heading(u)
         cv, sv = np.cos(v), np.sin(v)
@@ -250,28 +250,28 @@ class Tube:
             uv=combine(bend * (r.f * sv - r.v * cv), r.uv, r.u),
             vv=combine(zero, r.vv - r.f, 2 * r.v),
         )
-        return self._draw_out(wall)
+        return self._with_stalks(wall)
 
     @property
     def has_stalks(self) -> bool:
         """Whether there are pedunculated polyps."""
         return bool(self._stalks)
 
-    def drawn_out(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Tell which points, shape (N, 3), mm, are near enough to a pedunculated polyp to be moved by it."""
+    def moved_by_stalks(self, points: Array) -> Mask:
+        """Return which points, shape (N, 3), mm, are near enough to a pedunculated polyp to be moved by it."""
         moved = np.zeros(len(points), dtype=bool)
         for stalk in self._stalks:
             moved |= stalk.moves(points)
         return moved
 
-    def _draw_out(self, wall: Jet) -> Jet:
+    def _with_stalks(self, wall: Jet) -> Jet:
         """Apply the pedunculated polyps."""
         for stalk in self._stalks:
             wall = stalk.apply(wall)
         return wall
 
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Give the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
+        """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
         p = self.jet(u, v)
         normal = np.cross(p.u, p.v)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -284,19 +284,10 @@ class Tube:
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
     ) -> tuple[Array, Array, Array]:
-        """Solve P(u, v) = origin + t direction by Newton's method from a start close by.
+        """Solve P(u, v) = origin + t direction by Newton's method; return t, u and v, t NaN if there is no solution.
 
-        Parameters
-        ----------
-        origins, directions : ndarray, shape (N, 3)
-            Rays, mm; unit directions.
-        distance, u, v : ndarray, shape (N,)
-            The start.
-
-        Returns
-        -------
-        distance, u, v : ndarray, shape (N,)
-            The solution; distance is NaN where there is none.
+        The rays are of shape (N, 3), in mm, with unit directions; `distance`, `u` and `v`, shape (N,), are a start
+        close by.
         """
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)
@@ -309,6 +300,7 @@ class Tube:
             active, pu, pv, miss = active[~done], pu[~done], pv[~done], miss[~done]
             if not active.size:
                 break
+            # The linear system P_u du + P_v dv - direction dt = -miss
             du, dv, dt = _solve3(pu, pv, -directions[active], -miss)
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
@@ -321,7 +313,7 @@ class Tube:
 
 
 def _solve3(a: Array, b: Array, c: Array, right: Array) -> tuple[Array, Array, Array]:
-    """Solve [a b c] x = right by Cramer's rule, all of shape (N, 3); a singular matrix gives inf or NaN."""
+    """Solve [a b c] x = right by Cramer's rule, all of shape (N, 3); inf or NaN for a singular matrix."""
     bc = np.cross(b, c)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / np.einsum("ni,ni->n", a, bc)

@@ -13,7 +13,7 @@ from simtest.runtime.resources import find, shown
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
-from simtest.spec.toml_output import toml_value
+from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
 from simtest.validation.results_table import Value
 

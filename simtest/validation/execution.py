@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from simtest.estimators import load_estimators
-from simtest.runtime.engines import Tell
+from simtest.runtime.engines import OnStep
 from simtest.spec import Experiment
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
@@ -69,7 +69,7 @@ def parts_of(
     ]
 
 
-def make_rows(part: Part, tell: Tell) -> pl.DataFrame:
+def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     """Make a part's rows, in the order of its realisations; `tell` is called after each."""
     if part.case.is_paper:
         made = completed(_published(part), part.swept)
@@ -79,7 +79,7 @@ def make_rows(part: Part, tell: Tell) -> pl.DataFrame:
     return table(_rendered(part, tell), part.swept)
 
 
-def _rendered(part: Part, tell: Tell) -> list[ResultRow]:
+def _rendered(part: Part, tell: OnStep) -> list[ResultRow]:
     experiment, case, realiser = part.experiment, part.case, _realiser(part.variant)
     estimators = load_estimators(experiment.estimators)
     rows: list[ResultRow] = []

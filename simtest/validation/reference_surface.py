@@ -12,7 +12,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.resources import shown
-from simtest.spec.toml_input import read_toml
+from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
     DepthVerdict,

@@ -19,8 +19,8 @@ from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import Scene, scene_from_dict
-from simtest.spec.toml_output import toml_value
-from simtest.surfaces.generate import load_anatomy
+from simtest.spec.toml_files import toml_value
+from simtest.surfaces.recipe import load_anatomy
 
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]

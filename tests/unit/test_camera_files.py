@@ -184,8 +184,20 @@ ignored: 1
     }  # fmt: skip
     assert parse_yaml("") is None
     assert parse_yaml("[1, 2]") == [1, 2]
-    long = "data: [" + "1.25, " * 20_000 + "2]\n" + "a" + " " * 50_000 + "b: 1"
-    assert len(parse_yaml(long)["data"]) == 20_001
+    assert len(parse_yaml("data: [" + "1.25, " * 20_000 + "2]")["data"]) == 20_001
+    assert parse_yaml("a: 1\r\nb: 2\r\n") == {"a": 1, "b": 2}
+    assert parse_yaml("---\n") is None
+
+
+def test_yaml_scalars():
+    """Numbers as calibrations write them; what YAML 1.1 reads as octal, base 60, date or truth value stays plain."""
+    numbers = parse_yaml("[1e-5, 1.e+00, -.5, .5e1, +3, 010, .inf, -.INF, 123456789012345678901]")
+    assert numbers == [1e-5, 1.0, -0.5, 5.0, 3, 10, np.inf, -np.inf, 123456789012345678901.0]
+    assert np.isnan(parse_yaml("[.nan, nan]")).all()
+    assert parse_yaml("[12:30, 2024-01-01, yes, off, 0x1F, 1_000, '1']") == [
+        "12:30", "2024-01-01", "yes", "off", "0x1F", "1_000", "1",
+    ]  # fmt: skip
+    assert parse_yaml("1: a\ntrue: b\n~: c\n") == {"1": "a", "true": "b", "~": "c"}
 
 
 # Plain JSON and other names ----------------------------------------------------------------------------------------
@@ -220,13 +232,13 @@ BAD = {
     "no JSON": ("c.json", "{", "not valid JSON: "),
     "a list": ("c.json", "[1, 2]", "holds no keys"),
     "empty": ("c.yaml", "", "holds no keys"),
-    "broken YAML": ("c.yml", "a: [1, 2\n", "not valid YAML: line 1: a bracket is not closed"),
-    "no YAML": ("c.yml", "\x01\x02", "holds no keys"),
-    "level": ("c.yml", "a: 1\n  b: 2\n", "not valid YAML: line 2: incorrect indentation"),
+    "broken YAML": ("c.yml", "a: [1, 2\n", "not valid YAML: line 2: expected ',' or ']', but got"),
+    "no YAML": ("c.yml", "\x01\x02", "not valid YAML: line 1: special characters are not allowed"),
+    "level": ("c.yml", "a: 1\n  b: 2\n", "not valid YAML: line 2: mapping values are not allowed here"),
     "twice": ("c.yml", "a: 1\na: 2\n", "line 2: a is given twice"),
-    "anchor": ("c.yml", "a: &b 1\n", "line 1: '&b 1' is not supported"),
-    "no key": ("c.yml", "a: 1\nb\n", "line 2: must be key: value"),
-    "missing comma": ("c.yml", "a: [1 [2]]\n", "line 1: missing , before '['"),
+    "anchor": ("c.yml", "a: &b 1\n", "line 1: &b: anchors and aliases are not allowed"),
+    "no key": ("c.yml", "a: 1\nb\n", "line 3: could not find expected ':'"),
+    "missing comma": ("c.yml", "a: [1 [2]]\n", "line 1: expected ',' or ']', but got '['"),
     "broken XML": ("c.xml", "<?xml version='1.0'?><opencv_storage><a>", "not valid XML: "),
     "deep YAML": ("c.yaml", "a: " + "[" * 9999 + "]" * 9999, "line 1: nested too deeply"),
     "deep XML": ("c.xml", "<?xml version='1.0'?>" + "<a>" * 60_000 + "</a>" * 60_000, "nested too deeply"),
@@ -269,6 +281,62 @@ def test_malformed_files(tmp_path, case):
     assert message.startswith(f"{tmp_path / name}: ")
     assert fragment in message
     assert "\n" not in message
+
+
+HOSTILE = {
+    "billion laughs": ("a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n", "line 1: &a: anchors and aliases are not"),
+    "alias": ("a: *b\n", "line 1: *b: anchors and aliases are not allowed"),
+    "itself": ("&a [*a]", "line 1: &a: anchors and aliases are not allowed"),
+    "merge key": ("a: {b: 1}\n<<: {c: 2}\n", "line 2: merge keys (<<) are not allowed"),
+    "Python": (
+        "a: !!python/object/apply:os.system [ls]\n",
+        "line 1: tag !!python/object/apply:os.system is not allowed",
+    ),
+    "Python name": ("a: !!python/name:os.system\n", "line 1: tag !!python/name:os.system is not allowed; only !!open"),
+    "own tag": ("a: !mine 1\n", "line 1: tag !mine is not allowed; only !!opencv-... is"),
+    "binary": ("a: !!binary aGk=\n", "line 1: tag !!binary is not allowed"),
+    "map as key": ("[1, 2]: 3\n", "line 1: must be key: value, and the key a word"),
+    "twice, in a flow": ("a: {b: 1, b: 2}\n", "line 1: b is given twice"),
+    "tab": ("a:\n\tb: 1\n", "line 2: found character"),
+    "two in a line": ("a: 1: 2\n", "line 1: mapping values are not allowed here"),
+    "long key": ("a" + " " * 50_000 + "b: 1\n", "line 1: mapping values are not allowed here"),
+    "deep blocks": ("".join(f"{' ' * i}a:\n" for i in range(1000)), "line 32: nested too deeply; at most 32"),
+    "deep lists": ("- " * 400_000, "line 1: nested too deeply; at most 32 levels are allowed"),
+    "deep keys": ("? " * 400_000, "line 1: nested too deeply; at most 32 levels are allowed"),
+    "deep maps": ("{" * 900_000, "line 1: nested too deeply; at most 32 levels are allowed"),
+    "huge row": ("a: [" + "1," * 400_000 + "1]", "line 1: too many values; at most 100000 are allowed"),
+    "huge file": ("a: [" + "1," * 500_000 + "1]", "1000006 bytes; a camera file of at most 1000000 is allowed"),
+    "NaN": (ROS_FILE.replace("438.78", ".nan"), "fx = nan: must be a finite number"),
+    "infinity": (ROS_FILE.replace("438.78", "-.inf"), "fx = -inf: must be a finite number"),
+    "many digits": (ROS_FILE.replace("438.78", "9" * 5000), "fx = inf: must be a finite number"),
+    "only a comment": ("%YAML:1.0\n# nothing\n", "holds no keys"),
+    "quotes": ("'" * 900_000, "holds no keys"),
+    "digits": ("a: " + "9" * 900_000 + "x", "image_width: missing"),
+    "colons": (":" * 900_000, "line 1: mapping values are not allowed here"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_yaml_is_one_line(tmp_path, case):
+    text, fragment = HOSTILE[case]
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'c.yaml'}: ")
+    assert fragment in message
+    assert "\n" not in message
+
+
+@settings(max_examples=300, deadline=2000, derandomize=True)
+@given(st.text(alphabet="ab1.-: \n\t[]{},&*!|>'\"%@`?#~<", max_size=60))
+def test_yaml_raises_value_errors_only(text):
+    said = "line "
+    try:
+        parse_yaml(text)
+    except ValueError as error:
+        said = str(error)
+    assert said.startswith("line ")
+    assert "\n" not in said
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)

@@ -161,7 +161,7 @@ def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
     assert (np.einsum("ni,ni->n", cross, mesh.normals[mesh.faces[:, 0]]) > 0).all()
     tube = build(recipe).tube
     chosen = np.arange(0, len(mesh.vertices), 97)
-    chosen = chosen[~tube.drawn_out(mesh.vertices[chosen])]
+    chosen = chosen[~tube.moved_by_stalks(mesh.vertices[chosen])]
     inward = tube.centreline(tube.slice_of(mesh.vertices[chosen])[0]) - mesh.vertices[chosen]
     # Along the flank of a fold the normal may lean, but on the whole it points to the centreline.
     assert np.median(np.einsum("ni,ni->n", inward, mesh.normals[chosen]) / np.linalg.norm(inward, axis=1)) > 0.9

@@ -17,16 +17,16 @@ from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES
 from simtest.dataset.manifest import NAME, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.reproduce import compare, sample_again
+from simtest.dataset.reproduce import compare, reproduce_sample
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
+from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import mend, verify
-from simtest.dataset.writer import write_dataset
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.cluster import cores_each
+from simtest.runtime.engines.cluster import cores_per_task
 from simtest.spec import load_dataset, scene_from_dict
-from simtest.spec.dataset import Dataset, Distribution, Splits
-from simtest.spec.toml_input import validate
+from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
+from simtest.spec.spec_model import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}
@@ -236,7 +236,7 @@ def test_truth_is_where_the_highlight_is(made):
 def test_same_bytes_again_whole_and_alone(made, tmp_path):
     write_dataset(tiny(**SIX), tmp_path / "again", make_engine())
     assert contents(tmp_path / "again") == contents(made)
-    sample_again(made, 4, tmp_path / "alone")
+    reproduce_sample(made, 4, tmp_path / "alone")
     assert compare(made, 4, tmp_path / "alone").endswith("same bytes")
     (tmp_path / "alone" / "000000004.image.png").write_bytes(b"x")
     assert compare(made, 4, tmp_path / "alone").endswith("differs in image.png")
@@ -282,7 +282,7 @@ def test_a_finished_shard_that_the_manifest_lost_is_not_made_again(made, copy, m
     manifest = read_manifest(copy)
     manifest.shards.pop(sorted(manifest.shards)[0])
     manifest.save(copy)
-    monkeypatch.setattr("simtest.dataset.sample.Maker.make", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
     write_dataset(tiny(**SIX), copy, make_engine())
     assert contents(copy) == contents(made)
 
@@ -294,7 +294,7 @@ def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         write_sample(file, key, members)
 
-    monkeypatch.setattr("simtest.dataset.writer.write_sample", full)
+    monkeypatch.setattr("simtest.dataset.shard_writer.write_sample", full)
     with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); what is written stays valid"):
         write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
     monkeypatch.undo()
@@ -310,7 +310,7 @@ def test_reader_names_what_it_does_not_know(made, tmp_path):
     with pytest.raises(InputError, match="no dataset to read"):
         read(tmp_path)
     with pytest.raises(InputError, match="must be 0 to 5"):
-        sample_again(made, 6, tmp_path / "x")
+        reproduce_sample(made, 6, tmp_path / "x")
 
 
 def test_the_card_says_where_surfaces_come_from():
@@ -551,7 +551,7 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
 )
 def test_no_task_asks_a_cluster_for_more_cores_than_a_node_has(cores, workers, each):
     nodes = [{"memory": 1e9} if count is None else {"CPU": float(count)} for count in cores]
-    assert cores_each(nodes, workers) == each
+    assert cores_per_task(nodes, workers) == each
 
 
 # Command line -------------------------------------------------------------------------------------------------------

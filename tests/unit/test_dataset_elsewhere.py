@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from simtest.dataset import fields, read
-from simtest.dataset.writer import write_dataset
+from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
 from simtest.spec import load_dataset

@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 from simtest.dataset.learn import Samples, read_crops  # noqa: E402
 from simtest.dataset.learn.network import propose, train  # noqa: E402
-from simtest.dataset.writer import write_dataset  # noqa: E402
+from simtest.dataset.shard_writer import write_dataset  # noqa: E402
 from simtest.errors import InputError  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.runtime.engines import make_engine  # noqa: E402

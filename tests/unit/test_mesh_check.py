@@ -39,7 +39,7 @@ def said(verdict):
 def test_a_good_mesh_needs_no_repair(tmp_path):
     verdict = check_mesh(save(tmp_path / "ball.ply", *ball(5)), 50.0, C)
     assert not list(verdict.repairs.sentences())
-    assert verdict.condition.as_dict() == {
+    assert verdict.condition.to_json() == {
         "watertight": True, "pieces": 1, "open_edges": 0, "non_manifold_edges": 0, "crossing_faces": 0
     }  # fmt: skip
     assert verdict.usable

@@ -13,8 +13,9 @@ import pytest
 import trimesh
 
 from simtest.cli import main as command_line
-from simtest.surfaces.generate import load_anatomy, make_mesh
+from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.recipe import load_anatomy
 
 ROOT = Path(__file__).resolve().parents[2]
 SUMS = (ROOT / "meshes" / "SHA256SUMS").read_text().splitlines()
@@ -142,7 +143,7 @@ def test_a_segment_of_100_mm_takes_less_than_1_gb():
     Not by getrusage, whose peak a child inherits from its parent. The time of generation is no test's business.
     """
     code = (
-        "from simtest.surfaces.generate import load_anatomy\nfrom simtest.surfaces.colon import build\n"
+        "from simtest.surfaces.recipe import load_anatomy\nfrom simtest.surfaces.colon import build\n"
         "recipe = load_anatomy('colon', settings={'length_mm': 100.0})\n"
         "faces = len(build(recipe).mesh.faces)\n"
         "peak = next(line for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"

@@ -6,10 +6,10 @@ import trimesh
 
 from simtest.spec.surface import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.mesh_geometry import edge_lengths, edge_uses
 from simtest.surfaces.mesh_surface import Refinement, prepare
 from simtest.surfaces.model import principal_curvatures
-from simtest.surfaces.repair import edge_uses
-from simtest.surfaces.subdivision import edge_lengths, fair, halvings, refine, shape_operators, vertex_normals
+from simtest.surfaces.subdivision import fair, halvings, refine, shape_operators, vertex_normals
 
 
 def plane_lattice(side, reach):

@@ -8,13 +8,9 @@ import trimesh
 
 from simtest.errors import InputError
 from simtest.spec.surface import AnatomySurface
-from simtest.surfaces.mesh_surface import (
-    LUMEN_QUOTIENT,
-    MeshSurface,
-    isoperimetric_quotient,
-    prepare,
-    read_mesh,
-)
+from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.mesh_geometry import isoperimetric_quotient
+from simtest.surfaces.mesh_surface import LUMEN_QUOTIENT, MeshSurface, prepare
 from simtest.surfaces.model import RayHits
 
 MESHES = Path(__file__).resolve().parents[2].parent / "shared/data/meshes"

@@ -6,7 +6,7 @@ import pytest
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.spec.falloff import CosineProfile, TableProfile
-from simtest.spec.toml_input import validate
+from simtest.spec.spec_model import validate
 
 
 def test_cosine_profile_is_the_cosines_power():

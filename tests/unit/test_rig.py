@@ -15,7 +15,7 @@ from simtest.runtime.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
 from simtest.spec.experiment import Experiment
 from simtest.spec.rig import COLOCATED_MM, PRESETS, Rig
-from simtest.spec.toml_input import apply_settings
+from simtest.spec.toml_files import apply_settings
 from simtest.validation.cases import expand
 
 render = pytest.mark.render
@@ -48,7 +48,7 @@ def matt(light, factor):
     """Radiance of a Lambertian plane of albedo 1/2 under a light; factor over the angle from its axis."""
     spec = LightSpec.model_validate(light)
     P = positions()
-    away = P - np.array(spec.place_mm)
+    away = P - np.array(spec.nominal_mm)
     squared = np.sum(away**2, axis=-1)
     away /= np.sqrt(squared)[..., None]
     axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
@@ -282,12 +282,12 @@ def test_an_experiment_draws_the_position_errors_anew_for_each_realisation():
 def test_presets_stand_on_a_ring_and_share_the_power(preset, count):
     rig = scene(rig={"preset": preset}).rig
     places = rig.nominal_mm()
-    assert len(places) == count == PRESETS[preset]["count"]
-    np.testing.assert_allclose(np.linalg.norm(places, axis=1), PRESETS[preset]["radius_mm"], atol=1e-12)
+    assert len(places) == count == PRESETS[preset].count
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), PRESETS[preset].radius_mm, atol=1e-12)
     assert sum(light.power for light in rig.lights) == pytest.approx(1)
     if count > 1:
         np.testing.assert_allclose(places.mean(axis=0), 0, atol=1e-12)
-        assert 3 <= PRESETS[preset]["radius_mm"] <= 5
+        assert 3 <= PRESETS[preset].radius_mm <= 5
     else:
         assert np.linalg.norm(places) <= COLOCATED_MM
 

@@ -1,38 +1,36 @@
-"""Crops of matched highlights with their true normals and axis ratios, and what the classical estimators made of them.
+"""Crops of matched highlights with true normals and axis ratios, and with the errors of the classical estimators.
 
-A crop is resampled to twice the detection's box, so that a network sees the shape whatever the size; the size, the
-sightline and the light's place go beside it. The normal is asked for as the rotation from the direction to the camera,
-two numbers, since at a highlight the two are nearly the same.
+A crop is resampled to twice the detection's box, so that a network sees the shape whatever its size; size, sightline
+and light position are extra inputs. The target is the rotation from the direction to the camera to the normal, two
+numbers, since at a highlight the two directions are nearly the same.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import srgb_decode
-from simtest.dataset.reader import Record, read
-from simtest.geometry import Camera
+from simtest.dataset.metadata import EstimateMeta
+from simtest.dataset.reader import read_samples
+from simtest.dataset.sample import Sample
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
+from simtest.runtime.arrays import AnyArray, Array, Image, IntArray
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.sensor import Sensor
 
-Array = npt.NDArray[Any]
-
 SIDE = 32
-"""Of a crop, px."""
+"""Side of a crop, px."""
 
 EXTRAS = ("log of the crop's angle", "light, first", "light, second", "light, towards", "sightline x", "sightline y")
-"""The light's place in mm, in the tangent basis of the direction to the camera and along that direction."""
+"""Light position in mm: in the tangent basis of the direction to the camera, and along that direction."""
 
 
 @dataclass(frozen=True)
 class Crops:
-    """Crops and what is known of them, N in all.
+    """N crops with their inputs and targets.
 
     Parameters
     ----------
@@ -51,87 +49,93 @@ class Crops:
     index : ndarray of int64, shape (N,)
         Sample.
     classical : dict
-        By estimator: error_deg and axis_ratio, shape (N,) each; NaN where it gave none.
+        By estimator: error_deg and axis_ratio, shape (N,) each; NaN if it failed.
     """
 
-    images: Array
-    extras: Array
+    images: Image
+    extras: Image
     towards: Array
-    rotation: Array
+    rotation: Image
     normal: Array
-    axis_ratio: Array
-    index: Array
+    axis_ratio: Image
+    index: IntArray
     classical: dict[str, tuple[Array, Array]]
 
     def __len__(self) -> int:
         return len(self.images)
 
 
+@dataclass(frozen=True)
+class _Crop:
+    """One of `Crops`."""
+
+    image: AnyArray
+    extras: AnyArray
+    towards: Array
+    rotation: Array
+    normal: Array
+    axis_ratio: float
+    index: int
+    classical: dict[str, tuple[float, float]]
+
+
 def read_crops(folder: str | Path, split: str) -> Crops:
-    """Read the matched highlights of a split.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The dataset's.
-    split : str
-        train, validation or test.
-
-    Returns
-    -------
-    Crops
-
-    Raises
-    ------
-    InputError
-        As `simtest.dataset.read`.
-    """
-    rows = [row for record in read(folder, split, ["image"]) for row in _rows(record)]
-    names = sorted({name for row in rows for name in row["classical"]})
+    """Read the matched highlights of a split: train, validation or test; raise errors as `simtest.dataset.read`."""
+    crops = [crop for sample in read_samples(folder, split, ["image"]) for crop in _crops(sample)]
     nothing = (float("nan"), float("nan"))
     classical = {}
-    for name in names:
-        pairs = np.array([row["classical"].get(name, nothing) for row in rows], dtype=float)
+    for name in sorted({name for crop in crops for name in crop.classical}):
+        pairs = np.array([crop.classical.get(name, nothing) for crop in crops], dtype=float)
         classical[name] = (pairs[:, 0], pairs[:, 1])
-
-    def stacked(key: str, dtype: Any) -> Array:
-        return np.array([row[key] for row in rows], dtype=dtype)
-
+    # Shapes are stated, since a split may hold no highlight at all.
     return Crops(
-        stacked("image", np.float32).reshape(-1, SIDE, SIDE),
-        stacked("extras", np.float32).reshape(-1, len(EXTRAS)),
-        stacked("towards", float).reshape(-1, 3),
-        stacked("rotation", np.float32).reshape(-1, 2),
-        stacked("normal", float).reshape(-1, 3),
-        stacked("axis_ratio", np.float32),
-        stacked("index", np.int64),
+        np.array([crop.image for crop in crops], dtype=np.float32).reshape(-1, SIDE, SIDE),
+        np.array([crop.extras for crop in crops], dtype=np.float32).reshape(-1, len(EXTRAS)),
+        np.array([crop.towards for crop in crops], dtype=float).reshape(-1, 3),
+        np.array([crop.rotation for crop in crops], dtype=np.float32).reshape(-1, 2),
+        np.array([crop.normal for crop in crops], dtype=float).reshape(-1, 3),
+        np.array([crop.axis_ratio for crop in crops], dtype=np.float32),
+        np.array([crop.index for crop in crops], dtype=np.int64),
         classical,
     )
 
 
-def _rows(record: Record) -> Iterator[dict[str, Any]]:
-    meta = record["meta"]
+def _crops(sample: Sample) -> Iterator[_Crop]:
+    """Yield the crops of a sample: one for each detection that matches a true highlight."""
+    meta = sample.meta
     camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
     sensor = Sensor.model_validate(meta["scene"]["sensor"])
-    # As simtest.dataset.sample writes it: what the sensor itself encoded, or else sRGB.
+    # As simtest.dataset.maker writes it: what the sensor itself encoded, or else sRGB.
     decode = sensor.response.model().decode if sensor.encodes else srgb_decode
-    linear = decode(record["image"].astype(np.float32) / 255).mean(axis=2, dtype=np.float32)
-    by_detection: dict[int, dict[str, Any]] = {}
+    linear = decode(sample.images["image"].astype(np.float32) / 255).mean(axis=2, dtype=np.float32)
+    by_detection: dict[int, list[EstimateMeta]] = {}
     for row in meta["estimates"]:
         if "specularity" in row and "true_id" in row:
-            by_detection.setdefault(row["specularity"], {})[row["estimator"]] = row
-    for number, estimates in by_detection.items():
+            by_detection.setdefault(int(row["specularity"]), []).append(row)
+    for number, rows in by_detection.items():
         detection = meta["detections"][number]
-        if detection["peak_px"] is None:
+        peak = detection["peak_px"]
+        if peak is None:
             continue
-        truth = meta["highlights"][next(iter(estimates.values()))["true_id"]]
-        yield {"index": meta["index"], **_crop(linear, camera, detection, meta), **_target(camera, detection, truth),
-               "classical": {name: _errors(row) for name, row in estimates.items()}}  # fmt: skip
+        truth = meta["highlights"][int(rows[0]["true_id"])]
+        ray, normal = camera.unproject(peak), np.array(truth["normal"])
+        crop, step = _resample(linear, detection["box_px"], peak)
+        # inputs: the crop, its angle, the light and the sightline
+        first, second = (basis[0] for basis in tangent_basis(-ray[None]))
+        light = np.array(meta["lights_mm"][0])
+        angle = SIDE * step / camera.fx
+        extras = [np.log(angle), first @ light, second @ light, -ray @ light, ray[0], ray[1]]
+        # targets: rotation from the direction to the camera to the normal, and axis ratio
+        gains = sorted((abs(1 + truth["kd_min"]), abs(1 + truth["kd_max"])))
+        yield _Crop(
+            crop, np.array(extras), -ray, tangent_coordinates(-ray, normal), normal, gains[0] / gains[1],
+            meta["index"], {str(row["estimator"]): _errors(row) for row in rows},
+        )  # fmt: skip
 
 
-def _crop(linear: Array, camera: Camera, detection: dict[str, Any], meta: dict[str, Any]) -> dict[str, Any]:
-    x, y = detection["peak_px"]
-    _, _, width, height = detection["box_px"]
+def _resample(linear: AnyArray, box: list[int], peak: list[float]) -> tuple[AnyArray, float]:
+    """Return a crop around a peak over its largest value, and its step, px."""
+    (x, y), (_, _, width, height) = peak, box
     step = max(width, height) / SIDE
     corner = -(SIDE - 1) / 2 * step
     # warpAffine has the centre of pixel (0, 0) at the origin.
@@ -140,24 +144,8 @@ def _crop(linear: Array, camera: Camera, detection: dict[str, Any], meta: dict[s
         linear, image_from_crop, (SIDE, SIDE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    ray = camera.unproject(detection["peak_px"])
-    angle = SIDE * step / camera.fx
-    first, second = (basis[0] for basis in tangent_basis(-ray[None]))
-    light = np.array(meta["lights_mm"][0])
-    beside = [first @ light, second @ light, -ray @ light]
-    return {"image": crop / max(float(crop.max()), 1e-6), "extras": [np.log(angle), *beside, ray[0], ray[1]]}
+    return crop / max(float(crop.max()), 1e-6), step
 
 
-def _target(camera: Camera, detection: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
-    towards, normal = -camera.unproject(detection["peak_px"]), np.array(truth["normal"])
-    gains = sorted(abs(1 + truth[key]) for key in ("kd_min", "kd_max"))
-    return {
-        "towards": towards,
-        "normal": normal,
-        "rotation": tangent_coordinates(towards, normal),
-        "axis_ratio": gains[0] / gains[1],
-    }
-
-
-def _errors(row: dict[str, Any]) -> tuple[float, float]:
+def _errors(row: EstimateMeta) -> tuple[float, float]:
     return float(row.get("error_deg", "nan")), float(row.get("axis_ratio", "nan"))

@@ -11,8 +11,11 @@ from torch.utils.data import IterableDataset, get_worker_info
 from simtest.dataset.reader import Record, read, shard_names
 from simtest.errors import InputError
 
+Item = dict[str, Any]
+"""A sample as tensors by field name, and ``meta``: the form that PyTorch's loaders pass on."""
 
-class Samples(IterableDataset[dict[str, Any]]):
+
+class Samples(IterableDataset[Item]):
     """Samples of one split, shard after shard; each worker of a `DataLoader` reads shards of its own.
 
     Parameters
@@ -24,17 +27,17 @@ class Samples(IterableDataset[dict[str, Any]]):
     fields : sequence of str
         Images to decode (see `simtest.dataset.FIELDS`).
     shuffle : int
-        Samples that wait, of which one is drawn at random each time, and the shards in random order; 0 reads in order.
+        Size of the buffer from which samples are drawn at random, with the shards in random order; 0 reads in order.
     seed : int
         Of the shuffling.
     rank, world : int
-        This process's number among those that train together, and how many they are: shards are shared out.
+        Number of this process among those that train together, and how many there are: they divide the shards.
 
     Notes
     -----
     Each item is a dict: images as tensors, channels first, in the units of the card (8-bit pictures as float32 in
-    [0, 1], NaN where there is no surface), and ``meta``, the sample's metadata. Since metadata differs from sample to
-    sample, pass ``collate_fn=Samples.collate``.
+    [0, 1], NaN where there is no surface), and ``meta``, the sample's metadata. Pass ``collate_fn=Samples.collate``,
+    since metadata cannot be stacked.
 
     Raises
     ------
@@ -59,21 +62,23 @@ class Samples(IterableDataset[dict[str, Any]]):
             raise InputError(f"rank = {rank}: must be 0 to {world - 1}")
         self._folder, self._fields = Path(folder), tuple(fields)
         self._shards = shard_names(self._folder, split)
+        # Raises for unknown fields; no shard is opened.
         read(self._folder, fields=self._fields, shards=())
         self._shuffle, self._seed, self._rank, self._world = shuffle, seed, rank, world
         self._epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Shuffle otherwise from now on."""
+        """Shuffle in another order from now on."""
         self._epoch = epoch
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
+    def __iter__(self) -> Iterator[Item]:
         worker = get_worker_info()
         number, count = (0, 1) if worker is None else (worker.id, worker.num_workers)
         names = list(self._shards)
         rng = np.random.default_rng((self._seed, self._epoch))
         if self._shuffle:
             names = [names[i] for i in rng.permutation(len(names))]
+        # Ranks and their workers take turns over the shards.
         mine = names[self._rank * count + number :: self._world * count]
         records = read(self._folder, fields=self._fields, shards=mine)
         if self._shuffle:
@@ -81,7 +86,7 @@ class Samples(IterableDataset[dict[str, Any]]):
         yield from map(_tensors, records)
 
     @staticmethod
-    def collate(items: list[dict[str, Any]]) -> dict[str, Any]:
+    def collate(items: list[Item]) -> Item:
         """Stack the images of samples of one size; metadata stays a list."""
         names = [name for name in items[0] if name != "meta"]
         return {**{name: torch.stack([item[name] for item in items]) for name in names},
@@ -89,6 +94,7 @@ class Samples(IterableDataset[dict[str, Any]]):
 
 
 def _shuffled(records: Iterator[Record], size: int, rng: np.random.Generator) -> Iterator[Record]:
+    """Draw records at random from a buffer of the next `size`."""
     waiting: list[Record] = []
     for record in records:
         waiting.append(record)
@@ -98,8 +104,8 @@ def _shuffled(records: Iterator[Record], size: int, rng: np.random.Generator) ->
         yield waiting[i]
 
 
-def _tensors(record: Record) -> dict[str, Any]:
-    made: dict[str, Any] = {"meta": record["meta"]}
+def _tensors(record: Record) -> Item:
+    made: Item = {"meta": record["meta"]}
     for name, array in record.items():
         if name == "meta":
             continue

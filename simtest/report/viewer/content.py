@@ -11,9 +11,9 @@ from simtest.calibration import Calibration
 from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.runtime.arrays import Array, IntArray
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene
-from simtest.surfaces.model import Array, IntArray
 
 GRID = 240
 """Samples of the visible surface along the longer side of the frame."""

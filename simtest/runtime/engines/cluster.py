@@ -1,4 +1,4 @@
-"""A Ray cluster (extra ``ray``): each task runs on some node, and again on another where a node or process dies."""
+"""Ray cluster (extra ``ray``): a task runs on some node, and is repeated on another if that node or process dies."""
 
 import os
 import socket
@@ -6,34 +6,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.engines.engine import MAX_DEATHS, Task, Tell
+from simtest.runtime.engines.engine import MAX_DEATHS, OnStep, Task
 
 POLL_S = 1.0
-"""How long one wait lasts; between two of them Ctrl-C is answered."""
+"""Length of one wait; Ctrl-C is answered between two of them."""
 
 ANSWER_S = 5.0
 """How long a cluster's head may take to answer."""
 
 
 class RayEngine:
-    """Runs tasks on a Ray cluster whose nodes share the files' folder.
+    """Runs tasks on a Ray cluster whose nodes share the folder of the files.
 
-    Parameters
-    ----------
-    workers : int
-        How many tasks run at once.
-    address : str, optional
-        Of the cluster's head, such as ``10.0.0.1:6379``; default: a cluster of this machine is started, and ended
-        with the run.
-    gpu : bool
-        Whether each task needs a GPU.
-    renew_after : int, optional
-        Tasks after which a process is replaced; default never.
-
-    Raises
-    ------
-    InputError
-        If Ray is not installed.
+    The parameters are those of `make_engine`. Without an address a cluster of this machine is started, and ended with
+    the run. Raises `InputError` if Ray is not installed.
     """
 
     def __init__(
@@ -47,14 +33,14 @@ class RayEngine:
         self._workers, self._address, self._gpu = workers, address, gpu
         self._renew_after = renew_after
 
-    def run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
-        """See `Engine.run`; steps are told when their task is finished."""
+    def run(self, task: Task, arguments: Sequence[Any], on_step: OnStep) -> Iterator[tuple[int, Any]]:
+        """Run a task for each argument (see `Engine.run`); the steps of a task count when it is finished."""
         ray = self._ray
         own = not ray.is_initialized()
         if own:
             self._join()
         try:
-            yield from self._run(task, arguments, tell)
+            yield from self._run(task, arguments, on_step)
         finally:
             if own:
                 ray.shutdown()
@@ -78,24 +64,25 @@ class RayEngine:
             )
             raise InputError(f"{tried} ({said})") from error
 
-    def _run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
+    def _run(self, task: Task, arguments: Sequence[Any], on_step: OnStep) -> Iterator[tuple[int, Any]]:
         ray = self._ray
-        each = cores_each([node["Resources"] for node in ray.nodes() if node["Alive"]], self._workers)
+        cores = cores_per_task([node["Resources"] for node in ray.nodes() if node["Alive"]], self._workers)
         remote = ray.remote(
-            num_cpus=each, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=self._renew_after or 0
+            num_cpus=cores, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=self._renew_after or 0
         )(_work)
         waiting = list(enumerate(arguments))
         running: dict[Any, int] = {}
         while waiting or running:
+            # No more than `workers` tasks at once, however large the cluster.
             while waiting and len(running) < self._workers:
                 number, argument = waiting.pop(0)
-                running[remote.remote(task, argument, each)] = number
+                running[remote.remote(task, argument, cores)] = number
             done, _ = ray.wait(list(running), timeout=POLL_S)
             for reference in done:
                 number = running.pop(reference)
                 result, steps = self._get(reference)
                 for _ in range(steps):
-                    tell()
+                    on_step()
                 yield number, result
 
     def _get(self, reference: Any) -> Any:
@@ -111,27 +98,17 @@ class RayEngine:
             raise SimtestError(f"the cluster lost a task ({said}); what is finished is kept") from error
 
 
-def cores_each(nodes: Sequence[Mapping[str, float]], workers: int) -> int:
-    """Give a task's cores: its share of all, but no more than one node has, or it would wait forever.
+def cores_per_task(nodes: Sequence[Mapping[str, float]], workers: int) -> int:
+    """Return a task's cores, at least 1: its share of all, but no more than one node has, or it would wait forever.
 
-    Parameters
-    ----------
-    nodes : sequence of dict
-        The resources of each node that is alive; one that offers no cores names none.
-    workers : int
-        How many tasks run at once.
-
-    Returns
-    -------
-    int
-        At least 1.
+    `nodes` are the resources of each live node; one that offers no cores names none. `workers` tasks run at once.
     """
     cores = [node.get("CPU", 0.0) for node in nodes]
     return max(1, int(min(sum(cores) // workers, max(cores, default=0.0))))
 
 
 def _check_address(address: str) -> None:
-    """Raise `InputError` where nobody listens; Ray itself would try for minutes, then end the process."""
+    """Raise `InputError` if nobody listens; Ray itself would try for minutes, then end the process."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputError(f"--address {address}: must be HOST:PORT, that of the cluster's head")
@@ -142,6 +119,7 @@ def _check_address(address: str) -> None:
 
 
 def _work(task: Task, argument: Any, threads: int) -> tuple[Any, int]:
+    """Run a task; return its result and the number of its steps."""
     os.environ["SIMTEST_THREADS"] = str(threads)
     steps = 0
 

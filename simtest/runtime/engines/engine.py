@@ -1,28 +1,28 @@
-"""What an engine is, and the choice of one."""
+"""Engine protocol and the choice of an engine by name."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from simtest.errors import InputError
 
-Tell = Callable[[], None]
-"""Called by a task after each step; what it raises stops the task."""
+OnStep = Callable[[], None]
+"""Called by a task after each step; an exception from it stops the task."""
 
-Task = Callable[[Any, Tell], Any]
-"""A function at the top level of a module: its argument, and whom to tell of each step."""
+Task = Callable[[Any, OnStep], Any]
+"""A function at the top level of a module, of its argument and the callback for each step."""
 
 ENGINES = ("local", "ray")
 
 MAX_WORKERS = 256
 
 MAX_DEATHS = 8
-"""A task under which so many processes died is given up: the fault is the task's."""
+"""After this many processes died during the same task the run fails: the fault is the task's."""
 
 
 class Engine(Protocol):
     """Runs tasks."""
 
-    def run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
+    def run(self, task: Task, arguments: Sequence[Any], on_step: OnStep) -> Iterator[tuple[int, Any]]:
         """Run a task for each argument.
 
         Parameters
@@ -31,23 +31,23 @@ class Engine(Protocol):
             See `Task`.
         arguments : sequence
             One for each run.
-        tell : callable
-            Told, in this process, of the steps.
+        on_step : callable
+            Called in this process for each step.
 
         Yields
         ------
         tuple
-            Place of the argument, and result, as they are finished.
+            Index of the argument, and result, in the order in which tasks finish.
 
         Raises
         ------
         SimtestError
-            What a task raised; or if processes die again and again under the same task.
+            What a task raised, or if processes keep dying during the same task.
         """
 
 
 def check_workers(workers: int) -> None:
-    """Raise `InputError` where a number of workers is out of range."""
+    """Raise `InputError` if a number of workers is out of range."""
     if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
         raise InputError(f"workers = {workers!r}: must be 1 to {MAX_WORKERS}")
 
@@ -59,7 +59,7 @@ def make_engine(
     gpu: bool = False,
     renew_after: int | None = None,
 ) -> Engine:
-    """Give an engine by name.
+    """Return an engine by name.
 
     Parameters
     ----------
@@ -68,15 +68,11 @@ def make_engine(
     workers : int
         How many tasks run at once, 1 to 256.
     address : str, optional
-        Of the Ray cluster's head; default: one is started here.
+        Of the Ray cluster's head; default: a cluster is started here.
     gpu : bool
         Whether each of a cluster's tasks needs a GPU.
     renew_after : int, optional
-        Tasks after which a process is replaced, so that what libraries leak does not add up; default never.
-
-    Returns
-    -------
-    Engine
+        Tasks after which a process is replaced, so that leaks of libraries do not add up; default never.
 
     Raises
     ------
@@ -84,6 +80,7 @@ def make_engine(
         If there is no such engine, its packages are missing, or the number is out of range.
     """
     check_workers(workers)
+    # Each engine is imported on demand: Ray is an extra, and both load slowly.
     if name == "local":
         from simtest.runtime.engines.local import LocalEngine
 

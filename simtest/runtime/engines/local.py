@@ -1,4 +1,4 @@
-"""Processes of this machine: spawned, watched, replaced when they die, and renewed now and then."""
+"""Worker processes of this machine: spawned, watched, replaced when they die, and renewed regularly."""
 
 import multiprocessing
 import os
@@ -11,37 +11,31 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from simtest.errors import SimtestError
-from simtest.runtime.engines.engine import MAX_DEATHS, Task, Tell
+from simtest.runtime.engines.engine import MAX_DEATHS, OnStep, Task
 
 
 @dataclass
 class _Worker:
+    """A process, our end of its pipe, the index of its task, and how many tasks it has finished."""
+
     process: Any
     pipe: Connection
-    doing: int | None = None
-    done: int = 0
+    task: int | None = None
+    finished: int = 0
 
 
 class LocalEngine:
-    """Runs tasks in this process where one is asked for, else in spawned ones.
-
-    Parameters
-    ----------
-    workers : int
-        Number of processes.
-    renew_after : int, optional
-        Tasks after which a process is replaced, so that what libraries leak does not add up; default never.
-    """
+    """Runs tasks in this process if one worker is asked for, else in spawned ones; parameters as in `make_engine`."""
 
     def __init__(self, workers: int, renew_after: int | None = None) -> None:
         self._workers, self._renew_after = workers, renew_after
 
-    def run(self, task: Task, arguments: Sequence[Any], tell: Tell) -> Iterator[tuple[int, Any]]:
-        """See `Engine.run`."""
+    def run(self, task: Task, arguments: Sequence[Any], on_step: OnStep) -> Iterator[tuple[int, Any]]:
+        """Run a task for each argument (see `Engine.run`)."""
         if self._workers == 1:
-            yield from ((i, task(argument, tell)) for i, argument in enumerate(arguments))
+            yield from ((i, task(argument, on_step)) for i, argument in enumerate(arguments))
             return
-        yield from _Pool(min(self._workers, len(arguments)), task, arguments, self._renew_after).run(tell)
+        yield from _Pool(min(self._workers, len(arguments)), task, arguments, self._renew_after).run(on_step)
 
 
 class _Pool:
@@ -55,29 +49,30 @@ class _Pool:
         self._left = len(arguments)
         self._workers: list[_Worker] = []
 
-    def run(self, tell: Tell) -> Iterator[tuple[int, Any]]:
+    def run(self, on_step: OnStep) -> Iterator[tuple[int, Any]]:
         try:
             while self._left:
-                self._staff()
+                self._assign_tasks()
                 pipes = {worker.pipe: worker for worker in self._workers}
                 for pipe in wait(list(pipes), timeout=1.0):
                     assert isinstance(pipe, Connection)
-                    yield from self._hear(pipes[pipe], tell)
-                # Ctrl-C is answered between two messages too.
+                    yield from self._receive(pipes[pipe], on_step)
+                # Without workers no message arrives, and Ctrl-C is answered in the callback.
                 if not pipes:
-                    tell()
+                    on_step()
         finally:
-            self._dismiss()
+            self._kill_workers()
 
-    def _staff(self) -> None:
-        """Give every free process a task; start as many as there is work for."""
+    def _assign_tasks(self) -> None:
+        """Send every idle process a task, and start processes as long as tasks wait."""
         for worker in self._workers:
-            if worker.doing is None and self._waiting:
-                self._hand(worker)
+            if worker.task is None and self._waiting:
+                self._send_task(worker)
         while self._waiting and len(self._workers) < self._count:
-            self._hand(self._hire())
+            self._send_task(self._start_worker())
 
-    def _hire(self) -> _Worker:
+    def _start_worker(self) -> _Worker:
+        # Spawned, not forked: polars hangs in a forked process.
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
         threads = max(1, (os.cpu_count() or 1) // self._count)
@@ -88,36 +83,36 @@ class _Pool:
         self._workers.append(worker)
         return worker
 
-    def _hand(self, worker: _Worker) -> None:
-        worker.doing = self._waiting.popleft()
+    def _send_task(self, worker: _Worker) -> None:
+        worker.task = self._waiting.popleft()
         try:
-            worker.pipe.send(self._arguments[worker.doing])
+            worker.pipe.send(self._arguments[worker.task])
         except OSError:
-            self._bury(worker)
+            self._reap_worker(worker)
 
-    def _hear(self, worker: _Worker, tell: Tell) -> Iterator[tuple[int, Any]]:
+    def _receive(self, worker: _Worker, on_step: OnStep) -> Iterator[tuple[int, Any]]:
         try:
             kind, content = worker.pipe.recv()
         except (EOFError, OSError):
-            self._bury(worker)
+            self._reap_worker(worker)
             return
         if kind == "step":
-            tell()
+            on_step()
         elif kind == "error":
             raise content
         else:
-            number = worker.doing
+            number = worker.task
             assert number is not None
-            worker.doing, worker.done = None, worker.done + 1
+            worker.task, worker.finished = None, worker.finished + 1
             self._left -= 1
-            if self._renew_after is not None and worker.done >= self._renew_after:
-                self._release(worker)
+            if self._renew_after is not None and worker.finished >= self._renew_after:
+                self._join_worker(worker)
             yield number, content
 
-    def _bury(self, worker: _Worker) -> None:
-        """Take a dead process's task back."""
-        self._release(worker)
-        number = worker.doing
+    def _reap_worker(self, worker: _Worker) -> None:
+        """Remove a dead process and put its task back into the queue."""
+        self._join_worker(worker)
+        number = worker.task
         if number is None:
             return
         self._deaths[number] += 1
@@ -128,7 +123,8 @@ class _Pool:
             )
         self._waiting.appendleft(number)
 
-    def _release(self, worker: _Worker) -> None:
+    def _join_worker(self, worker: _Worker) -> None:
+        # A worker ends by itself once its pipe is closed.
         worker.pipe.close()
         worker.process.join(timeout=10)
         if worker.process.is_alive():
@@ -136,7 +132,7 @@ class _Pool:
             worker.process.join()
         self._workers.remove(worker)
 
-    def _dismiss(self) -> None:
+    def _kill_workers(self) -> None:
         for worker in self._workers:
             worker.process.kill()
         for worker in self._workers:
@@ -146,8 +142,8 @@ class _Pool:
 
 
 def _work(pipe: Connection, task: Task, threads: int) -> None:
-    """Do tasks until the pipe closes."""
-    # Ctrl-C reaches all processes of a terminal; it is the parent's to answer.
+    """Run tasks until the pipe closes."""
+    # Ctrl-C reaches all processes of a terminal; the parent answers it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     # Read by NumPy and the renderer when they load.
@@ -160,7 +156,7 @@ def _work(pipe: Connection, task: Task, threads: int) -> None:
         while True:
             pipe.send(_answer(pipe, task, pipe.recv()))
     except (EOFError, OSError):
-        # The pipe closed; what goes wrong in a task, which may be an OSError too, is an answer.
+        # The pipe closed. Errors of a task, OSError included, are answers and do not arrive here.
         return
 
 

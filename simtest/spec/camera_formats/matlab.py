@@ -1,6 +1,6 @@
 """Camera files of MATLAB: structs of cameraParameters, saved in a .mat file of version 7 or older.
 
-MATLAB counts the centre of the first pixel as (1, 1), simtest as (0.5, 0.5): the principal point loses half a pixel.
+For MATLAB the centre of the first pixel is (1, 1), for simtest (0.5, 0.5): the principal point loses half a pixel.
 """
 
 import warnings
@@ -23,20 +23,13 @@ HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 def read_matlab(path: Path) -> dict[str, Any]:
     """Read a calibration of MATLAB as the table of a `CameraSpec`.
 
-    Parameters
-    ----------
-    path : Path
-        A .mat file that holds one struct with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
-        RadialDistortion and TangentialDistortion; the struct's own name is free.
-
-    Returns
-    -------
-    dict
+    The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
+    RadialDistortion and TangentialDistortion.
 
     Raises
     ------
     InputError
-        If the file is missing, malformed, of version 7.3, or holds a cameraParameters object in place of a struct.
+        If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
     where, fields = shown(path), _struct(path)
     if "MappingCoefficients" in fields:
@@ -60,7 +53,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
 
 def _struct(path: Path) -> Mapping[str, Any]:
-    """Give the fields of the one struct in the file that is a calibration."""
+    """Return the fields of the one struct in the file that is a calibration."""
     where = shown(path)
     try:
         if not path.is_file():
@@ -68,7 +61,7 @@ def _struct(path: Path) -> Mapping[str, Any]:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{where}: {path.stat().st_size} bytes; at most {MAX_BYTES} are allowed")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of variables that are no calibration
+            warnings.simplefilter("ignore")  # about variables that are no calibration
             data = loadmat(str(path), simplify_cells=True)
     except InputError:
         raise
@@ -79,6 +72,7 @@ def _struct(path: Path) -> Mapping[str, Any]:
     except Exception as error:
         # SciPy raises whatever its parser runs into.
         raise InputError(f"{where}: no MATLAB file, or a damaged one ({type(error).__name__})") from error
+    # The variables themselves may be the fields of the struct.
     found = {name: value for name, value in {"": data, **data}.items() if _is_calibration(value)}
     if len(found) == 1:
         return next(iter(found.values()))
@@ -95,7 +89,7 @@ def _is_calibration(value: Any) -> bool:
 
 
 def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], where: str) -> Any:
-    """Give a field as numbers in row order."""
+    """Return a field as numbers in row order."""
     allowed = (counts,) if isinstance(counts, int) else counts
     if name not in fields:
         raise InputError(f"{where}: {name}: missing; {HOW}")

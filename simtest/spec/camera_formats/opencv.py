@@ -1,6 +1,6 @@
 """Camera files of OpenCV (FileStorage: YAML, XML, JSON) and ROS (camera_info), read and written.
 
-Both count the centre of the first pixel as (0, 0), simtest as (0.5, 0.5): the principal point gains half a pixel on
+For both the centre of the first pixel is (0, 0), for simtest (0.5, 0.5): the principal point gains half a pixel on
 import and loses it on export.
 """
 
@@ -20,7 +20,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
-from simtest.spec.toml_input import read_text
+from simtest.spec.toml_files import read_text
 
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "mtx", "K", "k")
 LENS_NAMES = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "dist", "D", "d")
@@ -36,20 +36,11 @@ MODELS = {
 
 BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
-"""Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor."""
+"""Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor, which simtest lacks."""
 
 
 def read_opencv(path: Path) -> dict[str, Any]:
-    """Read a calibration of OpenCV or ROS as the table of a `CameraSpec`.
-
-    Parameters
-    ----------
-    path : Path
-        .yml, .yaml, .xml or .json.
-
-    Returns
-    -------
-    dict
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`.
 
     Raises
     ------
@@ -58,6 +49,7 @@ def read_opencv(path: Path) -> dict[str, Any]:
     """
     data, where = _parse(path), shown(path)
     width, height = _size(data, where)
+    # K, upper triangular
     name, given = _one_of(data, MATRIX_NAMES, where)
     if name is None:
         raise InputError(f"{where}: camera_matrix: missing; allowed names: {', '.join(MATRIX_NAMES)}")
@@ -77,7 +69,7 @@ def read_opencv(path: Path) -> dict[str, Any]:
 
 
 def _parse(path: Path) -> Mapping[str, Any]:
-    """Read a file's keys into plain dicts, lists, numbers and text."""
+    """Read a file into plain dicts, lists, numbers and text."""
     text, where = read_text(path, "camera"), shown(path)
     kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower(), "YAML")
     try:
@@ -97,7 +89,7 @@ def _parse_json(text: str) -> Any:
 
 
 def _parse_xml(text: str) -> Any:
-    """Read OpenCV's XML; its own parser does not end on some malformed files."""
+    """Read OpenCV's XML; its own parser never returns from some malformed files."""
     return _plain_xml(ElementTree.fromstring(text))
 
 
@@ -123,7 +115,7 @@ def _one_of(data: Mapping[str, Any], names: Sequence[str], where: str) -> tuple[
 
 
 def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[float]:
-    """Give a matrix or list as numbers in row order; `counts` are the numbers of values that are allowed."""
+    """Return a matrix or list as numbers in row order; `counts` are the allowed numbers of values."""
     if isinstance(value, Mapping):
         value = value.get("data")
     flat: list[Any] = []
@@ -139,7 +131,7 @@ def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[f
 
 
 def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
-    """Give the image's width and height; their ranges are checked by the schema."""
+    """Return the image's width and height; the schema checks their ranges."""
     name, both = _one_of(data, SIZE_NAMES, where)
     if name is not None:
         width, height = _numbers(both, where, name, (2,))
@@ -154,7 +146,7 @@ def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
 
 
 def _check_whole(data: Mapping[str, Any], where: str) -> None:
-    """Refuse a camera_info of cropped or binned images, to which K does not belong as it stands."""
+    """Refuse a camera_info of cropped or binned images: K does not belong to them."""
     for key in ("binning_x", "binning_y"):
         if data.get(key, 0) not in (0, 1):
             raise InputError(f"{where}: {key} = {data[key]!r}: must be 0 or 1; calibrate at the size that is used")
@@ -165,7 +157,8 @@ def _check_whole(data: Mapping[str, Any], where: str) -> None:
             raise InputError(f"{where}: roi.{key} = {roi[key]!r}: must be 0; calibrate at the size that is used")
 
 
-def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
+def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
+    """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name, value = _one_of(data, LENS_NAMES, where)
     fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if name is None:
@@ -177,6 +170,7 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
     if fisheye:
         values = _numbers(value, where, name, (4,))
         return {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), values, strict=True))}
+    # Brown-Conrady: which counts are possible depends on the model, if one is named.
     counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
     values = _numbers(value, where, name, counts)
     for term, number in zip(UNKNOWN_TERMS, values[8:], strict=False):
@@ -191,7 +185,7 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, Any] | None:
 
 
 def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
-    """Refuse a file that speaks of a lens but whose coefficients stand under no name that is read."""
+    """Refuse a file that mentions a lens but has no coefficients under a known name."""
     told = [key for key in data if key.lower().startswith("dist") and (key != "distortion_model" or data[key])]
     if told:
         raise InputError(
@@ -216,23 +210,9 @@ def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:
 
 
 def opencv_text(camera: Camera, suffix: str) -> str:
-    """Give a camera as the text of an OpenCV FileStorage.
+    """Return a camera as the text of an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
 
-    Parameters
-    ----------
-    camera : Camera
-        What to write.
-    suffix : {".yml", ".yaml", ".xml", ".json"}
-        Chooses the format.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        If the camera has a skew, which OpenCV ignores.
+    Raises `InputError` if the camera has a skew, which OpenCV ignores.
     """
     matrix, coefficients = _shifted(camera, "OpenCV")
     kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}
@@ -251,7 +231,7 @@ def opencv_text(camera: Camera, suffix: str) -> str:
 
 
 def ros_text(camera: Camera) -> str:
-    """Give a camera as the text of a ROS camera_info file (YAML), as `opencv_text` does."""
+    """Return a camera as the text of a ROS camera_info file (YAML); see `opencv_text`."""
     matrix, coefficients = _shifted(camera, "ROS")
     model = "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
     model = "equidistant" if isinstance(camera.distortion, KannalaBrandt) else model
@@ -272,7 +252,7 @@ def ros_text(camera: Camera) -> str:
 
 
 def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
-    """Give K and the coefficients in the other convention."""
+    """Return K and the coefficients in the other convention; raise `InputError` for a skew."""
     if camera.skew != 0:
         raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {whose} ignores it; save as TOML instead")
     matrix = camera.K - np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]])
@@ -284,6 +264,6 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
 
 
 def _shifted_mask(camera: Camera) -> list[float] | None:
-    """Give the view mask's centre and radius in the other convention; neither OpenCV nor ROS has one, both skip it."""
+    """Return the view mask's centre and radius in the other convention; OpenCV and ROS skip a key that they lack."""
     mask = camera.view_mask
     return None if mask is None else [float(mask.cx) - PIXEL_CENTRE, float(mask.cy) - PIXEL_CENTRE, float(mask.radius)]

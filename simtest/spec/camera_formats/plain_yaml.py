@@ -1,195 +1,112 @@
-"""The plain part of YAML in which OpenCV and ROS write calibrations: maps, lists, numbers and text.
+"""YAML of camera files, by PyYAML's safe loader: with OpenCV's tags, without what a calibration never needs.
 
-OpenCV's own reader takes ROS files too, but does not end on some malformed files and crashes on others.
+OpenCV's own reader takes ROS files too, but never returns from some malformed files and crashes on others.
 """
 
 import re
-from collections import deque
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
+
+import yaml
 
 MAX_DEPTH = 32
+MAX_VALUES = 100_000
+"""Maps, lists and scalars of a file; PyYAML takes about 20 microseconds for each."""
 
-_KEY = re.compile(r"""^("[^"]*"|'[^']*'|[^\s\[\]{},#&*!|>'"%@`:-][^:\s]*(?:\s+[^:\s]+)*)\s*:(?:\s+(.*))?$""")
-_TOKEN = re.compile(r"""\s*([\[\]{},]|"[^"]*"|'[^']*'|:(?=\s)|(?:[^\[\]{},:\s"']|:(?!\s)|\s+(?![\[\]{},:\s]))+)\s*""")
-_COMMENT = re.compile(r"""^((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#|["'])*?)(?:(?:^|(?<=\s))#.*)?$""")
-_WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
-_FLOATS = {".nan": float("nan"), ".inf": float("inf"), "-.inf": float("-inf"), "+.inf": float("inf")}
+_YAML = "tag:yaml.org,2002:"
+_CONSTANTS = {"true": True, "false": False, "null": None, "~": None, "": None}
+_NUMBER = re.compile(r"[-+]?((\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|\.?inf|\.?nan)", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class _Line:
-    number: int
-    indent: int
-    text: str
+class _CameraLoader(yaml.SafeLoader):
+    """Builds maps, lists, numbers and text; refuses aliases, merge keys, other tags, and files that are too large."""
+
+    yaml_constructors: ClassVar = {}
+    yaml_multi_constructors: ClassVar = {}
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = self._values = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()
+        if anchor := getattr(event, "anchor", None):
+            sign = "*" if isinstance(event, yaml.AliasEvent) else "&"
+            raise _refusal(event, f"{sign}{anchor[:20]}: anchors and aliases are not allowed")
+        self._values += 1
+        if self._values > MAX_VALUES:
+            raise _refusal(event, f"too many values; at most {MAX_VALUES} are allowed")
+        if self._depth >= MAX_DEPTH:
+            raise _refusal(event, f"nested too deeply; at most {MAX_DEPTH} levels are allowed")
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
 
 def parse_yaml(text: str) -> Any:
-    """Read the first document of a YAML file.
+    """Read the first document of a YAML file: maps, lists, numbers and text; None if it is empty.
 
-    Parameters
-    ----------
-    text : str
-        Block maps and lists by indentation, flow lists and maps over several lines, tags (ignored), comments. Anchors
-        and text in blocks are refused.
-
-    Returns
-    -------
-    dict, list, int, float, str, bool or None
-        None for an empty document.
+    Tags of OpenCV are allowed and ignored. Keys are text, whatever they look like.
 
     Raises
     ------
     ValueError
-        If the text is no such YAML; the message begins with the line's number.
+        If the text is no such YAML; the message is one line and begins with the line's number.
     """
-    lines = _lines(text)
-    if not lines:
-        return None
-    value, rest = _block(lines, 0)
-    if rest:
-        raise ValueError(f"line {rest[0].number}: incorrect indentation")
-    return value
-
-
-def _lines(text: str) -> list[_Line]:
-    """Split the first document into lines; those inside brackets are joined."""
-    found: list[_Line] = []
-    depth = 0
-    for number, raw in enumerate(text.split("\n"), 1):
-        bare = raw.rstrip()
-        if re.match(r"(---|\.\.\.)(\s|$)", bare):
-            if found:
-                break
-            continue
-        if bare.startswith("%") and not found:
-            continue
-        matched = _COMMENT.match(bare)
-        kept = (matched[1] if matched else bare).rstrip()
-        if not kept.strip():
-            continue
-        if "\t" in kept[: len(kept) - len(kept.lstrip())]:
-            raise ValueError(f"line {number}: a tab in the indentation")
-        if depth > 0:
-            found[-1] = _Line(found[-1].number, found[-1].indent, f"{found[-1].text} {kept.strip()}")
-        else:
-            found.append(_Line(number, len(kept) - len(kept.lstrip(" ")), kept.strip()))
-        depth += sum((mark in "[{") - (mark in "]}") for mark in re.sub(r"\"[^\"]*\"|'[^']*'", "", kept))
-    if depth > 0:
-        raise ValueError(f"line {found[-1].number}: a bracket is not closed")
-    return found
-
-
-def _block(lines: list[_Line], depth: int) -> tuple[Any, list[_Line]]:
-    """Read the value that begins at the first line's indentation; gives it and the lines after it."""
-    if depth > MAX_DEPTH:
-        raise ValueError(f"line {lines[0].number}: nested too deeply")
-    first = lines[0]
-    if re.match(r"-(\s|$)", first.text):
-        return _list(lines, depth)
-    if not _KEY.match(first.text):
-        return _flow(first.text, first.number), lines[1:]
-    made: dict[str, Any] = {}
-    while lines and lines[0].indent == first.indent:
-        line = lines[0]
-        matched = _KEY.match(line.text)
-        if matched is None:
-            raise ValueError(f"line {line.number}: must be key: value")
-        key, inline = matched[1].strip("\"'"), re.sub(r"^!\S*\s*", "", matched[2] or "")
-        if key in made:
-            raise ValueError(f"line {line.number}: {key} is given twice")
-        below = lines[1:]
-        deeper = below and (
-            below[0].indent > line.indent
-            or (below[0].indent == line.indent and re.match(r"-(\s|$)", below[0].text))  # a list may stand level
-        )
-        if inline or not deeper:
-            made[key], lines = _flow(inline, line.number), below
-        else:
-            made[key], lines = _block(below, depth + 1)
-    return made, lines
-
-
-def _list(lines: list[_Line], depth: int) -> tuple[list[Any], list[_Line]]:
-    made: list[Any] = []
-    indent = lines[0].indent
-    while lines and lines[0].indent == indent and re.match(r"-(\s|$)", lines[0].text):
-        line = lines[0]
-        item = line.text[1:].lstrip()
-        if item:
-            # What follows the dash begins a value of its own, further in.
-            start = _Line(line.number, indent + len(line.text) - len(item), item)
-            value, lines = _block([start, *lines[1:]], depth + 1)
-        elif len(lines) > 1 and lines[1].indent > indent:
-            value, lines = _block(lines[1:], depth + 1)
-        else:
-            value, lines = None, lines[1:]
-        made.append(value)
-    return made, lines
-
-
-def _flow(text: str, number: int) -> Any:
-    """Read a value on one line: a scalar, or a list or map in brackets."""
-    if not text.startswith(("[", "{")):
-        return _scalar(text, number)
-    tokens: deque[str] = deque()
-    place = 0
-    while place < len(text):
-        matched = _TOKEN.match(text, place)
-        if matched is None:
-            raise ValueError(f"line {number}: cannot be read from {text[place : place + 10]!r}")
-        tokens.append(matched[1])
-        place = matched.end()
-    value = _bracket(tokens, number, 0)
-    if tokens:
-        raise ValueError(f"line {number}: {tokens[0]!r} after the closing bracket")
-    return value
-
-
-def _bracket(tokens: deque[str], number: int, depth: int) -> Any:
-    """Read a value from the front of the tokens, and take them away."""
-    if depth > MAX_DEPTH:
-        raise ValueError(f"line {number}: nested too deeply")
-    opening = _next(tokens, number)
-    if opening not in ("[", "{"):
-        return _scalar(opening, number)
-    closing = "]" if opening == "[" else "}"
-    items: list[Any] = []
-    keyed: dict[str, Any] = {}
-    while tokens and tokens[0] != closing:
-        item = _bracket(tokens, number, depth + 1)
-        if opening == "{":
-            if _next(tokens, number) != ":":
-                raise ValueError(f"line {number}: missing : after {item!r}")
-            keyed[str(item)] = _bracket(tokens, number, depth + 1)
-        else:
-            items.append(item)
-        if tokens and tokens[0] == ",":
-            tokens.popleft()
-        elif tokens and tokens[0] != closing:
-            raise ValueError(f"line {number}: missing , before {tokens[0]!r}")
-    if _next(tokens, number) != closing:
-        raise ValueError(f"line {number}: missing {closing}")
-    return items if opening == "[" else keyed
-
-
-def _next(tokens: deque[str], number: int) -> str:
-    if not tokens:
-        raise ValueError(f"line {number}: a bracket is not closed")
-    return tokens.popleft()
-
-
-def _scalar(text: str, number: int) -> Any:
-    if len(text) > 1 and text[0] in "\"'" and text[-1] == text[0]:
-        return text[1:-1]
-    if text[:1] in tuple("&*|>,]}"):
-        raise ValueError(f"line {number}: {text[:20]!r} is not supported")
-    lowered = text.lower()
-    if lowered in _WORDS:
-        return _WORDS[lowered]
-    if lowered in _FLOATS:
-        return _FLOATS[lowered]
     try:
-        return int(text) if re.fullmatch(r"[-+]?\d{1,18}", text) else float(text)
-    except ValueError:
-        return text
+        # OpenCV's header, %YAML:1.0, is no valid directive.
+        loader = _CameraLoader(re.sub(r"\A\ufeff?%", "#", text))
+        return loader.get_data() if loader.check_data() else None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        raise ValueError(f"line {line}: {error.problem or error.context}") from None
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise ValueError(f"line {line}: {error.reason}") from None
+
+
+def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+
+
+def _content(loader: _CameraLoader, node: yaml.Node) -> Any:
+    """Return a node's content, whatever its tag."""
+    if isinstance(node, yaml.ScalarNode):
+        return node.value if node.style else _plain_scalar(node.value)
+    if isinstance(node, yaml.SequenceNode):
+        return [loader.construct_object(item, deep=True) for item in node.value]
+    made: dict[str, Any] = {}
+    for key, value in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            raise _refusal(key, "must be key: value, and the key a word")
+        if key.value == "<<":
+            raise _refusal(key, "merge keys (<<) are not allowed")
+        if key.value in made:
+            raise _refusal(key, f"{key.value[:40]} is given twice")
+        made[key.value] = loader.construct_object(value, deep=True)
+    return made
+
+
+def _plain_scalar(text: str) -> Any:
+    """Return a scalar without quotes as constant, number or text."""
+    lowered = text.lower()
+    if lowered in _CONSTANTS:
+        return _CONSTANTS[lowered]
+    if re.fullmatch(r"[-+]?\d{1,18}", text):
+        return int(text)
+    # YAML writes .inf and .nan, Python inf and nan.
+    return float(lowered.replace(".inf", "inf").replace(".nan", "nan")) if _NUMBER.fullmatch(text) else text
+
+
+def _refuse_tag(_: _CameraLoader, node: yaml.Node) -> Any:
+    tag = node.tag.replace(_YAML, "!!")
+    raise _refusal(node, f"tag {tag[:40]} is not allowed; only !!opencv-... is")
+
+
+# PyYAML's own resolvers would read 1e-5 as text, 010 as 8, 12:30 as 750 and 2024-01-01 as a date.
+_CameraLoader.yaml_implicit_resolvers = {}
+for kind in ("map", "seq", "str", "int", "float", "bool", "null"):
+    _CameraLoader.add_constructor(f"{_YAML}{kind}", _content)
+_CameraLoader.add_multi_constructor(f"{_YAML}opencv-", lambda loader, _, node: _content(loader, node))
+_CameraLoader.add_constructor(None, _refuse_tag)

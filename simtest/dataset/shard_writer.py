@@ -1,4 +1,4 @@
-"""Writes a dataset: shard by shard, never half of one under its final name, and goes on after any stop."""
+"""Writes a dataset shard by shard: never half of one under its final name, and continued after any interruption."""
 
 import os
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ from typing import IO
 
 from simtest.dataset.card import CARD, write_card
 from simtest.dataset.index import TABLES, write_tables
+from simtest.dataset.maker import DEFAULT_VARIANT, Maker
 from simtest.dataset.manifest import (
     NAME,
     FileEntry,
@@ -22,36 +23,24 @@ from simtest.dataset.manifest import (
     read_manifest,
 )
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.sample import DEFAULT_VARIANT, Maker, Sample
+from simtest.dataset.sample import Sample
 from simtest.dataset.shard import finish, locked, whole_samples, write_sample
 from simtest.errors import InputError
-from simtest.runtime.engines import Engine, Tell
-from simtest.runtime.files import make_folder
+from simtest.runtime.engines import Engine, OnStep
+from simtest.runtime.files import make_folder, sync_folder
 from simtest.runtime.resources import shown
-from simtest.spec.dataset import Dataset
+from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
 
 PART = ".part"
 
 SHARDS_PER_PROCESS = 8
-"""A process is renewed after so many, since rebuilding scenes in a loop grows memory."""
+"""After so many a process is replaced, since rebuilding scenes in a loop grows memory."""
 
 
 @dataclass(frozen=True)
 class ShardTask:
-    """What a worker needs to write a shard.
-
-    Parameters
-    ----------
-    folder : str
-        The dataset's.
-    dataset : str
-        The specification, as JSON.
-    number : int
-        Which of the plan's shards.
-    variant : str
-        Mitsuba variant.
-    """
+    """Argument of `write_shard`: folder, specification as JSON, index among the plan's shards, and Mitsuba variant."""
 
     folder: str
     dataset: str
@@ -62,32 +51,28 @@ class ShardTask:
 def write_dataset(
     dataset: Dataset, folder: Path, engine: Engine, variant: str | None = None, progress: Progress | None = None
 ) -> Manifest:
-    """Write a dataset, or go on with one that was stopped.
+    """Write a dataset, or continue one that was interrupted.
 
     Parameters
     ----------
     dataset : Dataset
-        What is wanted.
+        The recipe.
     folder : Path
-        Made if need be; must hold nothing, or the same dataset made by the same code.
+        Created if needed; must hold nothing, or the same dataset made by the same code.
     engine : Engine
-        Who does the work.
+        Runs the tasks.
     variant : str, optional
         Mitsuba variant, of colour.
     progress : callable, optional
-        Told of samples done, samples in all, and what is done.
-
-    Returns
-    -------
-    Manifest
+        Called with samples done, samples in all, and what is being done.
 
     Raises
     ------
     InputError
-        If the dataset cannot be made as it is described, or the folder holds something else or cannot be written.
+        If the dataset cannot be made as described, or the folder holds something else or cannot be written.
     """
     plan = Plan(dataset)
-    with _spoken(folder):
+    with _one_line_errors(folder):
         manifest = _open(folder, plan, variant or DEFAULT_VARIANT)
         _complete(plan, manifest, folder, engine, progress)
     return manifest
@@ -95,6 +80,7 @@ def write_dataset(
 
 def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, progress: Progress | None) -> None:
     """Write what a manifest lacks: shards, then tables and card."""
+    # what is left to do
     missing = [number for number, shard in enumerate(plan.shards) if shard.name not in manifest.shards]
     variant, text = str(manifest.origin["variant"]), plan.dataset.model_dump_json()
     tasks = [ShardTask(str(folder), text, number, variant) for number in missing]
@@ -107,13 +93,15 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         if progress:
             progress(min(done, total), total + 1, f"{manifest.dataset['name']}: samples")
 
+    # shards
     if tasks:
-        # Tables of a dataset that was whole before say too much now.
+        # The tables of a dataset that was complete before no longer fit.
         manifest.tables = {}
         manifest.save(folder)
-    for place, entry in engine.run(write_shard, tasks, step):
-        manifest.shards[plan.shards[missing[place]].name] = entry
+    for done_task, entry in engine.run(write_shard, tasks, step):
+        manifest.shards[plan.shards[missing[done_task]].name] = entry
         manifest.save(folder)
+    # tables and card, of all shards
     if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):
         if progress:
             progress(total, total + 1, "tables")
@@ -121,14 +109,15 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         write_card(plan, manifest, folder)
         manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}
         manifest.save(folder)
+    # parts of interrupted runs
     for left in folder.glob(f"*{PART}*"):
         left.unlink(missing_ok=True)
 
 
 def repair(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:
-    """Make named files of a dataset again: shards, tables or card."""
+    """Make named files of a dataset anew: shards, tables or card."""
     plan = manifest.plan()
-    with _spoken(folder):
+    with _one_line_errors(folder):
         for name in broken:
             (folder / name).unlink(missing_ok=True)
             manifest.shards.pop(name, None)
@@ -138,8 +127,8 @@ def repair(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, 
 
 
 @contextmanager
-def _spoken(folder: Path) -> Iterator[None]:
-    """Turn what the operating system says into one line."""
+def _one_line_errors(folder: Path) -> Iterator[None]:
+    """Turn errors of the operating system into an `InputError`."""
     try:
         yield
     except OSError as error:
@@ -150,6 +139,7 @@ def _spoken(folder: Path) -> Iterator[None]:
 
 
 def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
+    """Return the manifest of a folder that is empty, or holds the same dataset."""
     make_folder(folder)
     wanted = new_manifest(plan, variant)
     try:
@@ -180,54 +170,42 @@ def _maker(dataset: str, variant: str) -> Maker:
     return Maker(Plan(Dataset.model_validate_json(dataset)), variant)
 
 
-def write_shard(task: ShardTask, tell: Tell) -> FileEntry:
-    """Write a shard, or finish one that was begun.
-
-    Parameters
-    ----------
-    task : ShardTask
-        Which.
-    tell : callable
-        Told of each sample.
-
-    Returns
-    -------
-    FileEntry
-    """
+def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
+    """Write a shard, or finish one that was begun; call `on_step` after each sample."""
     folder, maker = Path(task.folder), _maker(task.dataset, task.variant)
-    with _spoken(folder):
-        return _write_shard(folder, maker, maker.plan.shards[task.number], tell)
+    with _one_line_errors(folder):
+        return _write_shard(folder, maker, maker.plan.shards[task.number], on_step)
 
 
-def _write_shard(folder: Path, maker: Maker, shard: Shard, tell: Tell) -> FileEntry:
+def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> FileEntry:
     path = folder / shard.name
     part = folder / (shard.name + PART)
     if path.exists() and _is_whole(path, shard):
         for _ in shard.indices:
-            tell()
+            on_step()
         return file_entry(path)
     with locked(part) as file:
-        count = _go_on(file, shard)
+        count = _keep_whole(file, shard)
         for _ in range(count):
-            tell()
-        append(file, maker, shard.indices[count:], tell)
+            on_step()
+        append(file, maker, shard.indices[count:], on_step)
         finish(file)
         file.flush()
         os.fsync(file.fileno())
         os.replace(part, path)
-    _sync(folder)
+    sync_folder(folder)
     return file_entry(path)
 
 
 def _is_whole(path: Path, shard: Shard) -> bool:
-    """Tell whether a shard that the manifest does not know yet is finished."""
+    """Return whether a shard that the manifest does not list yet is finished."""
     with path.open("rb") as file:
         found, whole = whole_samples(file)
     return whole and tuple(sample.meta.get("index") for sample in found) == shard.indices
 
 
-def _go_on(file: IO[bytes], shard: Shard) -> int:
-    """Cut a begun shard after its last whole sample; give the number of samples kept."""
+def _keep_whole(file: IO[bytes], shard: Shard) -> int:
+    """Cut a begun shard after its last whole sample; return the number of samples kept."""
     found, _ = whole_samples(file)
     end, count = 0, 0
     for sample, index in zip(found, shard.indices, strict=False):
@@ -239,30 +217,21 @@ def _go_on(file: IO[bytes], shard: Shard) -> int:
     return count
 
 
-def append(file: IO[bytes], maker: Maker, indices: tuple[int, ...], tell: Tell) -> None:
-    """Make samples; each is encoded and written while the next is rendered."""
+def append(file: IO[bytes], maker: Maker, indices: tuple[int, ...], on_step: OnStep) -> None:
+    """Make samples and append them; each is encoded and written while the next is rendered."""
     with ThreadPoolExecutor(1) as writer:
         before: Future[None] | None = None
         for index in indices:
             sample = maker.make(index)
             if before is not None:
                 before.result()
-                tell()
+                on_step()
             before = writer.submit(_write, file, sample)
         if before is not None:
             before.result()
-            tell()
+            on_step()
 
 
 def _write(file: IO[bytes], sample: Sample) -> None:
     write_sample(file, sample.key, sample.encode())
     file.flush()
-
-
-def _sync(folder: Path) -> None:
-    """Flush a folder's entries to disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

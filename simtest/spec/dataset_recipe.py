@@ -1,7 +1,6 @@
-"""The dataset: which anatomies, what is drawn for each of them and for each sample, how many, and what is kept."""
+"""Recipe of a dataset: which anatomies, what is drawn for each of them and for each sample, how many, what is kept."""
 
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.runtime.resources import find
-from simtest.spec.toml_input import Spec, apply_settings, place, read_toml, validate
+from simtest.spec.spec_model import Name, Share, Spec, load
 
 MAX_SAMPLES = 100_000_000
 
@@ -73,9 +72,9 @@ class Distribution(Spec):
 class Splits(Spec):
     """Shares of the samples; no anatomy is in two of them."""
 
-    train: float = Field(0.8, ge=0, le=1)
-    validation: float = Field(0.1, ge=0, le=1)
-    test: float = Field(0.1, ge=0, le=1)
+    train: Share = 0.8
+    validation: Share = 0.1
+    test: Share = 0.1
 
     @model_validator(mode="after")
     def _whole(self) -> "Splits":
@@ -130,7 +129,7 @@ class Family(Spec):
 class Dataset(Spec):
     """A labelled dataset."""
 
-    name: str = Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")
+    name: Name
     title: str = ""
     description: str = ""
     samples: int = Field(1000, ge=1, le=MAX_SAMPLES)
@@ -179,10 +178,6 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
         Values by key path. The dataset's own keys (samples, seed, ...) are replaced; all other paths are those of the
         scene and apply to every family, in place of a distribution.
 
-    Returns
-    -------
-    Dataset
-
     Raises
     ------
     InputError
@@ -191,9 +186,7 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
     path = find(name, "scenes", "datasets")
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key.split(".")[0] in _DATASET_KEYS}
-    data = apply_settings(read_toml(path), own, str(path))
-    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
-    dataset = validate(Dataset, data, place(path, own))
+    dataset = load(Dataset, path, own)
     if not settings:
         return dataset
 

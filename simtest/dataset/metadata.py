@@ -1,0 +1,74 @@
+"""Metadata of a sample: the last member of its files in a shard, a JSON object, key by key."""
+
+from typing import NotRequired, TypedDict
+
+from pydantic import JsonValue
+
+from simtest.spec.camera_spec import CameraDescription
+
+
+class AnatomyMeta(TypedDict):
+    """Anatomy that a sample shows (see `simtest.dataset.plan.Anatomy`)."""
+
+    family: int
+    number: int
+    seed: int | None
+    surface: str
+
+
+class HighlightMeta(TypedDict):
+    """A true highlight; camera frame, mm."""
+
+    light: int
+    bp_px: list[float]
+    position_mm: list[float]
+    normal: list[float]
+    distance_mm: float
+    kd_min: float
+    kd_max: float
+    isolated: bool
+    why_not: str | None
+    direction_min: list[float] | None
+    peak_snr: float | None
+
+
+class EllipseMeta(TypedDict):
+    """Ellipse fitted to a detection's isophote."""
+
+    isovalue: float
+    centre_px: list[float]
+    semi_axes_px: list[float]
+    angle_deg: float
+
+
+class DetectionMeta(TypedDict):
+    """A highlight found in the frame."""
+
+    box_px: list[int]
+    peak_px: list[float] | None
+    ellipse: EllipseMeta | None
+
+
+EstimateMeta = dict[str, str | int | float | bool]
+"""A row of an experiment's results by column; columns without a value are left out."""
+
+
+class SampleMeta(TypedDict):
+    """Everything about a sample that is no image; `sha256` holds the hashes of its images."""
+
+    key: str
+    index: int
+    dataset: str
+    split: str
+    anatomy: AnatomyMeta
+    drawn: dict[str, JsonValue]
+    camera: CameraDescription
+    lights_mm: list[list[float]]
+    full_scale: float
+    scene: dict[str, JsonValue]
+    attempt: int
+    highlights: list[HighlightMeta]
+    detections: list[DetectionMeta]
+    estimates: list[EstimateMeta]
+    depth_scale_mm: float
+    sha256: NotRequired[dict[str, str]]

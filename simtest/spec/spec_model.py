@@ -1,0 +1,176 @@
+"""Base of all specification models: strict validation, ranges they share, and errors of one line."""
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
+from simtest.spec.json_schema import nodes_at
+from simtest.spec.toml_files import apply_settings, read_toml, source_name
+
+Model = TypeVar("Model", bound=BaseModel)
+
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-]+$")]
+"""Of an experiment, dataset or profile: fit for a file name."""
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Millimetres = Annotated[float, Field(ge=1e-3, le=1e6)]
+Curvature = Annotated[float, Field(ge=-10, le=10)]
+
+
+class Spec(BaseModel):
+    """Base of all specification models: frozen, no unknown keys, no NaN or infinity, no text where a number belongs."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_coerced(cls, data: Any) -> Any:
+        """Refuse what pydantic would turn into a number or a truth value: "50", true, 1."""
+        for name, value in data.items() if isinstance(data, Mapping) else ():
+            field: Any = cls.model_fields.get(name)
+            kinds = _leaf_types(field.annotation) if field else frozenset()
+            wrong, numeric = "", bool(kinds) and kinds <= {int, float, NoneType}
+            if numeric and any(isinstance(leaf, str | bytes | bool) for leaf in _leaves(value)):
+                wrong = "numbers" if isinstance(value, list | tuple) else "a number"
+            elif kinds == {bool} and not isinstance(value, bool):
+                wrong = "true or false"
+            if wrong:
+                raise PydanticCustomError("coerced", "must be {wrong}", {"field": name, "got": value, "wrong": wrong})
+        return data
+
+
+@cache
+def _leaf_types(annotation: Any) -> frozenset[Any]:
+    """Return the types at the leaves of an annotation such as ``tuple[float, float] | None``."""
+    if get_origin(annotation) is Annotated:
+        return _leaf_types(get_args(annotation)[0])
+    parts = [part for part in get_args(annotation) if part is not ...]
+    return frozenset({annotation}) if not parts else frozenset().union(*map(_leaf_types, parts))
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _leaves(item)
+    else:
+        yield value
+
+
+def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = None) -> Model:
+    """Read a TOML file as a model that has a `Name`, by default that of the file.
+
+    Values of `settings` replace those of the file, by key path. Raises `InputError` if the file is missing or
+    malformed.
+    """
+    data = apply_settings(read_toml(path), settings or {}, str(path))
+    data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
+    return validate(model, data, source_name(path, settings))
+
+
+def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
+    """Validate nested tables against a model; `where` is the name of their file.
+
+    Raises
+    ------
+    InputError
+        If the data do not fit: one line with file, key path, value, what is allowed, and the number of further errors.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+        # A list with a wrong item is reported as too short as well: once is enough.
+        paths = [e["loc"] for e in errors]
+        errors = [
+            e for e in errors
+            if not (e["type"] == "too_short" and any(p != e["loc"] and p[: len(e["loc"])] == e["loc"] for p in paths))
+        ]  # fmt: skip
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
+
+
+def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
+    """Return one of pydantic's errors as text: key path, value, and what is allowed."""
+    location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
+    kind, value = error["type"], error.get("input")
+    if kind == "coerced":
+        return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
+    path = ".".join(location) or "(top level)"
+    if kind == "extra_forbidden":
+        return f"{path} = {_short(value)}: unknown key{_allowed_keys(error['loc'], model)}"
+    if kind == "missing":
+        return f"{path}: missing; it must be given"
+    if kind == "union_tag_not_found":
+        return f"{path}.type: missing; allowed: {_allowed_types(error['loc'], model)}"
+    if kind == "union_tag_invalid":
+        return f"{path}.type = {_short(value['type'])}: unknown; allowed: {_allowed_types(error['loc'], model)}"
+    if kind == "value_error":
+        shown_value = "" if isinstance(value, Mapping) else f" = {_short(value)}"
+        return f"{path}{shown_value}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
+    return f"{path} = {_short(value)}: must {_demand(error)}"
+
+
+def _demand(error: Any) -> str:
+    """Return what a value must be or hold, in the words of TOML."""
+    kind, limits = error["type"], error.get("ctx", {})
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return "be a table"
+    if kind in ("tuple_type", "list_type"):
+        return "be a list"
+    if kind in ("too_short", "too_long", "string_too_short", "string_too_long"):
+        bound, count = ("least", limits.get("min_length")) if "short" in kind else ("most", limits.get("max_length"))
+        return f"have at {bound} {count} {'character' if 'string' in kind else 'item'}{'s'[: count != 1]}"
+    if kind == "string_pattern_mismatch":
+        return f"match the pattern {limits['pattern']}"
+    return f"be {error['msg'].removeprefix('Input should be ')}"
+
+
+def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
+    """Drop the tags that pydantic puts into the location for each tagged union."""
+    path: list[Any] = []
+    tagged: Any = None
+    for part in location:
+        # The tag comes first; after it the same word is a key (type = "gamma" has a key gamma).
+        if isinstance(data, Mapping) and data is not tagged and part == data.get("type"):
+            tagged = data
+            continue
+        path.append(part)
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            data = None
+    return path
+
+
+def _allowed_keys(location: tuple[Any, ...], model: type[BaseModel]) -> str:
+    """List the keys that are allowed instead of an unknown one, the closest first."""
+    nodes = nodes_at(model.model_json_schema(), location[:-1])
+    known = list(next((node["properties"] for node in nodes if "properties" in node), ()))
+    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+    ordered = close + [k for k in known if k not in close]
+    return f"; allowed: {', '.join(ordered)}" if ordered else ""
+
+
+def _allowed_types(location: tuple[Any, ...], model: type[BaseModel]) -> str:
+    """List the types that a tagged union allows."""
+    nodes = nodes_at(model.model_json_schema(), location)
+    return ", ".join(next((node["discriminator"]["mapping"] for node in nodes if "discriminator" in node), ()))
+
+
+def _short(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:
+        # Python refuses to write integers of more than 4300 digits.
+        text = "a number of too many digits"
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,146 @@
+"""TOML in and out: files, `--set key=value`, values at key paths, and tables that read back the same."""
+
+import copy
+import itertools
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
+
+MAX_TOML_BYTES = 1_000_000
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file; raise `InputError` if it is missing, too large, not UTF-8 or not TOML."""
+    try:
+        return _loads(read_text(path, "TOML"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{shown(path)}: not valid TOML: {error}") from error
+
+
+def read_text(path: Path, kind: str) -> str:
+    """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
+
+    Raises `InputError` if it is missing, too large or not UTF-8.
+    """
+    name = shown(path)
+    try:
+        size = path.stat().st_size
+        # A device or a pipe has no size and might never end.
+        if not path.is_file():
+            raise InputError(f"{name}: is {'a folder' if path.is_dir() else 'no plain file'}; a {kind} file is needed")
+        if size > MAX_TOML_BYTES:
+            raise InputError(f"{name}: {size} bytes; a {kind} file of at most {MAX_TOML_BYTES} is allowed")
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{name}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name}: not a text file in UTF-8 (byte {error.start})") from error
+
+
+def _loads(text: str) -> dict[str, Any]:
+    """Parse TOML; limits of the parser (nesting, digits) raise `TOMLDecodeError` too."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError:
+        raise tomllib.TOMLDecodeError("nested too deeply") from None
+    except ValueError:
+        # Python refuses to read integers of more than 4300 digits.
+        raise tomllib.TOMLDecodeError("a number has too many digits") from None
+
+
+# Settings by key path ------------------------------------------------------------------------------------------------
+
+
+def parse_settings(settings: list[str]) -> dict[str, Any]:
+    """Parse the `key=value` pairs of a command line, such as "surface.radius_mm=10", to values by key path.
+
+    A value is TOML, or else plain text. Raises `InputError` for a pair without ``=`` or with an empty key.
+    """
+    parsed = {}
+    for setting in settings:
+        path, equals, value = setting.partition("=")
+        if not equals or not path.strip():
+            raise InputError(f"--set {shown(setting)}: must be key=value, for example surface.distance_mm=12")
+        try:
+            table = _loads(f"value = {value}")
+        except tomllib.TOMLDecodeError:
+            table = {}
+        # More than one key means that the value held a line break, so it is text.
+        parsed[path.strip()] = table["value"] if list(table) == ["value"] else value
+    return parsed
+
+
+def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a copy of nested tables with values replaced at key paths such as ``rig.lights.0.position_mm``.
+
+    Raises
+    ------
+    InputError
+        If a path leads through something that is no table or beyond the end of a list; `where` names the file.
+    """
+    where = shown(where)
+    result = copy.deepcopy(dict(data))
+    for path, value in settings.items():
+        parts = path.split(".")
+        last, parents = parts[-1], parts[:-1]
+        node: Any = result
+        for part, following in itertools.pairwise(parts):
+            node = _step(node, part, following, path, where)
+        if isinstance(node, list):
+            _step(node, last, "", path, where)
+            node[int(last)] = value
+        elif isinstance(node, dict):
+            node[last] = value
+        else:
+            raise InputError(f"{where}: {shown(path)}: {shown('.'.join(parents))} is a plain value, not a table")
+    return result
+
+
+def _step(node: Any, part: str, following: str, path: str, where: str) -> Any:
+    """Descend one part of a key path; create what is missing, a list if the following part is its first index."""
+    if isinstance(node, dict):
+        if part not in node and following.isdecimal() and following != "0":
+            raise InputError(f"{where}: {shown(path)}: index {shown(following)} is not allowed; the first item is 0")
+        return node.setdefault(part, [{}] if following == "0" else {})
+    if isinstance(node, list):
+        if part.isdecimal() and len(part) < 10 and int(part) < len(node):
+            return node[int(part)]
+        held = f"items 0 to {len(node) - 1}" if node else "no items"
+        raise InputError(f"{where}: {shown(path)}: index {shown(part)} is not allowed; the list has {held}")
+    raise InputError(f"{where}: {shown(path)}: {shown(part)} is below a plain value, not a table")
+
+
+def source_name(path: Path, settings: Mapping[str, Any] | None) -> str:
+    """Return a file's name for messages, which mentions whether some of its values are replaced."""
+    return f"{path} with replaced values" if settings else str(path)
+
+
+# Writing -------------------------------------------------------------------------------------------------------------
+
+
+def toml_value(value: Any) -> str:
+    """Return a value as TOML: text quoted, tables and lists inline."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_value(item) for item in value) + "]"
+    if isinstance(value, str):
+        # A JSON string is a TOML basic string.
+        return json.dumps(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def toml_tables(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return tables by name as the text of a TOML file, one line per key."""
+    parts = []
+    for name, table in tables.items():
+        lines = [f"{key} = {toml_value(value)}\n" for key, value in table.items()]
+        parts.append(f"[{name}]\n{''.join(lines)}")
+    return "\n".join(parts)
