@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import Figure
-from simtest.geometry import Camera, backproject_conic, circle_poses, fit_ellipses
+from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipses
 from simtest.runtime.measuring import PeakMemory, in_turns
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
@@ -127,6 +127,6 @@ def _batched_pose() -> Figure:
         points = np.stack([x + a * np.cos(phase), y + b * np.sin(phase)], axis=1)
         contours.append(points + rng.normal(0, 0.1, points.shape))
     camera = Camera(406, 406, 406.0, 406.0, 203.0, 203.0)
-    work: Callable[[], object] = lambda: circle_poses(backproject_conic(fit_ellipses(contours), camera))  # noqa: E731
+    work: Callable[[], object] = lambda: circle_poses(cone_of_conic(fit_ellipses(contours), camera.K))  # noqa: E731
     each = 1e6 * in_turns({"pose": work}, 25)["pose"] / CONICS
     return Figure(f"ellipse fit and pose, batches of {CONICS}, {POINTS} points each", each, 6.0, unit="µs a conic")

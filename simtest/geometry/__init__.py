@@ -9,7 +9,7 @@ from simtest.geometry.arc_fit import FittedArc, fit_arc
 from simtest.geometry.arrays import Array, Image, Index, Mask
 from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
-from simtest.geometry.conics import Ellipse, backproject_conic, cone_of_conic, cone_rays, ellipse_of_conic
+from simtest.geometry.conics import Ellipse, cone_of_conic, cone_rays, ellipse_of_conic
 from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
 from simtest.geometry.gaussian_smoothing import smooth
@@ -31,7 +31,6 @@ __all__ = [
     "Mask",
     "Patch",
     "ViewMask",
-    "backproject_conic",
     "circle_pose",
     "circle_poses",
     "cone_axes",

@@ -42,9 +42,7 @@ class ViewMask:
 
     def __post_init__(self) -> None:
         for name in ("cx", "cy", "radius"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
-                raise InputError(f"view_mask.{name} = {value!r}: must be a finite number")
+            check_number(f"view_mask.{name}", getattr(self, name))
         if self.radius <= 0:
             raise InputError(f"view_mask.radius = {self.radius!r}: must be > 0")
 

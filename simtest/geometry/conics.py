@@ -1,4 +1,4 @@
-"""Conics: back-projection into the camera frame and the ellipse of a conic."""
+"""Conics: the cone of sightlines through a fitted ellipse, and the ellipse of a conic."""
 
 from dataclasses import dataclass
 
@@ -6,46 +6,26 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.arrays import Array
-from simtest.geometry.camera import Camera
 from simtest.geometry.circle_from_cone import cone_axes
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 
 
-def backproject_conic(conic: FittedConic | FittedConics, camera: Camera) -> Array:
-    """Return the cone of sightlines through an image ellipse, or through each: C' = K^T C K [MB, section 2.3, step 3].
-
-    The transforms are multiplied first, so that a small ellipse far from the origin keeps its digits.
-
-    Parameters
-    ----------
-    conic : FittedConic or FittedConics
-        In pixels.
-    camera : Camera
-        For K.
-
-    Returns
-    -------
-    ndarray, shape (3, 3) or (N, 3, 3)
-        Symmetric; w^T C' w = 0 for the sightlines w of the ellipse's pixels. Scaled to unit norm.
-    """
-    return cone_of_conic(conic, camera.K)
-
-
 def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -> Array:
-    """Return the cone of directions through an ellipse of a plane, or through each of several: C' = A^T C A.
+    """Return the cone of directions through an ellipse, or through each: C' = A^T C A [MB, section 2.3, step 3].
 
     Parameters
     ----------
     conic : FittedConic or FittedConics
-        In the plane's coordinates.
+        In a plane's coordinates.
     plane_from_camera : ndarray, shape (3, 3) or (N, 3, 3)
         A, from the camera frame to the plane's homogeneous coordinates: K for pixels, a rotation for a gnomonic plane.
 
     Returns
     -------
     ndarray, shape (3, 3) or (N, 3, 3)
-        Symmetric, camera frame, scaled to unit norm.
+        Symmetric, camera frame, scaled to unit norm; w^T C' w = 0 for the directions w of the ellipse's points.
     """
+    # The transforms are multiplied first, so that a small ellipse far from the origin keeps its digits.
     H = conic.normalised_from_image @ plane_from_camera
     cone = np.swapaxes(H, -1, -2) @ conic.normalised @ H
     cone = (cone + np.swapaxes(cone, -1, -2)) / 2
@@ -93,26 +73,9 @@ class Ellipse:
     semi_minor: float
     angle: float
 
-    def points(self, count: int = 100) -> Array:
-        """Return points along the ellipse, shape (count, 2), the first repeated at the end."""
-        phase = np.linspace(0, 2 * np.pi, count)
-        cos, sin = np.cos(self.angle), np.sin(self.angle)
-        local = np.stack([self.semi_major * np.cos(phase), self.semi_minor * np.sin(phase)], axis=1)
-        return np.asarray(self.centre + local @ np.array([[cos, sin], [-sin, cos]]))
-
 
 def ellipse_of_conic(conic: npt.ArrayLike) -> Ellipse:
-    """Compute centre and axes of a conic that is a real ellipse.
-
-    Parameters
-    ----------
-    conic : array_like, shape (3, 3)
-        Symmetric.
-
-    Returns
-    -------
-    Ellipse
-    """
+    """Compute centre and axes of a symmetric conic, shape (3, 3), that is a real ellipse."""
     C = np.asarray(conic, dtype=float)
     C = C if np.trace(C[:2, :2]) > 0 else -C
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])

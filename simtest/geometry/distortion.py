@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.errors import InputError
 from simtest.geometry.arrays import Array, Mask
+from simtest.geometry.checks import check_number
 
 Curve = Callable[[Array], tuple[Array, Array]]
 
@@ -88,17 +88,9 @@ class BrownConrady:
         return Polynomial([1.0, self.k1, self.k2, self.k3]), Polynomial([1.0, self.k4, self.k5, self.k6])
 
     def distort(self, rays: npt.ArrayLike) -> Array:
-        """Return the normalised image coordinates of directions.
+        """Return the normalised image coordinates, shape (..., 2), of directions, shape (..., 3), of any length.
 
-        Parameters
-        ----------
-        rays : array_like, shape (..., 3)
-            Camera frame, any length.
-
-        Returns
-        -------
-        ndarray, shape (..., 2)
-            NaN at 90 deg off the axis and more, and beyond the first monotone branch.
+        They are NaN at 90 deg off the axis and more, and beyond the first monotone branch.
         """
         P = np.asarray(rays, dtype=float)
         z = np.where(P[..., 2] > 0, P[..., 2], np.nan)
@@ -109,16 +101,9 @@ class BrownConrady:
         return np.asarray(np.where(valid[..., None], m, np.nan))
 
     def undistort(self, m: npt.ArrayLike) -> Array:
-        """Return the unit directions of normalised image coordinates, found by Newton's method.
+        """Return the unit directions, shape (..., 3), of normalised image coordinates, shape (..., 2).
 
-        Parameters
-        ----------
-        m : array_like, shape (..., 2)
-
-        Returns
-        -------
-        ndarray, shape (..., 3)
-            Camera frame; NaN where no direction of the first monotone branch is seen.
+        Found by Newton's method; NaN where no direction of the first monotone branch is seen.
         """
         target = np.asarray(m, dtype=float)
         radius = np.linalg.norm(target, axis=-1)
@@ -266,8 +251,7 @@ Distortion = BrownConrady | KannalaBrandt
 
 def _check_finite(model: Distortion) -> None:
     for name, value in zip(model.__dataclass_fields__, astuple(model), strict=True):
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
-            raise InputError(f"distortion.{name} = {value!r}: must be a finite number")
+        check_number(f"distortion.{name}", value)
 
 
 def _first_root(polynomial: Polynomial) -> float:
@@ -281,22 +265,9 @@ def _first_root(polynomial: Polynomial) -> float:
 
 
 def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
-    """Solve curve(x) = value for x in [0, top), by Newton steps kept inside a bracket.
+    """Solve curve(x) = value >= 0 for x in [0, top), by Newton steps kept inside a bracket; NaN without a solution.
 
-    Parameters
-    ----------
-    curve : callable
-        Returns value and slope; 0 at 0, and rising up to `top`.
-    value : ndarray, shape (...)
-        At least 0.
-    top : float
-    reach : float
-        The curve's value at `top`; may be inf.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        NaN where the curve does not reach the value below `top`.
+    The curve, which returns value and slope, is 0 at 0 and rises to `reach`, which may be inf, at `top`.
     """
     wanted = np.ravel(value).astype(float)
     found = np.full(wanted.shape, np.nan)

@@ -10,18 +10,9 @@ _NEWTON_STEPS = 2
 def constrained_minimum(M: Array) -> Array:
     """Minimise q^T M q subject to q^T C q = 4 a c - b^2 = 1 for q = (a, b, c).
 
-    q solves (M - l C) q = 0 for the one l >= 0: M is positive semidefinite and C has one positive eigenvalue, so all
-    three l are real and the other two are negative.
-
-    Parameters
-    ----------
-    M : ndarray, shape (B, 3, 3)
-        Symmetric, positive semidefinite, of rank 2 at least.
-
-    Returns
-    -------
-    ndarray, shape (B, 3)
-        q, unit.
+    M, shape (B, 3, 3), is symmetric, positive semidefinite and of rank 2 at least. The result, shape (B, 3), is unit.
+    It solves (M - l C) q = 0 for the one l >= 0: since C has one positive eigenvalue, all three l are real and the
+    other two are negative.
     """
     # coefficients of det(M - l C) = c0 + c1 l + c2 l^2 - 4 l^3
     entries = M.reshape(-1, 9)

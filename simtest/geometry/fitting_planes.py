@@ -42,18 +42,8 @@ def fitting_planes(contours: Sequence[Array], camera: Camera) -> FittingPlanes:
     A pinhole images ellipses: its plane is the image, with the transform K. Where a lens distorts, the plane is
     perpendicular to the contour's mean sightline, and the transform is a rotation.
 
-    Parameters
-    ----------
-    contours : sequence of ndarray, shape (N_i, 2)
-        px; at least one point each.
-    camera : Camera
-        The camera.
-
-    Returns
-    -------
-    FittingPlanes
-        A Failure for each contour with points at which the lens images nothing, or that reaches 90 deg from its mean
-        sightline.
+    Contours, shape (N_i, 2), px, have at least one point each. One with points at which the lens images nothing, or
+    that reaches 90 deg from its mean sightline, is a Failure.
     """
     if camera.distortion is None or not contours:
         return FittingPlanes(contours, camera.K, np.broadcast_to(FORWARD, (len(contours), 3)))

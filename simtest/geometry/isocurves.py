@@ -54,18 +54,9 @@ def _directions(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLi
 def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
     """Return the radius r- of the isophote at t about the foot of V = L, abs(V_Z) tan(acos(tau)/2) [MB, section 2.2].
 
-    Parameters
-    ----------
-    isovalue, exponent : float
-        t in (0, 1), relative to c, and n > 0.
-    height : float
-        V_Z.
-
-    Returns
-    -------
-    float
-        In the unit of V_Z. Computed from log tau, which keeps its digits for large n and for small ones.
+    t is in (0, 1), the exponent n > 0, and the height V_Z sets the unit.
     """
+    # From log tau, which keeps its digits for large n and for small ones.
     log_tau = np.log(isovalue) / exponent
     # tan(acos(tau) / 2)^2 = (1 - tau) / (1 + tau)
     return float(abs(height) * np.sqrt(-np.expm1(log_tau) / (1 + np.exp(log_tau))))
@@ -105,12 +96,9 @@ def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[A
 
 
 def brightest_point(light: Array, camera: Array) -> Array:
-    """Return the BP on the plane z = 0, shape (2,): there the mirrored light, the point and the camera are collinear.
+    """Return the BP on the plane z = 0, shape (2,), for L and V, shape (3,), at z > 0.
 
-    Parameters
-    ----------
-    light, camera : ndarray, shape (3,)
-        L and V, at z > 0.
+    There the mirrored light, the point and the camera are collinear.
     """
     share = camera[2] / (camera[2] + light[2])
     return np.asarray(camera[:2] + share * (light[:2] - camera[:2]))

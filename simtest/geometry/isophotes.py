@@ -15,20 +15,9 @@ the cut by 0.8 of that deviation, at this distance by 0.06."""
 
 @dataclass(frozen=True, eq=False)
 class IsophoteTracer:
-    """The level sets around one peak, each found once; what was found depends on the arguments alone.
+    """The level sets around one peak, each found once; the fields are those of `simtest.geometry.Patch`.
 
-    Parameters
-    ----------
-    values : ndarray, shape (h, w)
-        Smoothed intensities.
-    peak_pixel : tuple of int
-        Column and row of the peak.
-    peak_value : float
-        Isovalues are relative to it.
-    seen : ndarray of bool, shape (h, w), or None
-        The pixels inside the camera's view mask; None: all.
-    smoothing_px : float
-        Standard deviation of the Gaussian that `values` were smoothed with, px.
+    What it holds depends on its fields alone, so nobody needs to clear it.
     """
 
     values: Image | Array

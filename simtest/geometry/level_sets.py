@@ -145,17 +145,9 @@ class LevelSet:
 
 
 def crossings(sets: Sequence[LevelSet]) -> Crossings:
-    """Compute the crossings of level sets of one array, all at once: a call for each would cost more than the work.
+    """Compute the crossings of one or more level sets of one array, in their order.
 
-    Parameters
-    ----------
-    sets : sequence of LevelSet
-        At least one.
-
-    Returns
-    -------
-    Crossings
-        In the order of the sets.
+    All at once: a call for each would cost more than the work.
     """
     # candidates: lines with one end inside, as flat indices into (set, direction, row, column)
     (x, y), crossed = _crossed_lines(sets)
@@ -242,25 +234,9 @@ def level_set_around(
 def cut_level_set_around(
     values: Image | Array, pixel: tuple[int, int], level: float, margin_px: int, seen: Mask | None = None
 ) -> LevelSet:
-    """Find the region above a level that holds a pixel where the array's border or the view cuts it.
+    """Find the same region where the array's border or the view may cut it; its border is open there.
 
-    Parameters
-    ----------
-    values : ndarray, shape (H, W)
-        Finite intensities.
-    pixel : tuple of int
-        Column and row; its value lies above the level.
-    level : float
-        The level.
-    margin_px : int
-        Crossings nearer than this to the cut are left out: smoothing has moved the border there.
-    seen : ndarray of bool, shape (H, W), optional
-        Where the values are known; default everywhere.
-
-    Returns
-    -------
-    LevelSet
-        Its border is open at the cut.
+    Crossings nearer than `margin_px` to the cut are left out: smoothing has moved the border there.
     """
     known = np.ones(values.shape, dtype=bool) if seen is None else seen
     marks = ((values > level) & known).view(np.uint8)

@@ -80,7 +80,7 @@ class Patch:
         noise: float | Image | None = None,
         smoothing_px: float = 0.0,
     ) -> "Patch | Failure":
-        """Cut a region out of a smoothed frame.
+        """Cut a region out of a smoothed frame; masks, raw frame and noise are those of the frame, shape (H, W).
 
         Parameters
         ----------
@@ -89,19 +89,10 @@ class Patch:
         box : tuple of int
             Column, row, width, height of the region; inside the frame.
         peak : tuple of int, optional
-            Column and row of the peak's pixel; default the brightest of the region.
+            Column and row of the peak's pixel; default the brightest of the region. A peak on a clipped plateau of 12
+            px and more lies at the plateau's centroid.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
-        saturated : ndarray of bool, shape (H, W), optional
-            Where the sensor is clipped. A peak on a clipped plateau of 12 px and more lies at the plateau's centroid.
-        seen : ndarray of bool, shape (H, W), optional
-            The frame's pixels inside the camera's view mask; default all.
-        raw : ndarray, shape (H, W), optional
-            The frame before smoothing.
-        noise : float, or ndarray of float32, shape (H, W), optional
-            Standard deviation of the frame's noise before smoothing; None: not known.
-        smoothing_px : float
-            Standard deviation of the Gaussian that it was smoothed with, px.
 
         Returns
         -------
@@ -117,38 +108,34 @@ class Patch:
         rows, columns = smoothed.shape
         if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
             raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
-        values = smoothed[y : y + height, x : x + width]
+        crop = np.s_[y : y + height, x : x + width]
+        values, corner = smoothed[crop], (x + origin_px[0], y + origin_px[1])
         # NaN and infinity show at either end of the range, which costs less than a test of every value.
         lowest, highest = float(values.min()), float(values.max())
         if not (np.isfinite(lowest) and np.isfinite(highest)):
             return Failure(Reason.NOT_FINITE, "the region holds NaN or infinity")
-        if peak is None:
-            row, column = divmod(int(values.argmax()), values.shape[1])
-        else:
-            column, row = peak[0] - x, peak[1] - y
+        saturated, seen = (None if mask is None else mask[crop] for mask in (saturated, seen))
         if seen is not None:
-            seen = seen[y : y + height, x : x + width]
             lowest = float(values.min(where=seen, initial=np.inf))
-        corner = (x + origin_px[0], y + origin_px[1])
-        unsmoothed = None if raw is None else raw[y : y + height, x : x + width]
-        clipped = None if saturated is None else saturated[y : y + height, x : x + width]
-        # peak: a parabola's apex, or the centroid of a clipped plateau
-        plateau = None if clipped is None else _plateau(clipped, row, column)
-        if clipped is None or plateau is None:
+        # candidate: the given pixel or the brightest; refined by a parabola or, on a clipped plateau, by its centroid
+        row, column = divmod(int(values.argmax()), width) if peak is None else (peak[1] - y, peak[0] - x)
+        plateau = None if saturated is None else _plateau(saturated, row, column)
+        if saturated is None or plateau is None:
             position = _parabolic_peak(values, row, column)
         else:
             position = np.argwhere(plateau)[:, ::-1].mean(axis=0)
             # The clipped pixel nearest to the centroid: where falloff was divided away the plateau is slanted and
             # highest at its rim, and its holes may be dark.
-            pixels = np.argwhere(plateau & clipped)[:, ::-1]
+            pixels = np.argwhere(plateau & saturated)[:, ::-1]
             column, row = pixels[np.argmin(np.sum((pixels - position) ** 2, axis=1))]
+        # reject a region without a peak
         value = float(values[row, column])
         if value <= 0 or value <= lowest:
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
-        if isinstance(noise, np.ndarray):
-            noise = noise[y : y + height, x : x + width]
-        pixel, position = (int(column), int(row)), position + PIXEL_CENTRE + corner
-        return cls(values, corner, position, value, pixel, clipped, seen, unsmoothed, noise, smoothing_px)
+        return cls(
+            values, corner, position + PIXEL_CENTRE + corner, value, (int(column), int(row)), saturated, seen,
+            None if raw is None else raw[crop], noise[crop] if isinstance(noise, np.ndarray) else noise, smoothing_px,
+        )  # fmt: skip
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Return the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
@@ -191,19 +178,9 @@ class Patch:
         return self._isophotes.crossings([self._isophotes.cut(isovalue)]).points + self._first_centre
 
     def sensitivities(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Sensitivities:
-        """Return how the points of `crossings`, or of `arc` where cut, move with the patch's values, in the same order.
+        """Return how the points of `crossings`, or of `arc` where `cut` is true, move with the patch's values.
 
-        Parameters
-        ----------
-        isovalues : sequence of float
-            Of isophotes that were found.
-        cut : sequence of bool
-            Whether each is an arc.
-
-        Returns
-        -------
-        Sensitivities
-            One isophote after the other.
+        The isophotes must have been found; their points follow each other in the same order.
         """
         traced = self._isophotes
         found = [traced.cut(t) if arc else traced.closed(t) for t, arc in zip(isovalues, cut, strict=True)]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.protocol import FittedIsophote, fit_cut_isophote
+from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote
 from simtest.geometry import Camera, FittedArc, Patch, ellipse_of_conic, fit_arc, fit_ellipse, smooth
 from simtest.geometry.arc_fit import _residuals
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import Failure
-from simtest.geometry import Camera, backproject_conic, circle_poses, fit_ellipse, fit_ellipses
+from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipse, fit_ellipses
 from simtest.geometry.circle_from_cone import circle_pose
 
 CAMERA = Camera(406, 406, 406.0, 420.0, 203.0, 190.0, 1.5)
@@ -38,7 +38,7 @@ def test_a_batch_is_its_members(seed, count):
     rng = np.random.default_rng(seed)
     contours = [contour(rng) for _ in range(count)]
     fitted = fit_ellipses(contours)
-    poses = circle_poses(backproject_conic(fitted, CAMERA))
+    poses = circle_poses(cone_of_conic(fitted, CAMERA.K))
     assert len(fitted) == count
     for i, points in enumerate(contours):
         alone = fit_ellipse(points)
@@ -47,7 +47,7 @@ def test_a_batch_is_its_members(seed, count):
             continue
         np.testing.assert_array_equal(fitted[i].normalised, alone.normalised)
         np.testing.assert_array_equal(fitted[i].normalised_from_image, alone.normalised_from_image)
-        pose, single = poses[i], circle_pose(backproject_conic(alone, CAMERA))
+        pose, single = poses[i], circle_pose(cone_of_conic(alone, CAMERA.K))
         np.testing.assert_array_equal(pose.normals, single.normals)
         np.testing.assert_array_equal(pose.centres, single.centres)
         assert pose.axis_ratio == single.axis_ratio
@@ -62,7 +62,7 @@ def test_cones_that_look_backwards_are_those_that_look_forwards_turned(seed, cou
         rng.uniform(100, 300, 2) + np.stack([rng.uniform(5, 40) * np.cos(phase), 20 * np.sin(phase)], 1)
         for _ in range(count)
     ]
-    cones = backproject_conic(fit_ellipses(rings), CAMERA)
+    cones = cone_of_conic(fit_ellipses(rings), CAMERA.K)
     turns, _ = np.linalg.qr(rng.normal(size=(count, 3, 3)))
     turns *= np.linalg.det(turns)[:, None, None]
     turned = turns @ cones @ turns.transpose(0, 2, 1)

@@ -7,7 +7,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
-from simtest.geometry import Camera, backproject_conic, circle_pose, cone_axes, fit_ellipse
+from simtest.geometry import Camera, circle_pose, cone_axes, cone_of_conic, fit_ellipse
 
 CAMERA = Camera(640, 480, 500.0, 430.0, 330.0, 225.0, 15.0)
 EXACT_DEG = 1e-6
@@ -159,7 +159,7 @@ def test_pose_from_points_in_the_image(circle):
     assume(circle.radius > np.tan(np.radians(0.5)))
     fitted = fit_ellipse(CAMERA.project(circle.points(64)))
     assert not isinstance(fitted, Failure)
-    pose = circle_pose(backproject_conic(fitted, CAMERA))
+    pose = circle_pose(cone_of_conic(fitted, CAMERA.K))
     tilt = np.radians(angle_deg(-pose.normals[0], pose.axis))
     errors = angle_deg(pose.normals, circle.normal)
     assert errors.min() < (1e-5 if tilt > 0.01 else 1e-2)

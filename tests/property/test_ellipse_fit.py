@@ -131,7 +131,8 @@ def test_conic_in_pixels_vanishes_on_the_points_and_is_positive_outside():
     ellipse = ellipse_of_conic(-3 * conic)
     np.testing.assert_allclose(ellipse.centre, [40, 30], atol=1e-9)
     np.testing.assert_allclose([ellipse.semi_major, ellipse.semi_minor, ellipse.angle], [12, 5, 1.0], atol=1e-9)
-    around = np.column_stack([ellipse.points(30), np.ones(30)])
+    around = ellipse_points(ellipse.centre, ellipse.semi_major, ellipse.semi_minor, ellipse.angle, phases(30))
+    around = np.column_stack([around, np.ones(30)])
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", around, conic, around), 0, atol=1e-12)
 
 

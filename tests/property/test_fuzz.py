@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from simtest.calibration import Priors
+from simtest.calibration import Normal, Priors, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisector
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose as circle_pose_estimator
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
-from simtest.estimators.execution_guard import run
+from simtest.estimators.dispatch import run
 from simtest.estimators.photometric import photometric, photometric_plane
 from simtest.geometry import Camera, FittedArc, FittedConic, KannalaBrandt, Patch, circle_pose, fit_arc, fit_ellipse
 
@@ -23,7 +23,7 @@ ESTIMATORS = {
     "photometric": photometric,
     "photometric_plane": photometric_plane,
 }
-KNOWN = Priors(((1.0, 0.0, 0.0), (-1.0, 0.5, 0.0)), 10.0, 1.0, 200.0)
+KNOWN = Priors(((1.0, 0.0, 0.0), (-1.0, 0.5, 0.0)), Normal(10.0, 1.0), exactly(200.0))
 FISHEYE = Camera(48, 40, 30.0, 30.0, 24.0, 20.0, distortion=KannalaBrandt(0.01, 0.0, 0.0, 0.0))
 CAMERAS = (Camera(48, 40, 60.0, 60.0, 24.0, 20.0), FISHEYE)
 KINDS = 8

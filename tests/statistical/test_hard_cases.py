@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from simtest.calibration import Calibration, Priors
+from simtest.calibration import Calibration, Priors, exactly
 from simtest.detection import estimate_noise
 from simtest.errors import Failure, Reason
 from simtest.estimators.brightest_point import brightest_point
@@ -245,7 +245,7 @@ def test_a_light_beside_the_camera_is_told_by_the_rig_alone(see):
     blind = found(frame, replace(seen.calibration, priors=Priors()), HALVES)
     near = found(frame, seen.calibration, HALVES)
     lights = seen.calibration.priors.lights_mm
-    told = found(frame, replace(seen.calibration, priors=Priors(lights, truth.distance)), HALVES)
+    told = found(frame, replace(seen.calibration, priors=Priors(lights, exactly(truth.distance))), HALVES)
     for key in HALVES:
         assert not {"misfit", "not_elliptic", "light_offset"} & set(blind[key].flags)
         assert mahalanobis2(blind[key], truth.normal) > 100

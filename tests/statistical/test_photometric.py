@@ -43,7 +43,7 @@ def test_derivatives_are_those_of_finite_differences(model):
 
 def answers(setting, count):
     pipeline = Pipeline(setting)
-    return [photometric_plane(pipeline.patch(from_integer(number)), setting.camera) for number in range(count)]
+    return [photometric_plane.estimate(pipeline.patch(from_integer(number)), setting.camera) for number in range(count)]
 
 
 @pytest.mark.parametrize("values", [{}, {"sigma": 0.01}, {"sigma": 0.1}, {"theta_deg": 30.0}, {"theta_deg": 75.0}])
@@ -128,6 +128,6 @@ def test_what_has_no_highlight_fails_for_its_reason():
     ramp = Patch.cut(smooth(x + 0.1 * y, 1.0), (0, 0, 60, 50))
     assert isinstance(ramp, Patch)
     for estimator in (photometric, photometric_plane, cone_axis):
-        result = estimator(ramp, camera)
+        result = estimator.estimate(ramp, camera)
         assert isinstance(result, Failure)
         assert result.reason is Reason.NO_CLOSED_ISOPHOTE

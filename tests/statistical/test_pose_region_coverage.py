@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.runtime.seeds import from_integer
 from simtest.spec.paper import PaperSetting
@@ -22,7 +22,7 @@ def statistics_of(theta, sigma, count, **more):
     found = []
     for seed in range(count):
         patch = pipeline.patch(from_integer(40_000 + seed))
-        estimate = circle_pose(patch, setting.camera, setting.isovalue)
+        estimate = CirclePoseEstimator(setting.isovalue).estimate(patch, setting.camera)
         found.append(float(estimate.region.statistic(setting.normal)))
     return np.array(found)
 
@@ -52,9 +52,9 @@ def test_a_region_of_another_cone_does_not_cover():
     T = []
     for seed in range(40):
         patch = pipeline.patch(from_integer(seed))
-        isophote = circle_pose(patch, setting.camera, 0.5).isophotes[0]
+        isophote = CirclePoseEstimator(0.5).estimate(patch, setting.camera).isophotes[0]
         region = pose_region(patch, setting.camera, isophote)
-        own = circle_pose(patch, setting.camera, 0.5)
+        own = CirclePoseEstimator(0.5).estimate(patch, setting.camera)
         # The published normals themselves are those of the smoothed picture.
         T.append(float(region.statistic(own.candidates).min()))
     assert np.median(T) > 2

@@ -10,6 +10,7 @@ from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.calibration.calibration import MIN_FALLOFF
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.pipeline import reconstruct
@@ -351,13 +352,13 @@ def test_the_plateau_of_a_divided_frame_is_slanted_and_its_peak_is_not():
 def test_an_estimator_of_elsewhere_with_odd_isovalues_is_flagged_all_the_same():
     frame = np.minimum(spot(height=2.0), 1.0)
 
-    def odd(patch, camera):
-        from simtest.estimators.cone_axis import cone_axis
+    class Odd:
+        def estimate(self, patch, camera, priors):
+            made = cone_axis.estimate(patch, camera, priors)
+            isophotes = tuple(dataclasses.replace(i, isovalue=2.0) for i in made.isophotes)
+            return dataclasses.replace(made, isophotes=isophotes)
 
-        made = cone_axis(patch, camera)
-        return dataclasses.replace(made, isophotes=tuple(dataclasses.replace(i, isovalue=2.0) for i in made.isophotes))
-
-    (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=1.0), {"odd": odd})
+    (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=1.0), {"odd": Odd()})
     assert not isinstance(found.estimates["odd"], Failure)
     assert found.estimates["odd"].flags == ("saturated",)
 

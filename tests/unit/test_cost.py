@@ -1,5 +1,7 @@
 """Costs of a night: what gives no answer is not fast."""
 
+from types import SimpleNamespace
+
 import polars as pl
 import pytest
 
@@ -31,7 +33,8 @@ def test_every_piece_has_an_answer(frame_pieces):
 
 
 def test_a_piece_that_fails_is_not_timed_as_a_fast_one(frame_pieces, monkeypatch):
-    monkeypatch.setattr(cost, "cone_axis", lambda *_: Failure(Reason.NO_PEAK, "broken"))
+    broken = SimpleNamespace(estimate=lambda *_: Failure(Reason.NO_PEAK, "broken"))
+    monkeypatch.setattr(cost, "cone_axis", broken)
     monkeypatch.setattr(cost, "reconstruct", lambda *_: [], raising=True)
     monkeypatch.setattr(cost, "_frame_pieces", lambda _: {"reconstruct": lambda: cost.reconstruct()})
     found = cost.run_times(rounds=2)

@@ -1,4 +1,4 @@
-"""An estimator of another package, built and installed for real, is found and run by name."""
+"""Estimators and detectors of other packages, built and installed for real, are found and run by name."""
 
 import json
 import os
@@ -23,7 +23,13 @@ other_raises = "other_core:raises"
 other_garbage = "other_core:garbage"
 other_crooked = "other_core:crooked"
 other_refuses = "other_core:refuses"
+other_plain = "other_core:plain"
 other_missing = "other_core:nothing_of_that_name"
+other_constant = "other_core:CONSTANT"
+cone_axis = "other_core:axis"
+
+[project.entry-points."simtest.detectors"]
+other_middle = "other_core:middle"
 other_constant = "other_core:CONSTANT"
 
 [tool.hatch.build.targets.wheel]
@@ -33,53 +39,91 @@ packages = ["other_core"]
 MODULE = """
 import numpy as np
 from simtest import Camera, Estimate, Failure, Patch, Reason
+from simtest.detection import Detection, Region
 
 CONSTANT = 3
 
 
-def axis(patch: Patch, camera: Camera) -> Estimate:
-    normal = -camera.unproject(patch.peak_px)
-    return Estimate(normal=normal, candidates=normal[None], look_px=patch.peak_px, flags=("from outside",))
+class Axis:
+    def estimate(self, patch, camera, priors):
+        normal = -camera.unproject(patch.peak_px)
+        return Estimate(normal=normal, candidates=normal[None], look_px=patch.peak_px, flags=("from outside",))
 
 
-def raises(patch, camera):
-    raise KeyError("a fault of the other package")
+class Raises:
+    def estimate(self, patch, camera, priors):
+        raise KeyError("a fault of the other package")
 
 
-def garbage(patch, camera):
-    return "north"
+class Garbage:
+    def estimate(self, patch, camera, priors):
+        return "north"
 
 
-def crooked(patch, camera):
-    return Estimate(np.array([0.0, 0.0, -2.0]), np.array([[0.0, 0.0, -2.0]]), patch.peak_px)
+class Crooked:
+    def estimate(self, patch, camera, priors):
+        return Estimate(np.array([0.0, 0.0, -2.0]), np.array([[0.0, 0.0, -2.0]]), patch.peak_px)
 
 
-def refuses(patch, camera):
-    return Failure(Reason.NOT_AN_ELLIPSE, "not today")
+class Refuses:
+    def estimate(self, patch, camera, priors):
+        return Failure(Reason.NOT_AN_ELLIPSE, "not today")
+
+
+class Middle:
+    def detect(self, frame, camera, priors):
+        box = (camera.width // 4, camera.height // 4, camera.width // 2, camera.height // 2)
+        return Detection((Region(box, (camera.width // 2, camera.height // 2), 1.0),), frame)
+
+
+def plain(patch: Patch, camera: Camera) -> Estimate:
+    return axis.estimate(patch, camera, None)
+
+
+axis, raises, garbage, crooked, refuses, middle = Axis(), Raises(), Garbage(), Crooked(), Refuses(), Middle()
 """
 
 CHILD = """
 import json
+import warnings
 import numpy as np
 import simtest
-from simtest.estimators.registry import available, load_estimators
+from simtest.calibration import Calibration, Frame, Priors
+from simtest.detection import load_detector
+from simtest.detection.detector import DETECTORS
+from simtest.estimators.registry import ESTIMATORS, load_estimators
 
 camera = simtest.Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
 x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
-frame = np.exp(-((x - 70) ** 2 + (y - 40) ** 2) / 72)
-names = ["other_axis", "brightest_point", "other_raises", "other_garbage", "other_crooked", "other_refuses"]
+frame = np.exp(-((x - 70) ** 2 + (y - 40) ** 2) / 72).astype(np.float32)
+names = ["other_axis", "brightest_point", "other_raises", "other_garbage", "other_crooked", "other_refuses",
+         "simtest:cone_axis", "Other_Core:cone_axis"]
 (found,) = simtest.reconstruct(frame, camera, names)
 said = {}
 for name, result in found.estimates.items():
     failed = isinstance(result, simtest.Failure)
     said[name] = [str(result.reason), result.detail] if failed else ["ok", result.normal.tolist(), list(result.flags)]
 refused = {}
-for name in ("other_missing", "other_constant", "nobody"):
+for name in ("other_missing", "other_constant", "nobody", "cone_axis", "nobody:cone_axis"):
     try:
         load_estimators([name])
     except simtest.InputError as error:
         refused[name] = str(error)
-print(json.dumps({"available": available(), "said": said, "refused": refused}))
+for name in ("nobody", "other_constant"):
+    try:
+        load_detector(name)
+    except simtest.InputError as error:
+        refused["detector " + name] = str(error)
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    load_estimators(["other_plain"])
+seen = Frame(frame, Calibration(camera))
+print(json.dumps({
+    "available": ESTIMATORS.names(), "detectors": DETECTORS.names(), "said": said, "refused": refused,
+    "distributions": ESTIMATORS.distributions(["other_axis", "Other-Core:cone_axis", "nobody"]),
+    "deprecated": [[warning.category.__name__, str(warning.message)] for warning in told],
+    "middle": list(load_detector("other_middle").detect(seen, camera, Priors()).regions[0].box),
+}))
 """
 
 
@@ -111,8 +155,12 @@ def answer(tmp_path_factory):
 
 
 def test_it_is_found_beside_those_of_simtest(answer):
-    assert {"other_axis", "other_raises", "circle_pose", "brightest_point", "cone_axis"} <= set(answer["available"])
+    assert {"other_axis", "other_raises", "circle_pose", "brightest_point"} <= set(answer["available"])
     assert answer["available"] == sorted(answer["available"])
+    assert {"other_middle", "peaks", "colour"} <= set(answer["detectors"])
+    assert answer["middle"] == [30, 22, 60, 45]
+    found = {"estimator other_axis": "other-core 3.1", "estimator Other-Core:cone_axis": "other-core 3.1"}
+    assert answer["distributions"] == found
 
 
 def test_it_runs_by_name_on_the_same_patch(answer):
@@ -135,10 +183,31 @@ def test_what_it_raises_or_gives_in_the_wrong_form_is_a_failure(answer):
     assert said["other_refuses"] == ["not_an_ellipse", "not today"]
 
 
+def test_a_name_of_two_packages_is_refused_unless_the_package_is_named(answer):
+    assert {"simtest:cone_axis", "other-core:cone_axis"} <= set(answer["available"])
+    assert "cone_axis" not in answer["available"]
+    refused = answer["refused"]["cone_axis"]
+    assert refused == (
+        "estimator 'cone_axis': registered by 2 packages; name one of them: other-core:cone_axis or simtest:cone_axis"
+    )
+    assert answer["said"]["simtest:cone_axis"][2] == []
+    assert answer["said"]["Other_Core:cone_axis"][2] == ["from outside"]
+
+
+def test_a_plain_function_is_told_to_be_of_the_old_form(answer):
+    ((category, message),) = answer["deprecated"]
+    assert category == "DeprecationWarning"
+    assert "'other_plain' is a plain callable" in message
+
+
 def test_a_broken_registration_is_refused_with_one_line(answer):
     refused = answer["refused"]
-    assert set(refused) == {"other_missing", "other_constant", "nobody"}
+    assert set(refused) == {"other_missing", "other_constant", "nobody", "cone_axis", "nobody:cone_axis",
+                            "detector nobody", "detector other_constant"}  # fmt: skip
     assert "cannot be imported" in refused["other_missing"]
     assert "not callable" in refused["other_constant"]
     assert "other_axis" in refused["nobody"]
+    assert "not installed" in refused["nobody:cone_axis"]
+    assert "peaks" in refused["detector nobody"]
+    assert "no object with a method detect" in refused["detector other_constant"]
     assert all("\n" not in message for message in refused.values())

@@ -2,17 +2,18 @@
 
 import json
 import shlex
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 import pytest
-from simtest.estimators.execution_guard import run
 
 import simtest
 from simtest.api import reconstruct_picture
 from simtest.calibration import NoiseModel
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
+from simtest.estimators.dispatch import run
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.rendering import HighlightPoint, Session
@@ -28,6 +29,14 @@ from simtest.validation.runner import run_experiment
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
 GOOD = {"normal": np.array([0, 0, -1.0]), "candidates": np.array([[0, 0, -1.0]]), "look_px": np.array([40.0, 30.0])}
+
+
+@dataclass(frozen=True)
+class Returns:
+    estimated: Estimate
+
+    def estimate(self, patch, camera, priors):
+        return self.estimated
 
 
 def patch():
@@ -55,13 +64,13 @@ def patch():
     ],
 )
 def test_a_malformed_estimate_is_a_failure(change):
-    result = run(lambda *_: Estimate(**{**GOOD, **change}), patch(), CAMERA)
+    result = run(Returns(Estimate(**{**GOOD, **change})), patch(), CAMERA)
     assert isinstance(result, Failure)
     assert result.reason in ("estimator_error", "not_finite")
 
 
 def test_a_good_estimate_passes():
-    assert isinstance(run(lambda *_: Estimate(**GOOD), patch(), CAMERA), Estimate)
+    assert isinstance(run(Returns(Estimate(**GOOD)), patch(), CAMERA), Estimate)
 
 
 def small_experiment(**more):

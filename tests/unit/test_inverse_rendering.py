@@ -1,21 +1,19 @@
 """The differentiated patch against the renderer and finite differences, and what is fitted with it."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-from simtest.estimators.execution_guard import run
-from simtest.inverse.patch import RenderedQuadric
 
-from simtest.calibration import Calibration, Priors
+from simtest.calibration import Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
 from simtest.geometry.vectors import angle_deg, tangent_basis
-from simtest.inverse import inverse_rendering
+from simtest.inverse import InverseRendering, inverse_rendering
 from simtest.inverse.patch_renderer import PatchRenderer
+from simtest.inverse.rendered_quadric import RenderedQuadric
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
@@ -25,7 +23,7 @@ from simtest.validation.metrics import curvature_errors, mahalanobis2
 pytestmark = pytest.mark.render
 
 D, N = 10.0, 50.0
-LOBE = Priors(lobe_curvature=4 * N)
+LOBE = Priors(lobe_curvature=exactly(4 * N))
 
 SURFACES = {
     "plane": {"type": "plane", "tilt_deg": 10.0, "azimuth_deg": 40.0},
@@ -60,8 +58,7 @@ def frame_of(radiance, sigma, seed=0):
 
 
 def answers(session, frame, priors=LOBE, **estimators):
-    named = {name: lambda p, c, e=e: run(e, p, c, priors) for name, e in estimators.items()}
-    (found,) = reconstruct(frame, Calibration(session.camera, priors=priors), named, isolated=False)
+    (found,) = reconstruct(frame, Calibration(session.camera, priors=priors), estimators, isolated=False)
     return found.estimates
 
 
@@ -153,7 +150,7 @@ def test_normal_and_curvatures_are_recovered(render, name):
 def test_it_is_the_maximum_likelihood_estimate_that_photometric_is(render):
     """On the frame of a quadric both find the same normal; the curvature is nearer than that of `curved`."""
     session, radiance, highlight = render(SURFACES["saddle"])
-    without_base = partial(inverse_rendering, base=False)
+    without_base = InverseRendering(base=False)
     ours, others, axes = [], [], []
     for seed in range(3):
         found = answers(
@@ -175,19 +172,20 @@ def test_a_known_light_beside_the_camera(render):
     more = {"rig": {"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]}}
     session, radiance, highlight = render(SURFACES["cylinder"], **more)
     lights = tuple(map(tuple, session.scene.rig.true_mm().tolist()))
-    priors = Priors(lights, highlight.distance, 0.0, 4 * N)
+    priors = Priors(lights, exactly(highlight.distance), exactly(4 * N))
     found = answers(session, frame_of(radiance, 0.02), priors, inverse=inverse_rendering)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 0.02
     assert curvature_errors(found, highlight).gain_error < 0.01
     unaware = answers(session, frame_of(radiance, 0.02), replace(priors, lights_mm=()), inverse=inverse_rendering)
     assert 2 < angle_deg(unaware["inverse"].normal, highlight.normal) < 4
-    vague = answers(session, frame_of(radiance, 0.02), replace(priors, distance_sd_mm=1.0), inverse=inverse_rendering)
+    about = replace(priors, distance_mm=Normal(highlight.distance, 1.0))
+    vague = answers(session, frame_of(radiance, 0.02), about, inverse=inverse_rendering)
     assert np.trace(vague["inverse"].covariance) > 100 * np.trace(found.covariance)
 
 
 def test_the_exponent_is_found_without_noise(render):
     session, radiance, highlight = render(SURFACES["saddle"])
-    opened = partial(inverse_rendering, base=False, exponent=True)
+    opened = InverseRendering(base=False, exponent=True)
     found = answers(session, frame_of(radiance, 0.0), Priors(), inverse=opened)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 1e-3
     gains = np.sort(np.abs(1 + np.array([highlight.kd_min, highlight.kd_max])))

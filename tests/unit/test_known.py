@@ -1,19 +1,18 @@
 """What is known beside the picture: its limits, its way to the estimators, and what they make of it."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-from simtest.estimators.execution_guard import run
 
-from simtest.calibration import Calibration, Priors
+from simtest.calibration import Calibration, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisect, bisector
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
+from simtest.estimators.dispatch import run
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
@@ -42,10 +41,10 @@ def lobe(sigma=0.0, widths=(14.0, 9.0), seed=0, smoothing=2.0):
     [
         ({"lights_mm": ((0.0, 1.0),)}, "lights_mm"),
         ({"lights_mm": ((0.0, 1.0, float("nan")),)}, "lights_mm"),
-        ({"distance_mm": -1.0}, "distance_mm = -1.0"),
-        ({"distance_mm": 5.0, "distance_sd_mm": -1.0}, "distance_sd_mm = -1.0"),
-        ({"distance_sd_mm": 1.0}, "needs distance_mm"),
-        ({"lobe_curvature": 0.0}, "lobe_curvature = 0.0"),
+        ({"distance_mm": exactly(-1.0)}, "distance_mm = -1.0"),
+        ({"distance_mm": Uniform(-1.0, 5.0)}, "distance_mm = -1.0"),
+        ({"distance_mm": 5.0}, r"must be a Uniform, Normal or LogUniform, or exactly\(5.0\)"),
+        ({"lobe_curvature": exactly(0.0)}, "lobe_curvature = 0.0"),
     ],
 )
 def test_what_is_known_is_checked(values, said):
@@ -53,25 +52,48 @@ def test_what_is_known_is_checked(values, said):
         Priors(**values)
 
 
-def test_estimators_that_ask_are_told_and_others_run_as_before():
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: Normal(5.0, -1.0), "Normal sd = -1.0"),
+        (lambda: Normal(float("nan"), 1.0), "Normal mean = nan"),
+        (lambda: Uniform(2.0, 2.0), "low must be less than high"),
+        (lambda: Uniform(0.0, float("inf")), "Uniform high = inf"),
+        (lambda: LogUniform(0.0, 2.0), "LogUniform low = 0.0"),
+    ],
+)
+def test_a_malformed_distribution_is_refused(made, said):
+    with pytest.raises(InputError, match=said):
+        made()
+
+
+@pytest.mark.parametrize("prior", [Uniform(2.0, 5.0), LogUniform(2.0, 50.0), Normal(3.0, 0.5), exactly(3.0)])
+def test_a_distribution_has_the_mean_and_deviation_of_its_draws(prior):
+    rng, share = np.random.default_rng(0), (np.arange(200_000) + 0.5) / 200_000
+    if isinstance(prior, Normal):
+        drawn = prior.mean + prior.sd * rng.standard_normal(200_000)
+    else:
+        low, high = np.array([prior.low, prior.high])
+        drawn = low * (high / low) ** share if isinstance(prior, LogUniform) else low + (high - low) * share
+    assert prior.mean == pytest.approx(drawn.mean(), rel=3e-3)
+    assert prior.sd == pytest.approx(drawn.std(), rel=1e-2)
+
+
+def test_estimators_are_told_what_is_known():
     told = []
 
-    def asks(patch, camera, priors):
-        told.append(priors)
-        return Failure(Reason.NO_PEAK)
+    class Listens:
+        def estimate(self, patch, camera, priors):
+            told.append(priors)
+            return Failure(Reason.NO_PEAK)
 
-    def does_not(patch, camera, other=3):
-        told.append(other)
-        return Failure(Reason.NO_PEAK)
-
-    priors = Priors(distance_mm=7.0)
-    for estimator in (asks, does_not, partial(does_not, other=4)):
-        run(estimator, lobe(), CAMERA, priors)
-    assert told == [priors, 3, 4]
-    reconstruct(np.zeros((160, 200), np.float32), CAMERA, {"asks": asks}, roi=(0, 0, 50, 50))
-    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"asks": asks}, roi=(60, 40, 80, 80))
-    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"asks": asks})
-    assert told[3:] == [priors, priors]
+    priors = Priors(distance_mm=exactly(7.0))
+    run(Listens(), lobe(), CAMERA, priors)
+    # A patch that is a Failure is not shown to it.
+    reconstruct(np.zeros((160, 200), np.float32), CAMERA, {"listens": Listens()}, roi=(0, 0, 50, 50))
+    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"listens": Listens()}, roi=(60, 40, 80, 80))
+    reconstruct(_frame(), Calibration(CAMERA, priors=priors), {"listens": Listens()})
+    assert told == [priors] * 3
 
 
 def _frame():
@@ -86,7 +108,9 @@ def test_a_calibration_file_says_it(tmp_path):
         "[rig]\nlights_mm = [[4.0, 0.0, 0.0], [-4.0, 0.0, 1.0]]\ndistance_mm = 40.0\ndistance_sd_mm = 8.0\n"
         "[surface]\nphong_exponent = 50.0\n"
     )
-    assert load_calibration(path).priors == Priors(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), 40.0, 8.0, 200.0)
+    assert load_calibration(path).priors == Priors(
+        ((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0)
+    )
     path.write_text(path.read_text().replace("distance_mm = 40.0", ""))
     with pytest.raises(InputError, match="distance_sd_mm"):
         load_calibration(path)
@@ -96,8 +120,8 @@ def test_a_scene_says_it():
     surface = {"type": "plane"}
     scene = scene_from_dict({"surface": surface, "known": {"distance_error": -0.2, "distance_sd": 0.1}})
     priors = scene.calibration(10.0).priors
-    assert (priors.distance_mm, priors.distance_sd_mm) == (pytest.approx(8.0), pytest.approx(0.8))
-    assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), 200.0)
+    assert (priors.distance_mm.mean, priors.distance_mm.sd) == (pytest.approx(8.0), pytest.approx(0.8))
+    assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
     assert silent.calibration(10.0).priors == Priors()
     with pytest.raises(InputError, match="exclude each other"):
@@ -105,11 +129,11 @@ def test_a_scene_says_it():
 
 
 def test_without_a_rig_or_a_distance_the_bisector_says_so():
-    for priors in (Priors(), Priors(distance_mm=5.0), Priors(((0.0, 0.0, 0.0),))):
-        result = bisector(lobe(), CAMERA, priors)
+    for priors in (Priors(), Priors(distance_mm=exactly(5.0)), Priors(((0.0, 0.0, 0.0),))):
+        result = bisector.estimate(lobe(), CAMERA, priors)
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
-    light_at_camera = bisector(lobe(), CAMERA, Priors(((0.0, 0.0, 0.0),), 10.0))
+    light_at_camera = bisector.estimate(lobe(), CAMERA, Priors(((0.0, 0.0, 0.0),), exactly(10.0)))
     axis = fit_isophote_family(lobe(), CAMERA, ISOVALUES).peak_axis
     np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
 
@@ -189,7 +213,8 @@ def test_gains_invert_the_stiffness(m):
 
 
 def test_curvature_with_and_without_a_known_lobe():
-    without, with_lobe = curved(lobe(), CAMERA), curved(lobe(), CAMERA, Priors(lobe_curvature=200.0))
+    without = curved.estimate(lobe(), CAMERA)
+    with_lobe = curved.estimate(lobe(), CAMERA, Priors(lobe_curvature=exactly(200.0)))
     assert isinstance(without, Estimate)
     assert isinstance(with_lobe, Estimate)
     assert without.curvature.hypotheses is None
@@ -204,23 +229,23 @@ def test_curvature_with_and_without_a_known_lobe():
 
 def test_a_streak_is_refused():
     narrow = lobe(widths=(30.0, 2.0), smoothing=0.5)
-    result = curved(narrow, CAMERA)
+    result = curved.estimate(narrow, CAMERA)
     assert isinstance(result, Failure)
     assert result.reason == Reason.STREAK
-    assert isinstance(curved(lobe(widths=(30.0, 6.0)), CAMERA), Estimate)
+    assert isinstance(curved.estimate(lobe(widths=(30.0, 6.0)), CAMERA), Estimate)
 
 
 def test_a_highlight_cut_by_the_border_is_flagged():
     patch = lobe()
     # The box begins at column 30: the peak is at 73 of the patch, the isophote at t = 0.3 reaches 22 px from it.
     part = Patch.cut(np.asarray(patch.values), (45, 0, 105, 120))
-    assert "partial_arc" not in cone_axis(part, CAMERA).flags
+    assert "partial_arc" not in cone_axis.estimate(part, CAMERA).flags
     cut = Patch.cut(np.asarray(patch.values), (55, 0, 95, 120))
-    assert {"missing_isovalues", "partial_arc"} <= set(cone_axis(cut, CAMERA).flags)
+    assert {"missing_isovalues", "partial_arc"} <= set(cone_axis.estimate(cut, CAMERA).flags)
 
 
 def test_a_choice_without_known_noise_has_no_margin():
-    estimate = circle_pose(lobe(), CAMERA)
+    estimate = circle_pose.estimate(lobe(), CAMERA)
     assert isinstance(estimate, Estimate)
     assert estimate.choice_margin is None
     assert "near_degenerate" in estimate.flags

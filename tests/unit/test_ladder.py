@@ -6,7 +6,7 @@ import pytest
 
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators import protocol as base
+from simtest.estimators import isophote_fit as base
 from simtest.geometry import Patch
 from simtest.nightly import ladder as nightly_ladder
 from simtest.nightly.ladder import ladder_figures

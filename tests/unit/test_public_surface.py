@@ -89,10 +89,13 @@ def test_reconstructing_loads_neither_renderer_nor_viewer():
 
 
 def test_estimators_that_are_registered():
-    from simtest.estimators.registry import GROUP, available
+    from simtest.detection.detector import DETECTORS
+    from simtest.estimators.registry import ESTIMATORS
     from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS
 
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert {"circle_pose", "brightest_point", "cone_axis"} <= set(project["entry-points"][GROUP])
-    assert set(project["entry-points"][GROUP]) <= set(available())
+    registered = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+    assert {"circle_pose", "brightest_point", "cone_axis"} <= set(registered[ESTIMATORS.group])
+    assert {"peaks", "colour"} <= set(registered[DETECTORS.group])
+    for group in (ESTIMATORS, DETECTORS):
+        assert set(registered[group.group]) <= set(group.names())
     assert DEFAULT_ESTIMATORS == ("circle_pose", "brightest_point", "cone_axis")

@@ -1,27 +1,35 @@
-"""Running an estimator on several highlights: its own way for all at once gives what it gives one by one."""
+"""Running an estimator: on one highlight, on several at once, on the whole frame."""
 
-from dataclasses import replace
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from simtest.errors import Failure, Reason
+from simtest.calibration import NO_PRIORS, Calibration, Frame
+from simtest.detection import Region
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimator, load_estimators
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.execution_guard import run, run_each
-from simtest.estimators.protocol import answers_each
+from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.geometry import Camera, Patch, smooth
+from simtest.reconstruction.pipeline import reconstruct, run_estimators
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
 SIGMA, SMOOTHING_PX = 0.02, 2.0
 CENTRES = ((50.3, 49.6), (151.2, 52.2), (252.7, 47.9))
 
 
-@pytest.fixture(scope="module")
-def patches():
+def picture():
     y, x = np.mgrid[:100, :400] + 0.5
     lobes = sum(np.exp(-((x - cx) ** 2 + (1 + k) * (y - cy) ** 2) / 400) for k, (cx, cy) in enumerate(CENTRES))
-    frame = (lobes + SIGMA * np.random.default_rng(0).standard_normal(lobes.shape)).astype(np.float32)
+    return (lobes + SIGMA * np.random.default_rng(0).standard_normal(lobes.shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def patches():
+    frame = picture()
     smoothed = smooth(frame, SMOOTHING_PX)
     made = [
         Patch.cut(smoothed, (left, 0, 100, 100), raw=frame, noise=SIGMA, smoothing_px=SMOOTHING_PX)
@@ -45,28 +53,157 @@ def test_circle_pose_gives_the_same_of_all_at_once(patches):
         )
 
 
-def faulty(how):
-    def each(patches, camera):
-        if how == "raises":
+# A batch --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Faulty:
+    """Estimates as brightest_point does; its batch has a fault."""
+
+    how: str
+
+    def estimate(self, patch, camera, priors):
+        if self.how == "raises alone too" and patch.origin_px[0] == 100:
+            raise KeyError("this one")
+        return brightest_point.estimate(patch, camera, priors)
+
+    def estimate_batch(self, patches, camera, priors):
+        if "raises" in self.how:
             raise ValueError("spoilt by one of them")
-        results = [patch if isinstance(patch, Failure) else brightest_point(patch, camera) for patch in patches]
-        if how == "loses one":
+        results = [brightest_point.estimate(patch, camera, priors) for patch in patches]
+        if self.how == "loses one":
             return results[1:]
         results[0] = replace(results[0], normal=np.array([np.nan, 0.0, -1.0]))
         return results
 
-    return answers_each(each)(lambda patch, camera: brightest_point(patch, camera))
 
-
-@pytest.mark.parametrize("how", ["raises", "loses one"])
-def test_each_patch_is_run_alone_where_all_at_once_fails(patches, how):
-    found = run_each(faulty(how), patches, CAMERA)
-    assert isinstance(found[1], Failure)
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [("raises", "ValueError: spoilt by one of them"), ("loses one", "ValueError: 2 results for 3 patches")],
+)
+def test_a_batch_that_fails_is_told_and_each_patch_is_run_alone(patches, how, why):
+    with pytest.warns(RuntimeWarning, match=f"Faulty.estimate_batch failed.*{why}"):
+        found = run_each(Faulty(how), patches, CAMERA)
+    assert found[1] is patches[1]
     for i in (0, 2, 3):
-        np.testing.assert_array_equal(found[i].normal, brightest_point(patches[i], CAMERA).normal)
+        np.testing.assert_array_equal(found[i].normal, brightest_point.estimate(patches[i], CAMERA).normal)
 
 
-def test_what_comes_of_all_at_once_is_checked(patches):
-    found = run_each(faulty("not finite"), patches, CAMERA)
+def test_where_a_patch_alone_raises_too_it_is_a_failure_with_its_text(patches):
+    with pytest.warns(RuntimeWarning, match="spoilt by one of them"):
+        found = run_each(Faulty("raises alone too"), patches, CAMERA)
+    assert (found[2].reason, found[2].detail) == (Reason.ESTIMATOR_ERROR, "KeyError: 'this one'")
+    assert isinstance(found[0], Estimate)
+    assert isinstance(found[3], Estimate)
+
+
+def test_what_comes_of_a_batch_is_checked(patches):
+    found = run_each(Faulty("not finite"), patches, CAMERA)
     assert found[0].reason == Reason.NOT_FINITE
     assert not isinstance(found[2], Failure)
+
+
+# The whole frame ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Looks from the whole frame at given pixels, or does something else."""
+
+    looks: tuple[tuple[float, float], ...] = ()
+    does: str = "estimates"
+
+    def estimate_frame(self, frame, camera, priors):
+        if self.does == "raises":
+            raise ZeroDivisionError("somewhere in the frame")
+        if self.does == "refuses":
+            return Failure(Reason.NOT_CONVERGED, "nowhere")
+        assert frame.smoothed.shape == frame.encoded.shape == (camera.height, camera.width)
+        assert isinstance(frame.noise, float)
+        normals = [-camera.unproject(look) for look in self.looks]
+        if self.does == "is crooked":
+            normals[0] = 2 * normals[0]
+        return [
+            Estimate(normal, normal[None], np.array(look)) for normal, look in zip(normals, self.looks, strict=True)
+        ]
+
+
+def in_frame(estimator, patches):
+    return run_in_frame(estimator, Frame(picture(), Calibration(CAMERA), SMOOTHING_PX), patches)
+
+
+def test_estimates_of_a_frame_go_to_the_patches_that_they_look_into(patches):
+    # Two near the first peak, the nearer one second; one by the third; one where no patch is.
+    looks = ((55.0, 50.0), (51.0, 50.0), (253.0, 48.0), (390.0, 50.0))
+    found = in_frame(Peaks(looks), patches)
+    first, none, second, third = found.of_patches
+    assert first.look_px.tolist() == [51.0, 50.0]
+    assert none is patches[1]
+    assert second == Failure(Reason.NO_ESTIMATE, "the estimator has none in this region")
+    assert third.look_px.tolist() == [253.0, 48.0]
+    assert [estimate.look_px.tolist() for estimate in found.elsewhere] == [[55.0, 50.0], [390.0, 50.0]]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "reason", "said"),
+    [
+        (Peaks(does="raises"), Reason.ESTIMATOR_ERROR, "ZeroDivisionError: somewhere in the frame"),
+        (Peaks(does="refuses"), Reason.NOT_CONVERGED, "nowhere"),
+        (Peaks(CENTRES, "is crooked"), Reason.ESTIMATOR_ERROR, "estimate 0: normal or candidate of length 2"),
+        (Peaks(((500.0, 50.0),)), Reason.ESTIMATOR_ERROR, "estimate 0: look_px = [500.0, 50.0]: must lie in the frame"),
+    ],
+)
+def test_a_frame_that_fails_is_the_failure_of_every_patch(patches, estimator, reason, said):
+    found = in_frame(estimator, patches)
+    assert found.of_patches[1] is patches[1]
+    for i in (0, 2, 3):
+        assert found.of_patches[i].reason == reason
+        assert said in found.of_patches[i].detail
+    assert found.elsewhere == []
+
+
+def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():
+    estimators = {"brightest_point": brightest_point, "frame": Peaks((*CENTRES, (390.0, 50.0)))}
+    made = reconstruct(picture(), CAMERA, estimators)
+    assert len(made) == 4
+    for spot in made[:3]:
+        assert spot.region.contrast > 0
+        assert list(spot.estimates) == ["brightest_point", "frame"]
+        assert np.hypot(*(spot.estimates["frame"].look_px - spot.patch.peak_px)) < 2
+    alone = made[3]
+    assert (alone.region, list(alone.estimates)) == (Region((390, 50, 1, 1), (390, 50), None), ["frame"])
+    assert isinstance(alone.patch, Failure)
+    assert isinstance(alone.estimates["frame"], Estimate)
+
+
+def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
+    frame = Frame(picture(), Calibration(CAMERA), SMOOTHING_PX)
+    (spot,) = run_estimators([], {"frame": Peaks(((10.0, 90.0),))}, frame)
+    assert list(spot.estimates) == ["frame"]
+
+
+# What counts as an estimator ------------------------------------------------------------------------------------------
+
+
+def test_the_protocols_tell_the_kinds_apart():
+    assert isinstance(circle_pose, BatchEstimator)
+    assert isinstance(brightest_point, Estimator)
+    assert not isinstance(brightest_point, BatchEstimator)
+    assert isinstance(Peaks(), FrameEstimator)
+    assert not isinstance(Peaks(), Estimator)
+
+
+def test_a_plain_callable_is_accepted_for_one_release(patches):
+    with pytest.warns(DeprecationWarning, match="'old' is a plain callable"):
+        made = load_estimators({"old": lambda patch, camera: brightest_point.estimate(patch, camera)})
+    found = run(made["old"], patches[0], CAMERA)
+    np.testing.assert_array_equal(found.normal, brightest_point.estimate(patches[0], CAMERA, NO_PRIORS).normal)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_estimators({"new": brightest_point}) == {"new": brightest_point}
+
+
+@pytest.mark.parametrize(("given", "said"), [(3, "not callable"), (Peaks, "is a class"), ("peaks", "not callable")])
+def test_what_is_no_estimator_is_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        load_estimators({"given": given})

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Priors
+from simtest.calibration import Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
@@ -51,10 +51,10 @@ def view():
         truth = min(session.highlights(radiance), key=lambda h: np.linalg.norm(h.position - [0, 0, distance]))
         peak = radiance.total[int(truth.bp_px[1]), int(truth.bp_px[0])]
         frame = radiance.total / peak + sigma * from_integer(seed).standard_normal(radiance.total.shape)
-        priors = Priors(lobe_curvature=LOBE)
+        priors = Priors(lobe_curvature=exactly(LOBE))
         found = reconstruct(
-            np.minimum(frame, 1.5).astype(np.float32), Calibration(session.camera),
-            {"curved": lambda p, c: curved(p, c, priors), "cone_axis": cone_axis}, isolated=False,
+            np.minimum(frame, 1.5).astype(np.float32), Calibration(session.camera, priors=priors),
+            {"curved": curved, "cone_axis": cone_axis}, isolated=False,
         )  # fmt: skip
         answered = [s for s in found if not isinstance(s.estimates["curved"], Failure)]
         own = min(answered, key=lambda s: np.linalg.norm(s.patch.peak_px - truth.bp_px))
@@ -73,7 +73,7 @@ def test_rendered_pairs_tell_the_signs(view, name):
     for azimuth, seed in ((35.0, 2), (250.0, 3)):
         second, model_from_second, _ = view(kd, tilt, azimuth, 0.02, seed)
         motion = np.linalg.inv(model_from_second) @ model_from_first
-        priors = Priors(distance_mm=truth.distance, distance_sd_mm=0.05 * truth.distance)
+        priors = Priors(distance_mm=Normal(truth.distance, 0.05 * truth.distance))
         ranked = rank_by_motion(first["curved"], second["cone_axis"], motion, priors)
         # Along the directions of the smaller and the larger abs(1 + d k).
         order = np.argsort(np.abs(1 + np.array(kd)))
@@ -87,7 +87,9 @@ def test_rendered_pairs_tell_the_signs(view, name):
 def test_without_motion_nothing_is_told(view):
     first, _, truth = view(SHAPES["saddle"], 0.0, 0.0, 0.02, 1)
     second, _, _ = view(SHAPES["saddle"], 0.0, 0.0, 0.02, 2)
-    ranked = rank_by_motion(first["curved"], second["cone_axis"], np.eye(4), Priors(distance_mm=truth.distance))
+    ranked = rank_by_motion(
+        first["curved"], second["cone_axis"], np.eye(4), Priors(distance_mm=exactly(truth.distance))
+    )
     assert not ranked.is_clear
 
 
@@ -114,7 +116,7 @@ def test_small_motions_on_spheres_are_predicted_exactly(kd):
     # Within the centre's distance the camera lies between the highlight and the centre.
     normal = towards / np.linalg.norm(towards) * np.sign(kd * (1 + kd))
     second = Estimate(normal, normal[None], np.zeros(2))
-    ranked = rank_by_motion(first, second, T, Priors(distance_mm=D))
+    ranked = rank_by_motion(first, second, T, Priors(distance_mm=exactly(D)))
     np.testing.assert_allclose(ranked.hypotheses[0], 1 + kd)
     np.testing.assert_allclose(ranked.predicted[0], normal, atol=3e-6)
     assert ranked.distance2[0] < 1e-2
@@ -125,7 +127,7 @@ def test_a_motion_along_one_principal_direction_tells_that_sign_only():
     T = np.eye(4)
     T[0, 3] = -0.5
     normal = np.array([0.5, 0, -30.0]) / np.hypot(0.5, 30.0)
-    ranked = rank_by_motion(first, Estimate(normal, normal[None], np.zeros(2)), T, Priors(distance_mm=D))
+    ranked = rank_by_motion(first, Estimate(normal, normal[None], np.zeros(2)), T, Priors(distance_mm=exactly(D)))
     assert (ranked.hypotheses[:2, 0] == 1.5).all()
     assert sorted(np.sign(ranked.hypotheses[:2, 1])) == [-1, 1]
     assert ranked.distance2[2] - ranked.distance2[1] > 9
@@ -135,10 +137,10 @@ def test_a_motion_along_one_principal_direction_tells_that_sign_only():
 def test_what_is_missing_or_malformed_is_said():
     bare = Estimate(np.array([0.0, 0, -1]), np.array([[0.0, 0, -1]]), np.zeros(2))
     full = sphere_estimate(0.5, bare.normal)
-    for first, priors in ((bare, Priors(distance_mm=D)), (full, Priors())):
+    for first, priors in ((bare, Priors(distance_mm=exactly(D))), (full, Priors())):
         result = rank_by_motion(first, bare, np.eye(4), priors)
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
     for motion in (np.eye(3), np.diag([1.0, 1, 2, 1]), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan)):
         with pytest.raises(InputError, match="second_from_first"):
-            rank_by_motion(full, bare, motion, Priors(distance_mm=D))
+            rank_by_motion(full, bare, motion, Priors(distance_mm=exactly(D)))

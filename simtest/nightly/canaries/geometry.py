@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
-from simtest.geometry import Camera, Patch, backproject_conic, circle_pose, cone_axes, ellipse_of_conic, fit_ellipse
+from simtest.geometry import Camera, Patch, circle_pose, cone_axes, cone_of_conic, ellipse_of_conic, fit_ellipse
 from simtest.nightly.canaries.record import Canary
 
 Array = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def pose() -> list[Canary]:
     fitted = fit_ellipse(np.stack([FX * x / z + CX, FY * y / z + CY], axis=1))
     off, outside = np.nan, np.nan
     if not isinstance(fitted, Failure):
-        cone = backproject_conic(fitted, camera)
+        cone = cone_of_conic(fitted, camera.K)
         found = circle_pose(cone)
         if not isinstance(found, Failure):
             off = min(_angle_deg(candidate, normal) for candidate in found.normals)

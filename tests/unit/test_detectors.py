@@ -1,0 +1,108 @@
+"""The built-in detectors find what the pipelines find, and hand on the frame that patches are cut from."""
+
+import numpy as np
+import pytest
+
+from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Response, srgb_encode
+from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
+from simtest.detection.colour import ColourDetector, colour
+from simtest.detection.peaks import PeakDetector, peaks
+from simtest.errors import InputError
+from simtest.geometry import Camera, Patch, ViewMask
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.reconstruction.colour_pipeline import reconstruct_colour
+from simtest.reconstruction.pipeline import reconstruct
+
+CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
+CALIBRATIONS = {
+    "camera alone": Calibration(CAMERA),
+    "falloff, noise and clipping": Calibration(
+        CAMERA, Response("gamma", 2.2), AngularProfile(3.0), noise=NoiseModel(full_well=8000.0, bits=8),
+        saturation_level=0.9,
+    ),
+    "view mask": Calibration(Camera(200, 160, 200.0, 200.0, 100.0, 80.0, view_mask=ViewMask(100, 80, 70))),
+}  # fmt: skip
+
+
+def lobes(seed=0):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:160, :200] + 0.5
+    values = 0.01 * rng.standard_normal(x.shape)
+    for cx, cy, a, b in ((60.2, 70.7, 8, 10), (140.9, 80.1, 6, 9), (102.0, 120.0, 5, 5), (4.0, 20.0, 9, 9)):
+        values = values + 0.9 * np.exp(-(((x - cx) / a) ** 2) - ((y - cy) / b) ** 2)
+    return np.clip(values, 0, 1).astype(np.float32)
+
+
+def tissue():
+    """Reddish tissue with grey highlights, as encoded."""
+    y, x = np.mgrid[:160, :200] + 0.5
+    shade = 0.25 + 0.05 * np.sin(x / 40) * np.cos(y / 30)
+    spots = sum(0.6 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / s**2) for cx, cy, s in ((60, 60, 6), (140, 100, 5)))
+    linear = shade[..., None] * [1.0, 0.45, 0.35] + spots[..., None]
+    return srgb_encode(np.clip(linear, 0, 1)).astype(np.float32)
+
+
+def same_patches(detection, made):
+    for region, spot in zip(detection.regions, made, strict=True):
+        assert region == spot.region
+        cut = detection.frame.patch(region.box, region.peak)
+        for field in ("values", "raw", "saturated", "seen", "noise", "peak_px"):
+            np.testing.assert_array_equal(getattr(cut, field), getattr(spot.patch, field))
+        assert (cut.peak_value, cut.peak_pixel, cut.smoothing_px) == (
+            spot.patch.peak_value, spot.patch.peak_pixel, spot.patch.smoothing_px,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(CALIBRATIONS))
+@pytest.mark.parametrize("isolated", [True, False])
+@pytest.mark.parametrize("smoothing_px", [0.0, 2.0])
+def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
+    calibration = CALIBRATIONS[name]
+    frame = Frame(lobes(), calibration, smoothing_px)
+    found = PeakDetector(isolated).detect(frame, calibration.camera)
+    assert found.frame is frame
+    made = reconstruct(lobes(), calibration, {}, smoothing_px=smoothing_px, isolated=isolated)
+    assert len(made) >= 2
+    same_patches(found, made)
+
+
+@pytest.mark.parametrize("isolated", [True, False])
+@pytest.mark.parametrize("name", ["camera alone", "view mask"])
+def test_colour_is_that_of_the_pipeline(name, isolated):
+    calibration = CALIBRATIONS[name]
+    found = ColourDetector(isolated).detect(Frame(tissue(), calibration, 1.0), calibration.camera)
+    made = reconstruct_colour(tissue(), calibration, {}, isolated=isolated)
+    assert len(made.specularities) == 2
+    same_patches(found, made.specularities)
+    assert [h.kind for h in found.highlights] == [h.kind for h in made.highlights]
+    np.testing.assert_array_equal(found.colour.mask, made.found.detection.mask)
+
+
+def test_the_same_box_gives_the_same_patch_again():
+    frame = Frame(lobes(), Calibration(CAMERA))
+    (first, *_) = peaks.detect(frame, CAMERA, NO_PRIORS).regions
+    patch = frame.patch(first.box, first.peak)
+    assert isinstance(patch, Patch)
+    assert frame.patch(first.box, first.peak) is patch
+
+
+def test_detectors_are_found_by_name_or_given():
+    assert isinstance(peaks, Detector)
+    assert load_detector("peaks") is peaks
+    assert load_detector("simtest:colour") is colour
+    own = PeakDetector(isolated=False)
+    assert load_detector(own) is own
+    for given in (3, PeakDetector, lambda frame, camera, priors: None):
+        with pytest.raises(InputError, match="no object with a method detect"):
+            load_detector(given)
+
+
+def test_a_region_that_was_given_has_no_contrast_and_still_a_shape():
+    frame = Frame(lobes(), Calibration(CAMERA))
+    detected = peaks.detect(frame, CAMERA).regions[0]
+    given = Region(detected.box, detected.peak, None)
+    patch = frame.patch(given.box, given.peak)
+    assert peak_shape(patch, given, frame.noise).residual == peak_shape(patch, detected, frame.noise).residual
+    (spot,) = reconstruct(lobes(), CAMERA, {}, roi=detected.box)
+    assert spot.region.contrast is None
+    assert isinstance(Detection((given,), frame).regions[0], Region)
