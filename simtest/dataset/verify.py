@@ -119,7 +119,7 @@ def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
         yield Fault(path.name, "differs from its SHA-256 in the manifest")
 
 
-def repair(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
+def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
     """Make broken files anew, remove files that do not belong, and verify once more; return what is still broken.
 
     `faults` are those of `verify`; `engine` runs the tasks; `progress` is called with samples done, samples in all, and

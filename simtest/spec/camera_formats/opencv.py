@@ -192,10 +192,10 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
 
 def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
     """Refuse a file that mentions a lens but has no coefficients under a known name."""
-    mentioned = [key for key in data if key.lower().startswith("dist") and (key != "distortion_model" or data[key])]
-    if mentioned:
+    key = next((k for k in data if k.lower().startswith("dist") and (k != "distortion_model" or data[k])), None)
+    if key is not None:
         raise InputError(
-            f"{where}: {mentioned[0]} = {shown(repr(data[mentioned[0]]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"{where}: {key} = {shown(repr(data[key]), 60)}: speaks of a lens whose coefficients are missing; "
             f"allowed names: {', '.join(LENS_NAMES)}"
         )
 
