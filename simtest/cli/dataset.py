@@ -67,7 +67,7 @@ def verify(
     """Check a dataset's files and values; exit 1 if anything is broken, and name it."""
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
-    from simtest.dataset.verify import mend
+    from simtest.dataset.verify import repair_files
     from simtest.dataset.verify import verify as check
     from simtest.runtime.engines import make_engine
 
@@ -76,7 +76,9 @@ def verify(
         for fault in faults:
             print(fault)
         if faults and repair:
-            left = mend(folder, faults, make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS), progress)
+            left = repair_files(
+                folder, faults, make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS), progress
+            )
             print(*(f"still broken: {fault}" for fault in left), sep="\n", end="\n" * bool(left))
             print("mended" if not left else f"left: {len(left)}")
             return 1 if left else 0

@@ -1,6 +1,7 @@
 """`simtest mesh`: check a user's mesh, or make one from a recipe."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,14 +11,22 @@ from simtest.cli.options import replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
-Settings = Annotated[list[str] | None, replacing("length_mm=40")]
-Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)]
-Edge = Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")]
-File = Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
-Recipe = Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")]
-Curvature = Annotated[
-    bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
-]
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class MeshOptions:
+    """What `simtest mesh colon` and `liver` take."""
+
+    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
+    seed: Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)] = (
+        None
+    )
+    edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
+    recipe: Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")] = None
+    settings: Annotated[list[str] | None, replacing("length_mm=40")] = None
+    curvature: Annotated[
+        bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
+    ] = False
 
 
 @mesh.command
@@ -65,51 +74,29 @@ def check(
 
 
 @mesh.command
-def colon(
-    *,
-    out: File,
-    seed: Seed = None,
-    edge_mm: Edge = None,
-    recipe: Recipe = None,
-    settings: Settings = None,
-    curvature: Curvature = False,
-) -> None:
+def colon(*, options: MeshOptions) -> None:
     """Make a colon from its recipe: another one for each seed, the same bytes for the same."""
-    _make("colon", out, seed, edge_mm, recipe, settings, curvature)
+    _make("colon", options)
 
 
 @mesh.command
-def liver(
-    *,
-    out: File,
-    seed: Seed = None,
-    edge_mm: Edge = None,
-    recipe: Recipe = None,
-    settings: Settings = None,
-    curvature: Curvature = False,
-) -> None:
+def liver(*, options: MeshOptions) -> None:
     """Make a liver from its recipe: another one for each seed, the same bytes for the same."""
-    _make("liver", out, seed, edge_mm, recipe, settings, curvature)
+    _make("liver", options)
 
 
-def _make(
-    kind: str,
-    out: Path,
-    seed: int | None,
-    edge_mm: float | None,
-    recipe: Path | None,
-    settings: list[str] | None,
-    curvature: bool,
-) -> None:
+def _make(kind: str, options: MeshOptions) -> None:
     from simtest.errors import InputError
     from simtest.spec import parse_settings
     from simtest.surfaces.factory import make_mesh
     from simtest.surfaces.mesh_file import check_target, write_mesh
     from simtest.surfaces.recipe import load_anatomy
 
+    out = options.out
     check_target(out)
-    if curvature and out.suffix.lower() != ".ply":
+    if options.curvature and out.suffix.lower() != ".ply":
         raise InputError(f"--curvature: {out.suffix} files hold none; allowed: .ply")
-    made, k_min, k_max = make_mesh(load_anatomy(kind, recipe, seed, parse_settings(settings or [])), edge_mm)
-    write_mesh(out, made, {"k_min": k_min, "k_max": k_max} if curvature else None)
+    recipe = load_anatomy(kind, options.recipe, options.seed, parse_settings(options.settings or []))
+    made, k_min, k_max = make_mesh(recipe, options.edge_mm)
+    write_mesh(out, made, {"k_min": k_min, "k_max": k_max} if options.curvature else None)
     print(f"{out}: {len(made.vertices)} vertices, {len(made.faces)} faces")

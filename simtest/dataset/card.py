@@ -25,6 +25,7 @@ def write_card(plan: Plan, manifest: Manifest, folder: Path) -> None:
 def make_card(plan: Plan, manifest: Manifest) -> str:
     """Return the card's text, which depends on the dataset alone."""
     dataset = plan.dataset
+    # samples and shards of each split
     counts: dict[str, list[int]] = {name: [0, 0] for name in dataset.splits.shares}
     for shard in plan.shards:
         counts[shard.split][0] += len(shard.indices)

@@ -146,6 +146,7 @@ ROWS_AT_ONCE = 64
 
 
 def _decode_normal(data: bytes, _: SampleMeta) -> AnyArray:
+    # u stands above v
     counts = decode(data)
     height = len(counts) // 2
     counts = counts.reshape(2, height, -1)
@@ -164,6 +165,7 @@ def _decode_normal(data: bytes, _: SampleMeta) -> AnyArray:
 
 
 def _encode_curvature(curvature: AnyArray) -> bytes:
+    # k_min above k_max
     both = np.concatenate([curvature[..., 0], curvature[..., 1]], axis=0, dtype=np.float32)
     both *= 1 / CURVATURE_SCALE
     both += OFFSET + 0.5
@@ -193,6 +195,7 @@ def _decode_picture(data: bytes, _: SampleMeta) -> AnyArray:
 
 
 def _encode_half(radiance: AnyArray) -> bytes:
+    # Half precision ends at 65504; beyond it is infinity, which a picture must not hold.
     file = BytesIO()
     largest = float(np.finfo(np.float16).max)
     np.save(file, np.clip(radiance, 0, largest).astype(np.float16), allow_pickle=False)

@@ -50,7 +50,7 @@ class Maker:
         drawn, attempt, seen, frame = self._choose(index)
         session = self._at(drawn)
         scene, anatomy = drawn.scene, drawn.anatomy
-        # What the frame shows, to a camera that knows its calibration and nothing of the truth.
+        # What the frame shows to a camera that knows its calibration and nothing of the truth.
         picture = seen.frame(scene.sensor.seed)
         specularities = reconstruct(picture, seen.calibration, self._estimators) if seen.full_scale > 0 else []
         images = self._images(drawn, seen, frame, picture)
@@ -92,6 +92,7 @@ class Maker:
         return drawn, attempt, render_view(session, drawn.scene, frame.radiance), frame
 
     def _shows_enough(self, drawn: Drawn) -> bool:
+        # A cheap look, since an attempt may be rejected: one ray per pixel and direct light.
         quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
         scene = drawn.scene.model_copy(update={"render": quick})
         seen = render_view(self._at(replace(drawn, scene=scene)), scene)
@@ -190,6 +191,7 @@ def _detection(specularity: Specularity) -> DetectionMeta:
     if isinstance(specularity.patch, Failure):
         return found
     found["peak_px"] = specularity.patch.peak_px.tolist()
+    # The ellipse is missing if the isophote is open or no ellipse.
     contour = specularity.patch.isophote(HIGHLIGHT_ISOVALUE)
     fitted = contour if isinstance(contour, Failure) else fit_ellipse(contour)
     if not isinstance(fitted, Failure):

@@ -98,6 +98,7 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
 
 def read_manifest(folder: Path) -> Manifest:
     """Read a folder's manifest; raise `ManifestError` if it is missing, is no manifest, or was changed by hand."""
+    # a JSON object ...
     path = folder / NAME
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -109,6 +110,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise ManifestError(f"{NAME}: cannot be read ({error.strerror})") from None
     except ValueError:
         raise ManifestError(f"{NAME}: is no JSON") from None
+    # ... of this form, that nobody has changed
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ManifestError(f"{NAME}: is no manifest of the form {FORMAT!r}")
     if content.pop("digest", None) != _digest(content):

@@ -123,6 +123,7 @@ class Plan:
     def _check(self, number: int, family: Family) -> None:
         """Raise `InputError` if a scene would be malformed at an end of any range, alone or all together."""
         where = f"families.{number}"
+        # The scene itself, without any drawn value
         drawn = {**family.per_anatomy, **family.per_sample, **self.dataset.per_sample}
         scene = scene_from_dict(self._bases[number], where)
         if family.seeds is not None and not isinstance(scene.surface, AnatomySurface):
@@ -153,6 +154,7 @@ class Plan:
                 continue
             file, seeds = surface.file(), None
             if file.suffix == ".toml" and family.seeds is not None:
+                # A recipe makes another anatomy of each seed; a mesh is the same one always.
                 seeds = range(family.seeds.low, family.seeds.high + 1)
             elif file.suffix == ".toml" and surface.seed is not None:
                 seeds = range(surface.seed, surface.seed + 1)
@@ -197,6 +199,7 @@ class Plan:
 
     def _assign(self) -> dict[Anatomy, str]:
         """Return the split of each anatomy: each in turn goes to the split that lacks most samples."""
+        # samples of each anatomy
         sizes: dict[Anatomy, int] = {}
         for block, anatomy in enumerate(self._blocks):
             sizes[anatomy] = sizes.get(anatomy, 0) + len(self._block_indices(block))

@@ -50,6 +50,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     shard_names(folder)
     manifest = open_manifest(folder)
     index, highlights = (pl.read_parquet(folder / name) for name in (SAMPLES, HIGHLIGHTS))
+    # samples, evenly over the dataset, and the shards that hold them
     wanted = set(index["index"].gather_every(max(1, index.height // count)).head(count).to_list())
     names = index.filter(pl.col("index").is_in(list(wanted)))["shard"].unique().to_list()
     shown = (sample for sample in read_samples(folder, shards=sorted(names)) if sample.index in wanted)
@@ -123,6 +124,7 @@ def _normal_colours(normal: AnyArray) -> AnyArray:
 
 def _depth_colours(depth: AnyArray) -> AnyArray:
     low, high = np.nanpercentile(depth, (1, 99))
+    # Percentiles, so that a few far pixels do not use up the scale
     share = 1 - np.clip((np.nan_to_num(depth, nan=high) - low) / max(high - low, 1e-9), 0, 1)
     return np.asarray(cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)[:, :, ::-1])
 

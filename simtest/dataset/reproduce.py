@@ -37,6 +37,7 @@ def compare(folder: Path, index: int, out: Path) -> str:
     shard, key = open_manifest(folder).plan().shard_of(index), sample_key(index)
     try:
         with (folder / shard.name).open("rb") as file:
+            # Only the metadata are read until the sample is found.
             stored = next((sample for sample in samples(file, check=False) if sample.key == key), None)
             if stored is None:
                 return f"{shard.name} holds no sample {key}"

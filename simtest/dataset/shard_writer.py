@@ -114,7 +114,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         left.unlink(missing_ok=True)
 
 
-def repair(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:
+def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:
     """Make named files of a dataset anew: shards, tables or card."""
     plan = manifest.plan()
     with _one_line_errors(folder):
@@ -142,6 +142,7 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
     """Return the manifest of a folder that is empty, or holds the same dataset."""
     make_folder(folder)
     wanted = new_manifest(plan, variant)
+    # A folder without a manifest must be empty, but for parts of a run that never finished a shard.
     try:
         there = read_manifest(folder)
     except ManifestError as error:
@@ -156,6 +157,7 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
         wanted.save(folder)
         return wanted
     check_same(folder, there, wanted)
+    # Shards that were removed are made anew.
     for name in [name for name in there.shards if not (folder / name).exists()]:
         del there.shards[name]
     return there
@@ -180,10 +182,12 @@ def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
 def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> FileEntry:
     path = folder / shard.name
     part = folder / (shard.name + PART)
+    # finished, but not in the manifest: the run was killed in between
     if path.exists() and _is_whole(path, shard):
         for _ in shard.indices:
             on_step()
         return file_entry(path)
+    # begun, or not yet
     with locked(part) as file:
         count = _keep_whole(file, shard)
         for _ in range(count):

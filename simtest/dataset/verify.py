@@ -24,7 +24,7 @@ from simtest.dataset.metadata import SampleMeta
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample, decode, sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
-from simtest.dataset.shard_writer import PART, repair
+from simtest.dataset.shard_writer import PART, remake
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime import provenance
@@ -69,6 +69,7 @@ def verify(folder: Path, progress: Progress | None = None) -> list[Fault]:
         return [Fault(NAME, said.removeprefix(f"{NAME}: "))]
     faults = list(_files(folder, manifest, plan))
     damaged = {fault.file for fault in faults}
+    # content of shards
     done = 0
     for shard in plan.shards:
         if shard.name not in damaged and shard.name in manifest.shards:
@@ -118,7 +119,7 @@ def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
         yield Fault(path.name, "differs from its SHA-256 in the manifest")
 
 
-def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
+def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Progress | None = None) -> list[Fault]:
     """Make broken files anew, remove files that do not belong, and verify once more; return what is still broken.
 
     `faults` are those of `verify`; `engine` runs the tasks; `progress` is called with samples done, samples in all, and
@@ -139,7 +140,7 @@ def mend(folder: Path, faults: list[Fault], engine: Engine, progress: Progress |
     foreign = [folder / fault.file for fault in faults if fault.file not in known]
     for path in (path for path in foreign if path.is_symlink() or not path.is_dir()):
         path.unlink(missing_ok=True)
-    repair(folder, manifest, [fault.file for fault in faults if fault.file in known], engine, progress)
+    remake(folder, manifest, [fault.file for fault in faults if fault.file in known], engine, progress)
     return verify(folder, progress)
 
 
@@ -228,6 +229,7 @@ def _surface(sample: Sample, camera: Camera) -> Iterator[str]:
 
 def _angle_to_depth(points: AnyArray, normal: AnyArray) -> float:
     """Return the median angle, deg, between normals and those of the differences between neighbouring points."""
+    # Central differences along rows and columns span the surface.
     along_x = points[1:-1, 2:] - points[1:-1, :-2]
     along_y = points[2:, 1:-1] - points[:-2, 1:-1]
     own = np.cross(along_y, along_x)
@@ -253,6 +255,7 @@ def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> 
         except (pl.exceptions.PolarsError, OSError) as error:
             yield Fault(name, f"cannot be read ({str(error).splitlines()[0]})")
             continue
+        # Columns in common, if other code has written the tables
         columns = table.columns if same_code else [name for name in there.columns if name in table.columns]
         if (same_code and there.columns != columns) or not there.select(columns).equals(table.select(columns)):
             yield Fault(name, "differs from what the shards say")

@@ -48,6 +48,7 @@ def memory_of_tree_mib(pid: int) -> float | None:
         sizes = [proportional_size(member) for member in (process, *process.children(recursive=True))]
     except psutil.Error:
         return None
+    # A process that ended between the two calls counts for nothing.
     known = [size for size in sizes if size is not None]
     return sum(known) / 2**20 if known else None
 

@@ -21,6 +21,7 @@ def data_root(kind: str) -> Path:
 
 def shown(text: object, limit: int = 300) -> str:
     """Return a user's text fit for a message: on one line, of at most `limit` characters."""
+    # A line break in a user's text would make two lines of the message.
     line = str(text)
     if not line or not line.isprintable():
         line = repr(line)
@@ -52,6 +53,7 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
         raise InputError(f"{shown(name)}: cannot be read ({error.strerror})") from error
     except RuntimeError as error:
         raise InputError(f"{shown(name)}: no such home folder") from error
+    # a shipped file, by its bare name
     root = data_root(kind) / folder
     if path.name == str(name):
         for suffix in suffixes:

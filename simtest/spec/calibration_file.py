@@ -97,13 +97,16 @@ def load_calibration(path: str | Path) -> Calibration:
         If the file is missing or malformed.
     """
     path = Path(path)
+    # camera
     camera = load_camera(path)
+    # everything else, which only TOML holds
     data = read_toml(path) if is_toml(path) else {}
     if not isinstance(data.get("camera"), Mapping):
         # The camera's keys stand at top level, before the other tables.
         data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
     # The camera's own table has been read, by its own rules.
     spec = validate(CalibrationSpec, {**data, "camera": {}}, str(path))
+    # A response that is not stated counts as linear in the noise model, but stays unknown in the calibration.
     response = spec.response.model() if spec.response is not None else None
     sensor = spec.sensor
     noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())

@@ -93,11 +93,12 @@ class CameraSpec(Spec):
 
     @model_validator(mode="after")
     def _possible(self) -> "CameraSpec":
+        # The lens must not fold over inside the image, which only the geometry package can say.
         if self.distortion is not None or self.view_mask is not None:
             try:
                 self.model()
             except InputError as error:
-                # The key's path is put before it.
+                # The path of the key is put before the message.
                 raise ValueError(str(error).removeprefix("camera.")) from None
         return self
 
@@ -194,8 +195,10 @@ def load_camera(path: str | Path) -> Camera:
         from simtest.spec.camera_formats.matlab import read_matlab
 
         return _validated(read_matlab(path), path)
+    # The camera's keys under [camera], or at top level beside the other tables of a calibration file
     data = {key: value for key, value in read_toml(path).items() if key not in NOT_OF_THE_CAMERA}
     table = data.get("camera", data)
+    # A scene's camera has a default size and focal length; a file of its own must state them.
     missing = [key for key in ("width", "height", "fx", "fy") if not isinstance(table, Mapping) or key not in table]
     if missing:
         raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, fx, fy")
@@ -235,6 +238,7 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     path = Path(path)
     if not isinstance(camera, Camera):
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
+    # Imported on demand, as in `load_camera`.
     from simtest.runtime.files import write_atomically
     from simtest.spec.camera_formats.opencv import opencv_text, ros_text
 

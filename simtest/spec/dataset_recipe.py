@@ -54,6 +54,7 @@ class Distribution(Spec):
         assert self.low is not None
         assert self.high is not None
         if self.integer:
+            # high counts, unlike in a continuous range
             return int(rng.integers(int(self.low), int(self.high), endpoint=True))
         if self.log:
             return float(math.exp(rng.uniform(math.log(self.low), math.log(self.high))))
@@ -79,6 +80,7 @@ class Splits(Spec):
     @model_validator(mode="after")
     def _whole(self) -> "Splits":
         total = self.train + self.validation + self.test
+        # Shares are written in decimals, whose sum is rounded.
         if abs(total - 1) > 1e-6:
             raise ValueError(f"train + validation + test = {total:g}: must be 1")
         return self
@@ -184,12 +186,14 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
         If the file is missing or malformed.
     """
     path = find(name, "scenes", "datasets")
+    # The dataset's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key.split(".")[0] in _DATASET_KEYS}
     dataset = load(Dataset, path, own)
     if not settings:
         return dataset
 
+    # A value that is set is no longer drawn.
     def left(drawn: dict[str, Distribution]) -> dict[str, Distribution]:
         return {key: value for key, value in drawn.items() if key not in settings}
 

@@ -57,6 +57,7 @@ class Group(Spec):
             lengths = {key: len(values) for key, values in table.items()}
             if not lengths or 0 in lengths.values() or len(set(lengths.values())) > 1:
                 raise ValueError(f"lists of one sweep must be equally long and not empty, got lengths {lengths}")
+        # Two draws of one key would overwrite each other.
         keys = [key for table in (*self.sweep, *self.pool) for key in table] + list(self.random)
         if twice := next((key for key in keys if keys.count(key) > 1), None):
             raise ValueError(f"{twice}: varied twice; a key may be in one table of sweep, pool and random")
@@ -95,12 +96,15 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
         If the file is missing or malformed.
     """
     path = find(name, "scenes", "experiments")
+    # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
     experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
     if "realisations" in own:
+        # In all groups, also in those that have a number of their own.
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
+    # The page must say that this is not the experiment as shipped.
     description = experiment.description
     if settings:
         description = f"{description} With {', '.join(f'{key}={value}' for key, value in settings.items())}.".strip()
@@ -110,6 +114,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
     """Fix scene values in a group; swept and random values of the same path, or below it, are dropped."""
     varied = [*group.random, *(key for table in (*group.sweep, *group.pool) for key in table)]
+    # A part of a value that is varied as a whole cannot be fixed.
     for path in settings:
         for key in varied:
             if path.startswith(f"{key}."):

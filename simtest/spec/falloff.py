@@ -35,6 +35,7 @@ class TableProfile(Spec):
     def _table(self) -> "TableProfile":
         if len(self.value) != len(self.angle_deg):
             raise ValueError(f"value has {len(self.value)} entries, angle_deg {len(self.angle_deg)}; must be as many")
+        # Interpolation needs a value on the axis, to which all others are relative.
         if self.angle_deg[0] != 0 or not (np.diff(self.angle_deg) > 0).all():
             raise ValueError(f"angle_deg = {list(self.angle_deg)}: must rise from 0")
         if self.value[0] <= 0:

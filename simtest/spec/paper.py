@@ -29,6 +29,7 @@ class PaperSetting(Spec):
 
     @model_validator(mode="after")
     def _light_in_front(self) -> "PaperSetting":
+        # Lights lie at V + eps (cos a, sin a, b) with b down to -1/2.
         if self.eps >= 2 * self.height:
             raise ValueError(
                 f"eps = {self.eps:g} and height = {self.height:g}: the lowest light, at height - eps / 2, would lie "

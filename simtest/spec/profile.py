@@ -81,6 +81,7 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
     values: Mapping[str, Any] = {key: value for key, value in own.items() if value is not None}
     experiment = load_experiment(entry.experiment, {**values, **entry.set})
     groups = experiment.groups
+    # the groups asked for
     if entry.labels is not None:
         labels = [group.label for group in groups]
         if missing := next((label for label in entry.labels if label not in labels), None):
@@ -89,6 +90,7 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
                 f"profile {profile.name}: {experiment.name} has no group {shown(missing)!r}; allowed: {allowed}"
             )
         groups = tuple(group for group in groups if group.label in entry.labels)
+    # the first viewpoints of each
     if entry.pool is not None:
         groups = tuple(_thinned(group, entry.pool) for group in groups)
     return experiment.model_copy(update={"groups": groups, "name": entry.name or experiment.name})

@@ -97,6 +97,7 @@ class Emission(Spec):
         value = self.profile.model().at(cosine, sine)
         if self.spot_deg is None:
             return value
+        # Angle from the spot's rim, positive inside; a soft edge rises linearly from 0 at the rim.
         inside = math.radians(self.spot_deg / 2) - np.arctan2(sine, cosine)
         edge = math.radians(self.soft_edge_deg)
         return value * (np.clip(inside / edge, 0.0, 1.0) if edge > 0 else (inside >= 0))
@@ -194,6 +195,7 @@ class Rig(Spec):
         # Equal lights are those of an older frame.json, which held both.
         if "lights" in self.model_fields_set and self.lights != ring:
             raise ValueError("preset and lights exclude each other; give one of them")
+        # The model is frozen; this is still its construction.
         object.__setattr__(self, "lights", ring)
         return self
 
@@ -245,5 +247,6 @@ class Rig(Spec):
         positions = self.nominal_mm()
         if not self.is_drawn:
             return positions
+        # All lights draw, also those without an error, so that a light's error does not depend on the others'.
         deviations = np.array([[light.position_error_mm] for light in self.lights])
         return positions + deviations * from_integer(self.seed).standard_normal(positions.shape)

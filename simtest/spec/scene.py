@@ -73,6 +73,7 @@ class Scene(Spec):
         distance_mm : float, optional
             True distance of the brightest highlight, mm, to which ``known.distance_error`` is relative.
         """
+        # What is not known is assumed to be linear and uniform.
         sensor, emission = self.sensor, self.rig.known_emission()
         response = sensor.response.model() if sensor.response_known else Response()
         return Calibration(
@@ -87,8 +88,10 @@ class Scene(Spec):
 
     def _priors(self, distance_mm: float | None) -> Priors:
         mean = self.known.distance_mm
+        # distance, off by a stated share of the truth
         if self.known.distance_error is not None and distance_mm is not None:
             mean = distance_mm * (1 + self.known.distance_error)
+        # lobe, which only Phong's model states by one number
         lobe = None
         if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
             lobe = exactly(self.reflectance.lobe_curvature)

@@ -62,6 +62,7 @@ class TableResponse(Spec):
     @model_validator(mode="after")
     def _rising(self) -> "TableResponse":
         try:
+            # The rule is the response's own, so that both ways to make one agree.
             check_table(self.light, self.value)
         except InputError as error:
             raise ValueError(str(error)) from None

@@ -37,6 +37,7 @@ class Spec(BaseModel):
     def _not_coerced(cls, data: Any) -> Any:
         """Refuse what pydantic would turn into a number or a truth value: "50", true, 1."""
         for name, value in data.items() if isinstance(data, Mapping) else ():
+            # Unknown keys are refused later, with a suggestion.
             field: Any = cls.model_fields.get(name)
             kinds = _leaf_types(field.annotation) if field else frozenset()
             wrong, numeric = "", bool(kinds) and kinds <= {int, float, NoneType}
@@ -103,17 +104,21 @@ def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> st
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
     location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
     kind, value = error["type"], error.get("input")
+    # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
+    # keys
     path = ".".join(location) or "(top level)"
     if kind == "extra_forbidden":
         return f"{path} = {_short(value)}: unknown key{_allowed_keys(error['loc'], model)}"
     if kind == "missing":
         return f"{path}: missing; it must be given"
+    # types of tagged unions
     if kind == "union_tag_not_found":
         return f"{path}.type: missing; allowed: {_allowed_types(error['loc'], model)}"
     if kind == "union_tag_invalid":
         return f"{path}.type = {_short(value['type'])}: unknown; allowed: {_allowed_types(error['loc'], model)}"
+    # validators of our models, then the ranges of fields
     if kind == "value_error":
         shown_value = "" if isinstance(value, Mapping) else f" = {_short(value)}"
         return f"{path}{shown_value}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])

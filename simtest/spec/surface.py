@@ -45,6 +45,7 @@ class _Round(_Placed):
 
     @model_validator(mode="after")
     def _camera_inside(self) -> "_Round":
+        # An inside view from outside the radius would look at the surface's other side.
         if self.side == "inside" and self._camera_from_centre() >= self.radius_mm:
             raise ValueError(
                 f"distance_mm = {self.distance_mm:g} puts the camera outside a radius of {self.radius_mm:g} mm; "

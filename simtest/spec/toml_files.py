@@ -91,8 +91,10 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
         parts = path.split(".")
         last, parents = parts[-1], parts[:-1]
         node: Any = result
+        # Down to the table or list that holds the value ...
         for part, following in itertools.pairwise(parts):
             node = _step(node, part, following, path, where)
+        # ... which is replaced there; in a list only an item that exists.
         if isinstance(node, list):
             _step(node, last, "", path, where)
             node[int(last)] = value

@@ -2,7 +2,7 @@
 
 `model` is what every surface offers, `factory` makes one from its description. `analytic` holds plane, sphere, cylinder
 and quadric; `colon` (with `tube`, `stalk`, `jets`) and `liver` are generated from a `recipe`; `mesh_surface` is a
-user's mesh, read by `mesh_file`, mended by `repair`, refined by `subdivision`, judged by `mesh_check`. `poses` and
+user's mesh, read by `mesh_file`, repaired by `repair`, refined by `subdivision`, judged by `mesh_check`. `poses` and
 `centreline` place cameras.
 """
 

@@ -38,6 +38,7 @@ def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg:
     The anchor is (0, 0, distance); its normal is (0, 0, -1) leaned by `tilt_deg` towards image direction
     `azimuth_deg`; at tilt 0 the model's x axis is image direction `spin_deg`.
     """
+    # frame at tilt 0: x along spin, z towards the camera
     tilt, azimuth, spin = np.radians([tilt_deg, azimuth_deg, spin_deg])
     x = np.array([np.cos(spin), np.sin(spin), 0.0])
     z = np.array([0.0, 0.0, -1.0])
@@ -76,6 +77,7 @@ class Plane(_Analytic):
         """Intersect rays with z = 0 (see `SurfaceModel.points`)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origins[:, 2] / directions[:, 2]
+        # In front of the camera, and within the rendered part of the plane
         distance = np.where((distance > 0) & np.isfinite(hits.distance), distance, np.nan)
         normal = np.broadcast_to([0.0, 0.0, 1.0], directions.shape)
         return pack_points(origins, directions, distance, normal, np.zeros((len(origins), 3, 3)))
@@ -123,6 +125,7 @@ class Sphere(_Round):
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the sphere; S = (I - N N^T)/R (see `SurfaceModel.points`)."""
         distance = self._distance(origins, directions, hits)
+        # Renormalised, to be of unit length to rounding.
         normal = (origins + distance[:, None] * directions - self.centre) / self.radius
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         S = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / self.radius
@@ -146,6 +149,7 @@ class Cylinder(_Round):
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the cylinder; S = (I - N N^T - y y^T)/R (see `SurfaceModel.points`)."""
+        # A cylinder is a circle for the components across its axis.
         across = self._across
         distance = self._distance(origins * across, directions * across, hits)
         normal = (origins + distance[:, None] * directions - self.centre) * across / self.radius
@@ -201,6 +205,7 @@ class Quadric(_Analytic):
             # Both roots without cancellation; a = 0 leaves one of them infinite.
             q = -(b + np.copysign(root, b)) / 2
             roots = np.stack([c / q, q / a])
+            # A ray may meet the quadric twice: the rendered hit decides which root is meant.
             gap = np.abs(roots - hits.distance)
         gap = np.where(np.isfinite(gap), gap, np.inf)
         distance = np.take_along_axis(roots, gap.argmin(axis=0)[None], axis=0)[0]

@@ -58,6 +58,7 @@ class CameraPath:
 
     def at(self, position: float) -> tuple[Array, Array, Array]:
         """Return point, mm, unit tangent and side at a position of 0 to `length`, mm; straight on beyond the ends."""
+        # interpolated between the two nearest points
         inside = min(max(position, 0.0), self.length)
         index = inside / self.length * (len(self.points) - 1)
         low = min(int(index), len(self.points) - 2)
@@ -65,6 +66,7 @@ class CameraPath:
         point, tangent, side = (
             (1 - share) * rows[low] + share * rows[low + 1] for rows in (self.points, self.tangents, self.sides)
         )
+        # orthonormal again
         tangent /= np.linalg.norm(tangent)
         side -= (side @ tangent) * tangent
         return point + (position - inside) * tangent, tangent, side / np.linalg.norm(side)
@@ -191,9 +193,11 @@ def _without_ends(path: Array, room: Array) -> Array:
 
     The two cells farthest apart lie in corners, into which the path turns within about its own width.
     """
+    # the longest piece
     kept = _longest_run(room >= WALL_MM)
     path, room = path[kept], room[kept]
     usual = float(np.median(room)) if len(room) else 0.0
+    # without its narrow ends, and at least the usual room from either end
     wide = np.flatnonzero(room >= min(MIN_CLEARANCE_MM, CLEARANCE_SHARE * usual))
     if not len(wide):
         return path[:0]
@@ -237,6 +241,7 @@ def path_pose(spec: AnatomySurface, surface: SurfaceModel) -> Array:
     other = np.cross(tangent, side)
     angle = math.radians(spec.around_deg)
     across = math.cos(angle) * side + math.sin(angle) * other
+    # site and target
     target = path.at(position + spec.look_ahead_mm)[0]
     if spec.view == "wall":
         target = site + across

@@ -98,6 +98,7 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     InputError
         If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
+    # cells, square on the bare tube
     tube = Tube(recipe)
     area = recipe.length_mm * 2 * math.pi * recipe.radius_mm
     cell = math.sqrt(2 * area / TRIANGLES) if edge_mm is None else edge_mm

@@ -110,6 +110,7 @@ class Body:
 
     def values(self, points: Array) -> Array:
         """Return F, mm, at points of shape (N, 3), without derivatives, for large grids."""
+        # B, then D with V
         blend, edge = self.recipe.blend_mm, self.recipe.edge_mm
         union = np.full(len(points), -np.inf)
         for centre, A, scale in self._lobes:
@@ -117,6 +118,7 @@ class Body:
             union = np.logaddexp(union, -0.5 * scale * (((d @ A) * d).sum(axis=1) - 1) / blend)
         face, _ = self._face(points)
         f = edge * np.logaddexp(-blend * union / edge, face / edge)
+        # G
         if self._fossa and self.recipe.fossa:
             centre, A, scale = self._fossa
             d = points - centre
@@ -167,6 +169,7 @@ class Body:
             slope = np.einsum("ni,ni->n", at.gradient, directions[active])
             # On a grazing ray F is nearly flat: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
+            # Newton's step along the ray; a ray that leaves the neighbourhood of its hit is given up.
             step = np.clip(-at.f / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
             t[active] += step
             done = np.abs(step) < NEWTON_TOLERANCE_MM
@@ -230,6 +233,7 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     InputError
         If the recipe gives no body, or one too large for the grid.
     """
+    # marching cubes, made even, then split where the surface bends sharply
     body = Body(recipe)
     vertices, faces = _march(body, GRID_MM if edge_mm is None else edge_mm)
     vertices = _even(body, vertices, faces)

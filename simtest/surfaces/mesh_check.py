@@ -162,12 +162,14 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
     InputError
         If the file is missing or no usable mesh.
     """
+    # size, unit and side, after the repairs
     vertices, faces, repairs = read_mesh(path)
     lumen = is_lumen(vertices, faces, kind)
     lengths, extents = edge_lengths(vertices, faces), np.ptp(vertices, axis=0)
     # Curvature, and the edges that highlights need because of it
     median = p95 = needed = share = None
     if len(faces) <= MAX_CURVATURE_FACES:
+        # The operators are for outward normals; in a lumen the camera sees the other side.
         k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
         wanted = needed_edge(distance_mm, concentration, k_min, k_max)
         needed = area_quantile(wanted, vertices, faces, 1 - FINE_SHARE)
@@ -196,6 +198,7 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
 
 def _fine_share(wanted: Array, vertices: Array, faces: IntArray) -> float:
     """Return the share of the area whose edges are at most as long as wanted there; `wanted` at the vertices."""
+    # Mean length of the edges at each vertex
     edges, _ = edge_uses(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     count = np.bincount(edges.ravel(), minlength=len(vertices))

@@ -98,10 +98,12 @@ def _check_file(path: Path, suffix: str) -> None:
             head = file.read(4096)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    # size of the file
     if size == 0:
         raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
     if size > MAX_BYTES[suffix]:
         raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
+    # faces that the header declares
     declared = 0
     if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
         declared = int(match[1])
@@ -130,6 +132,7 @@ def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
     kind = path.suffix[1:].lower()
     options = {"skip_materials": True} if kind == "obj" else {}
     loaded = trimesh.load(path, file_type=kind, process=False, **options)
+    # An OBJ file may hold several objects.
     if isinstance(loaded, trimesh.Scene):
         parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
         if not parts:
@@ -171,6 +174,7 @@ def _check_indices(path: Path, indices: IntArray, count: int) -> None:
 
 
 def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
+    # shapes and counts
     if vertices.ndim != 2 or vertices.shape[-1] != 3 or not len(vertices):
         raise InputError(f"{path}: no vertices; at least {MIN_FACES} are needed")
     if not faces.size:
@@ -179,6 +183,7 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         raise InputError(f"{path}: faces of {faces.shape[-1]} corners; triangles are needed")
     if not MIN_FACES <= len(faces) <= MAX_FACES:
         raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; allowed: {MIN_FACES} to {MAX_FACES}")
+    # values
     _check_indices(path, faces.ravel(), len(vertices))
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])

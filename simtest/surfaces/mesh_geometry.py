@@ -16,6 +16,7 @@ def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
         Number of the edge from each corner of a face to the next.
     """
     codes, span = _edge_codes(faces)
+    # Each edge once, and for each corner which of them it starts
     found, index = np.unique(codes, return_inverse=True)
     return np.stack(np.divmod(found, span), axis=1), index.reshape(-1, 3)
 
@@ -55,6 +56,7 @@ def vertex_areas(vertices: Array, faces: IntArray) -> Array:
 def area_quantile(values: Array, vertices: Array, faces: IntArray, share: float) -> float:
     """Return the value that this share of the surface lies below; values at the vertices, shape (V,), NaN ignored."""
     weight, known = vertex_areas(vertices, faces), np.isfinite(values)
+    # Values in rising order, against the area that has at most that value
     order = np.argsort(values[known])
     filled = np.cumsum(weight[known][order])
     return float(values[known][order][np.searchsorted(filled, share * filled[-1])])
@@ -68,5 +70,6 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     centred = vertices - vertices.mean(axis=0)
     cross = area_vectors(centred, faces)
     area = np.linalg.norm(cross, axis=1).sum() / 2
+    # Sum of the signed volumes of the cones from the centroid to the faces
     volume = np.einsum("ni,ni->n", centred[faces][:, 0], cross).sum() / 6
     return float(36 * np.pi * volume**2 / area**3)

@@ -83,6 +83,7 @@ class PreparedMesh(BuiltMesh):
         The normal is the normalised barycentric mean of the vertex normals; S is that of the vertices' tensors,
         projected on the plane perpendicular to that normal.
         """
+        # Linear between the corners, as the renderer shades it
         corners = self.mesh.faces[hits.face]
         normal = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -132,12 +133,15 @@ def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "aut
 @lru_cache(maxsize=4)
 def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
     vertices, faces, repairs = read_mesh(path)
+    # what is wrong with the file
     lumen = is_lumen(vertices, faces, kind)
     _warn(path, vertices, faces, list(repairs.sentences(lumen)))
+    # smooth and fine
     times, smoothing = _plan(path, vertices, faces, how, lumen)
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
+        # Everything turned inward, to the camera's side
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
     digest = blake2b(repr((path, mtime_ns, size, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
     return PreparedMesh(TriangleMesh(vertices, faces, normals), f"mesh-{digest}", operators, lumen, times)
@@ -164,9 +168,11 @@ def _warn(path: str, vertices: Array, faces: IntArray, repairs: list[str]) -> No
 def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float]:
     """Return how often to subdivide, and the wavelength to smooth, mm."""
     smoothing, wanted = how.smoothing_mm or 0.0, how.subdivisions
+    # smoothing, by default of what is the mesh's own
     if how.edge_mm is not None and how.smoothing_mm is None:
         smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
     smoothing = allowed_smoothing(path, faces, smoothing)
+    # subdivisions, as many as the edge length needs
     if how.edge_mm is not None:
         edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
         wanted = halvings(vertices, faces, edge)
@@ -179,6 +185,7 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
     The faces are outward. Curvatures are taken after smoothing by `smoothing_mm`.
     """
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
+    # The nearest camera sees the narrowest highlights.
     distance = (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
     k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
     needed = needed_edge(distance, AUTO_CONCENTRATION, k_min, k_max)

@@ -185,6 +185,7 @@ def pack_points(
     direction_min = np.cos(angle)[:, None] * other - np.sin(angle)[:, None] * tangent
     valid = np.isfinite(distance) & np.isfinite(normal).all(axis=1) & np.isfinite(mean)
 
+    # Whatever is not finite in one field is NaN in all.
     def only_valid(values: Array) -> Array:
         return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 

@@ -62,6 +62,7 @@ class MeshProbe:
         The sign is that of the interpolated vertex normal at the closest point, so an open mesh works too.
         """
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
+        # The normal at the closest point, interpolated in its triangle
         corners = self._mesh.vertices[self._mesh.faces[face]]
         weights = _barycentric(closest, corners)
         normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
@@ -187,6 +188,7 @@ def organ_pose(
         If no drawn point can be seen from such a position.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
+    # candidates
     points, normals = targets(rng, _TARGETS)
     away = _cap(normals, math.radians(ORGAN_TILT_DEG), rng)
     distance = rng.uniform(*ORGAN_RANGE_MM, size=_TARGETS)

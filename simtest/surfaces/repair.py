@@ -139,6 +139,7 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
     a, b, c = (corners[:, i] - middle[piece] for i in range(3))
     volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
+    # Pieces of negative volume are inside out.
     outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
     # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
     inward = np.bincount(piece, _follower(faces) != _follower(outward), count)

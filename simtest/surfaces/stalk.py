@@ -159,9 +159,11 @@ def _quartic(x: Array, reach: float) -> tuple[Array, Array, Array]:
 def _widths(depth: float) -> tuple[float, float]:
     """Return the radii of neck and head on a flat wall, over the width s."""
     z = _PROFILE
+    # Radius at which the lift E equals z, narrowed by the stricture
     tau = (np.sqrt(1 - 8 * np.log(z)) - 1) / 2
     r = np.sqrt(2 * tau)
     r *= 1 - depth * np.exp(-(((z - NECK_AT) / NECK_REACH) ** 4)) * np.exp(-((r / ACROSS) ** 4))
+    # The head is the widest part above the neck, the neck the narrowest below the head.
     above = z > NECK_AT + NECK_REACH / 2
     head = int(np.argmax(np.where(above, r, 0.0)))
     return float(r[(z > NECK_AT / 3) & (z <= z[head])].min()), float(r[head])

@@ -33,6 +33,7 @@ def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
+    # Laplacian, areas, and 0 at the vertices of a rim
     laplacian = igl.cotmatrix(vertices, faces)
     mass = np.asarray(igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal())
     edges, uses = edge_uses(faces)
@@ -115,6 +116,7 @@ def shape_operators(vertices: Array, faces: IntArray) -> Array:
     """
     fitted: Any = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
     first, second, k1, k2 = fitted[:4]
+    # S = k1 d1 d1^T + k2 d2 d2^T
     operators = k1[:, None, None] * first[:, :, None] * first[:, None, :]
     operators += k2[:, None, None] * second[:, :, None] * second[:, None, :]
     return np.asarray(operators)

@@ -64,6 +64,7 @@ class Tube:
         self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
         steps = self._integrate(self._knots[:-1], self._knots[1:])
         self._knot_points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        # Stalks stand on the wall without any, so that is needed first.
         self._stalks: tuple[Stalk, ...] = ()
         self._check()
         self._stalks = tuple(self._draw_stalks())
@@ -95,7 +96,7 @@ class Tube:
             yield _Fold(polyp.along_mm, math.radians(polyp.around_deg), polyp.height_mm, width, 0.0, kappa)
 
     def _draw_stalks(self) -> Iterator[Stalk]:
-        """Yield the pedunculated polyps, each on the wall as it is without them, towards the centreline."""
+        """Yield the pedunculated polyps, each on the wall without any, towards the centreline."""
         for polyp in self.recipe.polyps:
             if polyp.neck_mm is not None:
                 u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
@@ -123,6 +124,7 @@ class Tube:
                 f"colon recipe: folds leave a radius of {r.min():.3g} mm; at least {0.1 * self.recipe.radius_mm:.3g} "
                 "is needed: lower fold_depth_mm or raise fold_spacing_mm"
             )
+        # 1 - psi' r cos v must stay positive.
         bend = np.abs(self.heading(u.ravel())[1]) * r
         if bend.max() > 0.9:
             raise InputError(
@@ -140,6 +142,7 @@ class Tube:
     def _integrate(self, start: Array, stop: Array) -> Array:
         """Return C(stop) - C(start), mm, shape (N, 3)."""
         half = (stop - start) / 2
+        # Gauss-Legendre nodes on each interval; the integrand is the unit tangent.
         psi = self.heading(((start + stop) / 2)[:, None] + half[:, None] * _GAUSS_NODES)[0]
         x, z = (half * (part(psi) @ _GAUSS_WEIGHTS) for part in (np.sin, np.cos))
         return np.stack([x, np.zeros_like(x), z], axis=1)
@@ -273,6 +276,7 @@ class Tube:
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
         p = self.jet(u, v)
+        # First fundamental form G and second fundamental form -N . P_ij
         normal = np.cross(p.u, p.v)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         J = np.stack([p.u, p.v], axis=2)
@@ -297,6 +301,7 @@ class Tube:
             miss = p - origins[active] - t[active, None] * directions[active]
             done = np.linalg.norm(miss, axis=1) < NEWTON_TOLERANCE_MM
             found[active[done]] = True
+            # The others go on.
             active, pu, pv, miss = active[~done], pu[~done], pv[~done], miss[~done]
             if not active.size:
                 break
@@ -307,6 +312,7 @@ class Tube:
             u[active] += scale * du
             v[active] += scale * dv
             t[active] += scale * dt
+            # A ray that leaves the neighbourhood of its hit is given up.
             active = active[np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM]
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
         return np.where(found & inside, t, np.nan), u, v

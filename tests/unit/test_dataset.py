@@ -20,7 +20,7 @@ from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.shard_writer import write_dataset
-from simtest.dataset.verify import mend, verify
+from simtest.dataset.verify import repair_files, verify
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.cluster import cores_per_task
@@ -496,18 +496,18 @@ def test_damage_is_mended(made, copy):
     DAMAGE["flipped byte in the middle"][0](copy)
     DAMAGE["edited estimates"][0](copy)
     DAMAGE["foreign file"][0](copy)
-    assert mend(copy, verify(copy), make_engine()) == []
+    assert repair_files(copy, verify(copy), make_engine()) == []
     assert contents(copy) == contents(made)
     (copy / NAME).write_text("{")
     with pytest.raises(InputError, match="is broken; remove it"):
-        mend(copy, verify(copy), make_engine())
+        repair_files(copy, verify(copy), make_engine())
 
 
 def test_mending_leaves_a_strange_folder_alone(copy):
     (copy / "mine").mkdir()
     (copy / "mine" / "notes.txt").write_text("mine")
     DAMAGE["foreign file"][0](copy)
-    assert [fault.file for fault in mend(copy, verify(copy), make_engine())] == ["mine"]
+    assert [fault.file for fault in repair_files(copy, verify(copy), make_engine())] == ["mine"]
     assert (copy / "mine" / "notes.txt").read_text() == "mine"
 
 

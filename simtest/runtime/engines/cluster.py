@@ -68,7 +68,11 @@ class RayEngine:
         ray = self._ray
         cores = cores_per_task([node["Resources"] for node in ray.nodes() if node["Alive"]], self._workers)
         remote = ray.remote(
-            num_cpus=cores, num_gpus=int(self._gpu), max_retries=MAX_DEATHS, max_calls=self._renew_after or 0
+            # Ray itself repeats a task whose process or node dies, and renews processes.
+            num_cpus=cores,
+            num_gpus=int(self._gpu),
+            max_retries=MAX_DEATHS,
+            max_calls=self._renew_after or 0,
         )(_work)
         waiting = list(enumerate(arguments))
         running: dict[Any, int] = {}
@@ -89,10 +93,12 @@ class RayEngine:
         ray = self._ray
         try:
             return ray.get(reference)
+        # what the task itself raised
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, SimtestError):
                 raise error.cause from None
             raise SimtestError(f"a worker failed ({type(error.cause).__name__}: {error.cause})") from error
+        # what Ray could not cure by repeating it
         except ray.exceptions.RayError as error:
             said = str(error).splitlines()[0][:160]
             raise SimtestError(f"the cluster lost a task ({said}); what is finished is kept") from error

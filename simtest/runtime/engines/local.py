@@ -105,6 +105,7 @@ class _Pool:
             assert number is not None
             worker.task, worker.finished = None, worker.finished + 1
             self._left -= 1
+            # Closing the pipe of an idle worker ends it; the next task starts another one.
             if self._renew_after is not None and worker.finished >= self._renew_after:
                 self._join_worker(worker)
             yield number, content

@@ -38,9 +38,11 @@ def read_matlab(path: Path) -> dict[str, Any]:
         matrix = _array(fields, "K", 9, where).reshape(3, 3)
     else:
         matrix = _array(fields, "IntrinsicMatrix", 9, where).reshape(3, 3).T
+    # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
     height, width = _array(fields, "ImageSize", 2, where).tolist()
+    # Two or three radial coefficients, in OpenCV's order k1 k2 p1 p2 k3 with the tangential ones
     radial = _array(fields, "RadialDistortion", (2, 3), where).tolist()
     tangential = _array(fields, "TangentialDistortion", 2, where).tolist()
     lens = dict(zip(("k1", "k2", "k3", "p1", "p2"), [*radial, 0.0][:3] + tangential, strict=True))

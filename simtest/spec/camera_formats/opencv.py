@@ -57,6 +57,7 @@ def read_opencv(path: Path) -> dict[str, Any]:
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: {name} = {matrix.tolist()}: must be upper triangular with 1 in its last corner")
     _check_whole(data, where)
+    # lens and view mask
     table = {
         "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
         "cx": float(matrix[0, 2]) + PIXEL_CENTRE, "cy": float(matrix[1, 2]) + PIXEL_CENTRE,
@@ -118,6 +119,7 @@ def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[f
     """Return a matrix or list as numbers in row order; `counts` are the allowed numbers of values."""
     if isinstance(value, Mapping):
         value = value.get("data")
+    # A FileStorage matrix holds its numbers flat, plain JSON and YAML row by row.
     flat: list[Any] = []
     for item in value if isinstance(value, list) else [value]:
         flat += item if isinstance(item, list) else [item]
@@ -163,16 +165,19 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
     fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if name is None:
         _check_no_other_lens(data, where)
+    # no coefficients
     if name is None or value in (None, []) or (isinstance(value, Mapping) and not value.get("data")):
         if fisheye:
             raise InputError(f"{where}: {LENS_NAMES[0]}: missing; a fisheye has 4 coefficients")
         return None
+    # Kannala-Brandt
     if fisheye:
         values = _numbers(value, where, name, (4,))
         return {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), values, strict=True))}
     # Brown-Conrady: which counts are possible depends on the model, if one is named.
     counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
     values = _numbers(value, where, name, counts)
+    # Terms that simtest lacks must vanish.
     for term, number in zip(UNKNOWN_TERMS, values[8:], strict=False):
         if number != 0:
             kind = "tilted sensor" if term.startswith("tau") else "thin prism"
@@ -180,16 +185,17 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
                 f"{where}: {name}: {term} = {number:g} ({kind}): must be 0; simtest does not know that term"
             )
     if not any(values):
+        # All coefficients 0: a pinhole.
         return None
     return {"type": "brown_conrady", **dict(zip(BROWN_ORDER, values, strict=False))}
 
 
 def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
     """Refuse a file that mentions a lens but has no coefficients under a known name."""
-    told = [key for key in data if key.lower().startswith("dist") and (key != "distortion_model" or data[key])]
-    if told:
+    key = next((k for k in data if k.lower().startswith("dist") and (k != "distortion_model" or data[k])), None)
+    if key is not None:
         raise InputError(
-            f"{where}: {told[0]} = {shown(repr(data[told[0]]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"{where}: {key} = {shown(repr(data[key]), 60)}: speaks of a lens whose coefficients are missing; "
             f"allowed names: {', '.join(LENS_NAMES)}"
         )
 
