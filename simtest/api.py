@@ -1,13 +1,13 @@
-"""The workflows behind the commands: render a labelled frame, run an experiment with its report."""
+"""The workflows behind the commands: render a labelled frame, run an experiment with its report, reconstruct a file."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
-from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction import reconstruct
 from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import make_folder, write_json
 from simtest.simulation.labelled_frame import LabelledFrame, make_frame
@@ -16,8 +16,8 @@ from simtest.spec import Experiment, Scene, load_experiment, load_scene
 from simtest.validation.runner import Progress
 
 if TYPE_CHECKING:
-    from simtest.geometry import Camera
-    from simtest.validation.reference_surface import Reference
+    from simtest.reconstruction.description import PictureRecord
+    from simtest.reconstruction.picture import Options
 
 __all__ = [
     "Extras",
@@ -240,18 +240,8 @@ class Extras:
 
 
 def reconstruct_picture(
-    image: Path,
-    out: Path,
-    camera_file: Path | None = None,
-    fov_deg: float | None = None,
-    estimators: Sequence[str] | None = None,
-    roi: str | None = None,
-    encoding: str | None = None,
-    every: bool = False,
-    detector: str = "auto",
-    smoothing_px: float | None = None,
-    extras: Extras | None = None,
-) -> tuple[int, list[Path]]:
+    image: Path, out: Path, options: "Options", extras: Extras | None = None
+) -> tuple["PictureRecord", list[Path]]:
     """Reconstruct the normals of a picture and write them.
 
     Parameters
@@ -260,30 +250,15 @@ def reconstruct_picture(
         The picture.
     out : Path
         Folder, made if need be.
-    camera_file : Path, optional
-        Calibration or camera file; this or `fov_deg` must be given, not both.
-    fov_deg : float, optional
-        Horizontal field of view, deg.
-    estimators : sequence of str, optional
-        Names; default those of the package that need no more than the calibration states.
-    roi : str, optional
-        "x,y,w,h" in px; default: detected.
-    encoding : {"srgb", "linear"}, optional
-        How the picture's values are encoded, where the calibration does not state the response; default sRGB.
-        Isophotes are those of linear values.
-    every : bool
-        Take peaks too that the border cuts or whose shape is not that of one point highlight.
-    detector : {"auto", "colour", "peaks"}
-        How highlights are found (`Options`).
-    smoothing_px : float, optional
-        Standard deviation of the Gaussian smoothing, px.
+    options : Options
+        Camera, detector and estimators.
     extras : Extras, optional
         Reference surface and depths.
 
     Returns
     -------
-    count : int
-        Specularities found.
+    record : PictureRecord
+        The specularities found, with their normals.
     files : list of Path
         normals.json, normals.csv, normals.ply, overlay.png, and the others.
 
@@ -293,40 +268,28 @@ def reconstruct_picture(
         If the input is malformed or the folder cannot be written.
     """
     from simtest.reconstruction.image_io import read_picture
-    from simtest.reconstruction.picture import NOTHING, parse_roi, picture_document, write_document
-    from simtest.reconstruction.single import Options, check_camera_given, completed, read_camera
+    from simtest.reconstruction.output_files import write_outputs
+    from simtest.reconstruction.picture import NOTHING, read_calibration, reconstruct_values
     from simtest.validation.depth_maps import depths_at
-    from simtest.validation.reference_surface import comparison
+    from simtest.validation.reference_surface import compare, load_reference
 
-    box = parse_roi(roi) if roi is not None else None
-    options = Options(None if estimators is None else tuple(estimators), box, encoding, every, detector, smoothing_px)
-    check_camera_given(camera_file, fov_deg)
+    extras = extras or Extras()
+    # read
     picture = read_picture(image)
-    height, width = picture.shape[:2]
-    calibration, cautions = read_camera(camera_file, fov_deg, (width, height))
+    calibration, cautions = read_calibration(options, picture)
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
-    calibration = completed(calibration, encoding)
-    reference = _reference(extras, calibration.camera)
-    document = picture_document(image, picture, calibration, options, cautions)
-    spots = document["specularities"]
-    if not spots:
-        document["warnings"].append(NOTHING)
+    reference = load_reference(extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm)
+    # linear light, detect, estimate, describe
+    record = reconstruct_values(str(image), picture, calibration, options, cautions)
+    if not record.specularities:
         warnings.warn(NOTHING, stacklevel=2)
+        record = replace(record, warnings=[*record.warnings, NOTHING])
     depth = None
-    if extras is not None and extras.depth is not None:
-        looks = [spot["peak_px"] for spot in spots]
-        depth = depths_at(extras.depth, looks, (width, height), extras.depth_scale_mm)
+    if extras.depth is not None:
+        peaks = [spot.peak_px for spot in record.specularities]
+        depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale_mm)
     if reference is not None:
-        document["reference"] = comparison(spots, calibration.camera, reference)
-    return len(spots), write_document(out, document, picture, calibration.camera, depth)
-
-
-def _reference(extras: Extras | None, camera: "Camera") -> "Reference | None":
-    from simtest.validation.reference_surface import load_reference
-
-    if extras is None or extras.reference is None:
-        if extras is not None and extras.pose is not None:
-            raise InputError("--camera-from-model: needs --reference, the mesh that it places")
-        return None
-    return load_reference(extras.reference, extras.pose, camera, extras.depth_scale_mm)
+        record = compare(record, reference)
+    # write
+    return record, write_outputs(out, record, picture, depth)

@@ -35,6 +35,14 @@ def environment() -> "Environment":
     return made
 
 
+def write_page(path: Path, template: str, data: Any, **values: Any) -> None:
+    """Render a template and write it; `data` stands in it as JSON for the page's script."""
+    from markupsafe import Markup
+
+    html = environment().get_template(template).render(data=Markup(script_json(data)), **values)
+    path.write_text(html, encoding="utf-8")
+
+
 def breakable(name: str) -> "Markup":
     """Give a name that may be broken behind its underscores, where a column is narrow."""
     from markupsafe import Markup, escape

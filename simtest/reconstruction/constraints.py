@@ -1,13 +1,16 @@
 """Sparse normals as constraints that a reconstruction of the surface can take: constraints.json and constraints.npz."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.files import write_atomically, write_json
+from simtest.reconstruction.description import SpecularityRecord, Vector
+from simtest.runtime.files import JsonObject
+from simtest.spec import describe_camera
 
 VERSION = 1
 
@@ -20,67 +23,79 @@ ABOUT = (
 )
 
 
-def constraints(document: dict[str, Any]) -> dict[str, Any]:
-    """Give the constraints of a document of normals: the best normal of each specularity that has one."""
-    made = []
-    for spot in document["specularities"]:
-        result = spot["estimates"].get(spot["best"]) if spot["best"] else None
-        if result is None or result["status"] != "ok" or spot["sightline"] is None:
-            continue
-        published = spot["estimates"].get("circle_pose", {})
-        made.append(
-            {
-                "id": spot["id"],
-                "track": spot.get("track"),
-                "pixel": spot["peak_px"],
-                "sightline": spot["sightline"],
-                "normal": result["normal"],
-                "basis": np.concatenate(tangent_basis(np.array([result["normal"]]))).tolist(),
-                "covariance": result["covariance"],
-                "estimator": spot["best"],
-                "candidates": published.get("candidates", result["candidates"]),
-                "score": spot.get("score"),
-                "flags": result["flags"],
-            }
-        )
-    return {"version": VERSION, "about": ABOUT, "image": document["image"], "camera": document["camera"],
-            "constraints": made}  # fmt: skip
+@dataclass(frozen=True)
+class Constraint:
+    """The best normal of a specularity (see `ABOUT`), with the candidates of `circle_pose` where it has any."""
+
+    id: int
+    track: int | None
+    pixel: Vector | None
+    sightline: Vector
+    normal: Vector
+    basis: list[Vector]
+    covariance: list[Vector] | None
+    estimator: str
+    candidates: list[Vector]
+    score: float | None
+    flags: list[str]
 
 
-def write_constraints(json_file: Path, npz_file: Path, document: dict[str, Any]) -> None:
-    """Write the constraints twice: as JSON, and as arrays without pickles.
+@dataclass(frozen=True)
+class Constraints:
+    """The constraints of a picture."""
 
-    The arrays: id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates
-    (N, 2, 3) with NaN where there is no second, estimator (N,) as text, and K (3, 3).
-    """
-    described = constraints(document)
-    write_json(json_file, described)
-    write_atomically(npz_file, lambda part: np.savez(part, **arrays(described)))
+    image: str
+    camera: Camera
+    constraints: list[Constraint]
 
+    @classmethod
+    def of(cls, image: str, camera: Camera, spots: Sequence[SpecularityRecord]) -> "Constraints":
+        """Take the best normal of each specularity that has one and a sightline."""
+        made = [
+            Constraint(
+                id=spot.id,
+                track=spot.track,
+                pixel=spot.peak_px,
+                sightline=spot.sightline,
+                normal=best.normal.tolist(),
+                basis=np.concatenate(tangent_basis(best.normal[None])).tolist(),
+                covariance=None if best.covariance is None else best.covariance.tolist(),
+                estimator=spot.best,
+                candidates=spot.normals.get("circle_pose", best).candidates.tolist(),
+                score=None if spot.highlight is None else spot.highlight.score,
+                flags=list(best.flags),
+            )
+            for spot in spots
+            if spot.best and spot.sightline and (best := spot.best_estimate)
+        ]
+        return cls(image, camera, made)
 
-def arrays(described: dict[str, Any]) -> dict[str, Any]:
-    """Give constraints as arrays (see `write_constraints`)."""
-    entries = described["constraints"]
+    def to_json(self) -> JsonObject:
+        """Return the content of constraints.json."""
+        about = {"version": VERSION, "about": ABOUT, "image": self.image}
+        return {**about, "camera": describe_camera(self.camera), "constraints": self.constraints}
 
-    def stacked(give: Callable[[dict[str, Any]], Any], shape: tuple[int, ...]) -> np.ndarray:
-        return np.array([give(entry) for entry in entries], dtype=float).reshape(-1, *shape)
+    def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
+        """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
 
-    def both(entry: dict[str, Any]) -> np.ndarray:
-        pair = np.full((2, 3), np.nan)
-        given = np.array(entry["candidates"], dtype=float)[:2]
-        pair[: len(given)] = given
-        return pair
-
-    unknown = np.full((2, 2), np.nan)
-    return {
-        "version": np.array(VERSION),
-        "id": np.array([entry["id"] for entry in entries], dtype=int),
-        "pixel": stacked(lambda e: e["pixel"], (2,)),
-        "sightline": stacked(lambda e: e["sightline"], (3,)),
-        "normal": stacked(lambda e: e["normal"], (3,)),
-        "basis": stacked(lambda e: e["basis"], (2, 3)),
-        "covariance": stacked(lambda e: e["covariance"] or unknown, (2, 2)),
-        "candidates": stacked(both, (2, 3)),
-        "estimator": np.array([entry["estimator"] for entry in entries], dtype=str),
-        "K": np.array(described["camera"]["K"]),
-    }
+        id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3)
+        with NaN where there is no second, estimator (N,) as text.
+        """
+        every = self.constraints
+        candidates = np.full((len(every), 2, 3), np.nan)
+        for pair, constraint in zip(candidates, every, strict=True):
+            given = np.array(constraint.candidates, dtype=float)[:2]
+            pair[: len(given)] = given
+        unknown = [[np.nan] * 2] * 2
+        return {
+            "version": np.array(VERSION),
+            "id": np.array([c.id for c in every], dtype=int),
+            "pixel": np.array([c.pixel for c in every], dtype=float).reshape(-1, 2),
+            "sightline": np.array([c.sightline for c in every], dtype=float).reshape(-1, 3),
+            "normal": np.array([c.normal for c in every], dtype=float).reshape(-1, 3),
+            "basis": np.array([c.basis for c in every], dtype=float).reshape(-1, 2, 3),
+            "covariance": np.array([c.covariance or unknown for c in every], dtype=float).reshape(-1, 2, 2),
+            "candidates": candidates,
+            "estimator": np.array([c.estimator for c in every], dtype=str),
+            "K": self.camera.K,
+        }

@@ -1,4 +1,4 @@
-"""From one frame and its camera to normals: detect the specularities, run the estimators on each."""
+"""The pipeline from the values of a picture to normals: linear light, detect, estimate; one for grey and for colour."""
 
 import math
 import operator
@@ -8,20 +8,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, CorrectedFrame
+from simtest.calibration import Calibration
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
-from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
+from simtest.detection import Region
+from simtest.detection.blobs import Highlight
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.execution_guard import run_each
-from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry import Camera, Patch
+from simtest.reconstruction.detectors import DETECTORS, Found, cut_region
+from simtest.reconstruction.linear_light import check_frame, linear_picture
 from simtest.runtime.resources import shown
 
-Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
 MAX_SMOOTHING_PX = 50
+
+SMOOTHING_BY_COLOUR_PX = 1.0
+"""Highlights of real pictures are small, and 2 px would round them."""
+
+SMALL_RADIUS = 3.0
+"""A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
+estimates have the flag ``small``."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,22 @@ class Specularity:
     region: Region
     patch: Patch | Failure
     estimates: dict[str, Estimate | Failure]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The normals of a picture.
+
+    Parameters
+    ----------
+    specularities : list of Specularity
+        The brightest first.
+    found : Found
+        What the detector found: the view, the highlights behind the specularities, and those of other kinds.
+    """
+
+    specularities: list[Specularity]
+    found: Found
 
 
 def reconstruct(
@@ -84,105 +109,86 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN or infinity; if an
         argument is of the wrong kind or out of range.
     """
-    calibration = _calibration(camera)
-    view = calibration.camera
-    image = check_frame(frame, view)
-    corrected = calibration.correct(image)
-    number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
-    if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
-        raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    roi = None if roi is None else _check_roi(roi)
-    chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
-    frame_cut = FrameCut.of(corrected, calibration, smoothing_px)
-    if roi is not None:
-        patch = frame_cut.patch(roi)
-        peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
-        found = [(Region(roi, (peak[0], peak[1]), float("nan")), patch)]
-    else:
-        noise = frame_cut.noise
-        regions = detect(frame_cut.smoothed, noise, isolated, view.seen)
-        found = [(region, frame_cut.patch(region.box, region.peak)) for region in regions]
-        if isolated:
-            left, flat = _noise_left(smoothing_px), flat_pixels(image)
-            found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
-    return run_estimators(found, chosen, calibration, corrected.limited)
+    return run_pipeline(frame, camera, "peaks", estimators, roi, smoothing_px, isolated).specularities
 
 
-@dataclass(frozen=True)
-class FrameCut:
-    """A corrected frame, smoothed, that patches are cut from.
+def reconstruct_colour(
+    picture: npt.ArrayLike,
+    camera: Camera | Calibration,
+    estimators: Sequence[str] | Mapping[str, Estimator] = DEFAULT_ESTIMATORS,
+    smoothing_px: float = SMOOTHING_BY_COLOUR_PX,
+    isolated: bool = True,
+) -> Reconstruction:
+    """Reconstruct the normals at the isolated highlights of a colour picture.
+
+    The estimators see the specular light alone: the tissue's part of each pixel is taken off (`split_light`).
 
     Parameters
     ----------
-    corrected : CorrectedFrame
-        The frame.
-    smoothed : ndarray of float32, shape (H, W)
-        Its intensity, smoothed.
-    noise : float, or ndarray of float32, shape (H, W)
-        Standard deviation of the intensity's noise before smoothing.
-    smoothing_px : float
-        Standard deviation of the Gaussian, px.
-    seen : ndarray of bool, shape (H, W), or None
-        The pixels inside the view mask.
-    """
-
-    corrected: CorrectedFrame
-    smoothed: Image
-    noise: float | Image
-    smoothing_px: float
-    seen: Mask | None
-
-    @classmethod
-    def of(
-        cls, corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float, seen: Mask | None = None
-    ) -> "FrameCut":
-        """Smooth a frame and estimate its noise; `seen` is that of the calibration's camera where it is not given."""
-        seen = calibration.camera.seen if seen is None else seen
-        smoothed = smooth(corrected.intensity, smoothing_px, seen)
-        return cls(corrected, smoothed, _noise(corrected, calibration, smoothing_px, seen), smoothing_px, seen)
-
-    def patch(self, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None) -> Patch | Failure:
-        """Cut a region of interest out (see `Patch.cut`)."""
-        return Patch.cut(
-            self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen, raw=self.corrected.intensity,
-            noise=self.noise, smoothing_px=self.smoothing_px,
-        )  # fmt: skip
-
-
-def run_estimators(
-    found: Sequence[tuple[Region, Patch | Failure]],
-    estimators: Mapping[str, Estimator],
-    calibration: Calibration,
-    limited: Mask | None = None,
-) -> list[Specularity]:
-    """Run estimators on regions of interest.
-
-    Parameters
-    ----------
-    found : sequence of tuple
-        Regions with their patches.
-    estimators : mapping
-        Estimator by name.
-    calibration : Calibration
-        Camera, and what is known beside the picture.
-    limited : ndarray of bool, shape (H, W), optional
-        Where too little light is left for the whole correction (`CorrectedFrame.limited`).
+    picture : array_like, shape (H, W, 3)
+        RGB values as encoded, in [0, 1].
+    camera : Camera or Calibration
+        Of the same size. Where it has no response, sRGB is taken; where it has no view mask, that of the picture.
+    estimators, smoothing_px
+        As of `reconstruct`.
+    isolated : bool
+        Leave out highlights of the other kinds.
 
     Returns
     -------
-    list of Specularity
-        In the same order.
+    Reconstruction
+        Estimates of highlights that smoothing has made rounder have the flag ``small``.
+
+    Raises
+    ------
+    InputError
+        As `reconstruct`.
     """
-    peaks = [(r.peak[0] + PIXEL_CENTRE, r.peak[1] + PIXEL_CENTRE) for r, _ in found]
-    # A region that was given stands for itself.
-    known = [not np.isnan(region.contrast) for region, _ in found]
-    patches = [
-        _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
-    ]
+    return run_pipeline(picture, camera, "colour", estimators, None, smoothing_px, isolated)
+
+
+def run_pipeline(
+    picture: npt.ArrayLike,
+    camera: Camera | Calibration,
+    detector: str,
+    estimators: Sequence[str] | Mapping[str, Estimator],
+    roi: tuple[int, int, int, int] | None,
+    smoothing_px: float,
+    isolated: bool,
+) -> Reconstruction:
+    """Reconstruct the normals of a picture with the detector of a name (see `reconstruct`, `reconstruct_colour`)."""
+    calibration = _calibration(camera)
+    image = check_frame(picture, calibration.camera)
+    number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
+    if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
+        raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
+    box = None if roi is None else _check_roi(roi)
+    chosen = estimators if isinstance(estimators, Mapping) else load_estimators(_check_names(estimators))
+    # linear light
+    light = linear_picture(image, calibration, in_colour=detector == "colour")
+    # detect
+    if box is not None:
+        found = cut_region(light, calibration, smoothing_px, box)
+    else:
+        found = DETECTORS[detector](light, calibration, smoothing_px, isolated)
+    # estimate
+    return Reconstruction(_estimate(found, chosen, calibration), found)
+
+
+def _estimate(found: Found, estimators: Mapping[str, Estimator], calibration: Calibration) -> list[Specularity]:
+    """Run each estimator on all patches of a picture."""
+    # Where the others are tells which light a highlight belongs to, so each patch holds their peaks.
+    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in found.regions]
+    patches = [_beside(patch, (*peaks[:i], *peaks[i + 1 :])) for i, patch in enumerate(found.patches)]
     made = {name: run_each(each, patches, calibration.camera, calibration.priors) for name, each in estimators.items()}
+    limited = found.frame.corrected.limited
+    rounded_px = SMALL_RADIUS * found.frame.smoothing_px
+    small = [_radius_px(highlight) < rounded_px for highlight in found.highlights] or [False] * len(patches)
     return [
-        Specularity(region, patch, {name: _flagged(results[i], patch, limited) for name, results in made.items()})
-        for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))
+        Specularity(
+            region, patch, {name: _flagged(results[i], patch, limited, small[i]) for name, results in made.items()}
+        )
+        for i, (region, patch) in enumerate(zip(found.regions, patches, strict=True))
     ]
 
 
@@ -190,37 +196,14 @@ def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> 
     return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
 
 
-def _noise(
-    corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float, seen: Mask | None
-) -> float | Image:
-    """Give the noise of a corrected frame before smoothing: estimated where it is white, then amplified with it."""
-    # A sensor that clips at full scale clips at 0 as well.
-    clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
-    white = estimate_noise(corrected.linear, seen, clipped)
-    if calibration.noise.is_silent and corrected.gain is None:
-        return white
-    known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)
-    noise = np.maximum(white, known)
-    return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
+def _radius_px(highlight: Highlight) -> float:
+    return math.sqrt(highlight.area_px / math.pi)
 
 
-def _at(noise: float | Image, pixel: tuple[int, int]) -> float:
-    return float(noise) if isinstance(noise, float) else float(noise[pixel[1], pixel[0]])
-
-
-def _noise_left(smoothing_px: float) -> float:
-    """Give the share of white noise that a Gaussian of this width leaves: 1 / (2 sqrt(pi) s) where it is wide."""
-    return 1 / math.sqrt(1 + 4 * math.pi * smoothing_px**2)
-
-
-def _is_highlight(region: Region, patch: Patch | Failure, noise: float, flat: Mask | None) -> bool:
-    """Tell whether nothing in a peak's shape speaks against one point highlight."""
-    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, noise, flat)
-    return isinstance(shape, Failure) or shape.is_highlight
-
-
-def _flagged(result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None) -> Estimate | Failure:
-    """Add the flags that hang on the frame, not on the estimator."""
+def _flagged(
+    result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None, small: bool
+) -> Estimate | Failure:
+    """Add the flags that depend on the frame, not on the estimator."""
     if isinstance(result, Failure) or isinstance(patch, Failure):
         return result
     masks = {"saturated": patch.saturated}
@@ -228,41 +211,12 @@ def _flagged(result: Estimate | Failure, patch: Patch | Failure, limited: Mask |
         (x, y), (height, width) = patch.origin_px, patch.values.shape
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    if not touched:
-        return result
-    isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
-    used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
-    flags = tuple(name for name, mask in touched.items() if (mask & used).any())
-    return replace(result, flags=(*result.flags, *flags))
-
-
-def check_frame(frame: npt.ArrayLike, camera: Camera) -> Image:
-    """Give a frame as float32 values, shape (H, W) or (H, W, C); raise `InputError` where it does not fit."""
-    try:
-        given = np.asarray(frame)
-    except (TypeError, ValueError):
-        raise InputError(
-            "frame: must be an array of numbers; its rows differ in length or hold something else"
-        ) from None
-    if given.dtype.kind not in "biuf":
-        raise InputError(f"frame holds values of type {given.dtype}: must be an array of real numbers")
-    # What float32 cannot hold becomes infinite and is refused below.
-    with np.errstate(all="ignore"):
-        image = given.astype(np.float32)
-    if image.ndim not in (2, 3) or image.size == 0:
-        raise InputError(f"frame has shape {image.shape}: must be (H, W) or (H, W, C)")
-    if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
-            "the size of the camera's calibration"
-        )
-    # The channels' mean may be beyond what float32 holds.
-    with np.errstate(all="ignore"):
-        finite = np.isfinite(image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32))
-    if not finite.all():
-        bad = int(np.count_nonzero(~finite))
-        raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
-    return image
+    flags = ("small",) if small else ()
+    if touched:
+        isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
+        used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
+        flags = (*(name for name, mask in touched.items() if (mask & used).any()), *flags)
+    return replace(result, flags=(*result.flags, *flags)) if flags else result
 
 
 def _calibration(camera: Camera | Calibration) -> Calibration:
@@ -280,7 +234,7 @@ def _check_names(names: Sequence[str]) -> Sequence[str]:
 
 
 def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Give a region as four plain integers; that it lies inside the frame is checked where it is cut."""
+    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
     try:
         x, y, width, height = (operator.index(value) for value in roi)
     except (TypeError, ValueError):

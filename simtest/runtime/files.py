@@ -9,6 +9,9 @@ from typing import Any
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
 
+JsonObject = dict[str, Any]
+"""An object as it stands in a JSON file: what records become when they are written, and are made of when read."""
+
 
 def refuse_file(folder: Path) -> None:
     """Raise `InputError` where a folder for results is wanted and a file stands."""
@@ -55,7 +58,14 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_json(path: Path, value: Any, compact: bool = False) -> None:
-    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none."""
+    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none.
+
+    Records in it are written by their `to_json`, or by their fields where they have none.
+    """
     how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
-    text = json.dumps(value, allow_nan=False, **how) + "\n"
+    text = json.dumps(value, allow_nan=False, default=_as_json, **how) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def _as_json(record: Any) -> Any:
+    return record.to_json() if hasattr(record, "to_json") else vars(record)

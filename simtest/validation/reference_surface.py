@@ -1,16 +1,25 @@
 """Comparison of reconstructed normals with a reference: a registered model, or a depth map."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.description import (
+    ComparisonRecord,
+    ErrorRecord,
+    ErrorSummary,
+    PictureRecord,
+    ReferenceRecord,
+    SpecularityRecord,
+)
 from simtest.runtime.resources import shown
 from simtest.spec.toml_input import read_toml
 from simtest.validation.depth_maps import (
@@ -133,21 +142,24 @@ Reference = MeshReference | DepthReference
 
 
 def load_reference(
-    path: Path, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None,
-    depth_kind: Literal["z", "distance"] = "z",
-) -> Reference:  # fmt: skip
-    """Read a reference: a mesh with its pose, or a depth map, which is in the camera frame already.
+    path: Path | None, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None
+) -> Reference | None:
+    """Read a reference, if any: a mesh with its pose, or a depth map, which is in the camera frame already.
 
     Raises
     ------
     InputError
-        If a file is missing or malformed, a mesh has no pose, a depth map has one, or sizes differ.
+        If a file is missing or malformed, a mesh has no pose, a pose no mesh, or sizes differ.
     """
+    if path is None:
+        if pose is not None:
+            raise InputError("--camera-from-model: needs --reference, the mesh that it places")
+        return None
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if pose is not None:
             raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
         depth = read_depth(path, depth_scale_mm)
-        points = depth_points(depth, camera, depth_kind)
+        points = depth_points(depth, camera)
         normals = depth_normals(points)
         return DepthReference(normals, judge_depth(points[..., 2], normals, camera), str(path))
     if pose is None:
@@ -212,63 +224,50 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
     return values
 
 
-def comparison(spots: Sequence[dict[str, Any]], camera: Camera, reference: Reference) -> dict[str, Any]:
-    """Compare the normals of specularities with a reference at their brightest points.
-
-    Each specularity gains ``reference``: the normal, and the angle of each estimator, deg: of the proposed normal, and
-    of the better candidate, as the article chooses by hand.
+def compare(record: PictureRecord, reference: Reference) -> PictureRecord:
+    """Compare the normals of a picture with a reference at their brightest points.
 
     Parameters
     ----------
-    spots : sequence of dict
-        As in normals.json; changed.
-    camera : Camera
-        Calibration.
+    record : PictureRecord
+        What was reconstructed.
     reference : MeshReference or DepthReference
+        What it is compared with.
 
     Returns
     -------
-    dict
-        The file, what is wrong with it, how many sightlines miss it, and by estimator: n, mean_deg, std_deg, and the
-        same of the better candidates.
+    PictureRecord
+        The same with the reference's normal and the errors of the estimators, deg, at each specularity that has a
+        peak: of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and
+        standard deviations by estimator stand in the picture's own ``reference``.
     """
-    placed = [spot for spot in spots if spot["peak_px"] is not None]
-    peaks = np.array([spot["peak_px"] for spot in placed], dtype=float).reshape(-1, 2)
-    normals = reference.normals_at(peaks, camera) if placed else np.empty((0, 3))
-    errors: dict[str, list[tuple[float, float]]] = {}
-    missed = 0
-    for spot, normal in zip(placed, normals, strict=True):
-        if not np.isfinite(normal).all():
-            spot["reference"] = None
-            missed += 1
-            continue
-        own = {}
-        for name, result in spot["estimates"].items():
-            if result["status"] == "ok":
-                angles = [angle_deg(np.array(candidate), normal) for candidate in result["candidates"]]
-                own[name] = {"error_deg": angles[0], "error_oracle_deg": min(angles)}
-                errors.setdefault(name, []).append((angles[0], min(angles)))
-        spot["reference"] = {"normal": normal.tolist(), "errors": own}
-    return {
-        "source": reference.source,
-        "problems": list(reference.notes),
-        "compared": len(placed) - missed,
-        "missed": missed,
-        "estimators": {name: _summary(np.array(pairs)) for name, pairs in errors.items()},
-    }
+    peaks = np.array([spot.peak_px for spot in record.specularities if spot.peak_px is not None], dtype=float)
+    normals = iter(reference.normals_at(peaks, record.camera) if len(peaks) else ())
+    spots = [
+        spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals)))
+        for spot in record.specularities
+    ]
+    met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
+    names = dict.fromkeys(name for errors in met for name in errors)
+    comparison = ComparisonRecord(
+        source=reference.source,
+        problems=list(reference.notes),
+        compared=len(met),
+        missed=len(peaks) - len(met),
+        estimators={name: _summary([errors[name] for errors in met if name in errors]) for name in names},
+    )
+    return replace(record, specularities=spots, reference=comparison)
 
 
-def angle_deg(first: Array, second: Array) -> float:
-    """Give the angle between two unit vectors, deg."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
+def _errors(spot: SpecularityRecord, normal: Array) -> ReferenceRecord:
+    if not np.isfinite(normal).all():
+        return ReferenceRecord(None, {})
+    angles = {name: angle_deg(estimate.candidates, normal) for name, estimate in spot.normals.items()}
+    errors = {name: ErrorRecord(float(own[0]), float(own.min())) for name, own in angles.items()}
+    return ReferenceRecord(normal.tolist(), errors)
 
 
-def _summary(pairs: Array) -> dict[str, Any]:
-    spread = pairs.std(axis=0, ddof=1) if len(pairs) > 1 else np.array([None, None])
-    return {
-        "n": len(pairs),
-        "mean_deg": float(pairs[:, 0].mean()),
-        "std_deg": None if spread[0] is None else float(spread[0]),
-        "mean_oracle_deg": float(pairs[:, 1].mean()),
-        "std_oracle_deg": None if spread[1] is None else float(spread[1]),
-    }
+def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:
+    pairs = np.array([(error.error_deg, error.error_oracle_deg) for error in errors])
+    spread = pairs.std(axis=0, ddof=1).tolist() if len(pairs) > 1 else (None, None)
+    return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1])
