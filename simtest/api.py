@@ -33,7 +33,7 @@ __all__ = [
 MAX_VIEWS = 1000
 
 TRIES = 10
-"""Places that are tried for each view wanted."""
+"""Viewpoints that are tried for each view wanted."""
 
 
 def render(
@@ -118,9 +118,9 @@ def sample_views(
 ) -> SampledViews:
     """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
 
-    Tried are the viewpoints 0, 1, 2, ..., or, where ``surface.view`` is not auto, places spread evenly over the camera
-    path; ten for each view wanted at most. Written are views.json, with the poses and what was left out, a picture of
-    each view, and sheet.png, which shows all of them; of a sequence film.avi too.
+    At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
+    spread over the camera path. The folder gets views.json, with the poses and what was left out, a picture of each
+    view, sheet.png, which shows all of them, and film.avi of a sequence.
 
     Parameters
     ----------
@@ -156,10 +156,10 @@ def sample_views(
     if not 1 <= count <= MAX_VIEWS:
         raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
     described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    places = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
+    viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
     writer = ViewWriter(Path(out), film=along is not None)
-    sampled = sample_views(described, count, places, variant, progress, writer.add, along is not None)
+    sampled = sample_views(described, count, viewpoints, variant, progress, writer.add, along is not None)
     writer.close()
     write_json(Path(out) / "views.json", sampled.as_dict(place_key(described)))
     return sampled
@@ -194,7 +194,7 @@ def validate(
     workers : int
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
-        Who does the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+        What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
 
     Returns
     -------

@@ -29,18 +29,8 @@ Box = tuple[int, int, int, int]
 class SmoothedFrame:
     """A corrected frame, smoothed, that patches are cut from.
 
-    Parameters
-    ----------
-    corrected : CorrectedFrame
-        The frame.
-    smoothed : ndarray of float32, shape (H, W)
-        Its intensity, smoothed.
-    noise : float, or ndarray of float32, shape (H, W)
-        Standard deviation of the intensity's noise before smoothing.
-    smoothing_px : float
-        Standard deviation of the Gaussian, px.
-    seen : ndarray of bool, shape (H, W), or None
-        The pixels inside the view mask.
+    `noise` is the standard deviation of the intensity's noise before smoothing, one for all pixels or each, shape
+    (H, W); `seen` are the pixels inside the view mask, None where all are.
     """
 
     corrected: CorrectedFrame
@@ -67,22 +57,11 @@ class SmoothedFrame:
 
 @dataclass(frozen=True)
 class Found:
-    """What a detector found in a picture.
+    """What a detector found in a picture: regions of interest, the brightest first, and the frame's patch at each.
 
-    Parameters
-    ----------
-    frame : SmoothedFrame
-        The light that the estimators see: the whole of it for peaks, its specular part by colour.
-    regions : list of Region
-        Regions of interest, the brightest first.
-    patches : list of Patch or Failure
-        The frame's crop at each of them.
-    highlights : sequence of Highlight
-        How each of them was judged; empty where the detector judges none.
-    others : sequence of Highlight
-        Highlights of the kinds that were not asked for.
-    view : View
-        The part of the picture that shows tissue, as far as it was looked for.
+    `frame` is the light that the estimators see: all of it for peaks, the specular part by colour. `highlights` says
+    how each region was judged and `others` what was left out, both empty where the detector judges none; `view` is the
+    part of the picture that shows tissue, as far as that was looked for.
     """
 
     frame: SmoothedFrame
@@ -148,15 +127,7 @@ def cut_region(light: LinearPicture, calibration: Calibration, smoothing_px: flo
 
 @dataclass(frozen=True)
 class PictureDetection:
-    """What a colour picture shows.
-
-    Parameters
-    ----------
-    view : View
-        The part of the picture that shows tissue.
-    detection : ColourDetection
-        Its highlights.
-    """
+    """What a colour picture shows: the part of it that is tissue, and its highlights."""
 
     view: View
     detection: ColourDetection

@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -23,23 +24,9 @@ VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpe
 
 
 def read_picture(path: Path) -> Image:
-    """Read a picture of 8 or 16 bits as intensities in [0, 1].
+    """Read a picture of 8 or 16 bits as values in [0, 1], as they are encoded; shape (H, W) or (H, W, 3), RGB.
 
-    The values are as they are encoded.
-
-    Parameters
-    ----------
-    path : Path
-        PNG, JPEG, BMP or TIFF; grey, RGB or RGBA (alpha is ignored).
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W) or (H, W, 3)
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no picture, or too large.
+    Grey, RGB and RGBA are read; alpha is ignored. Raises `InputError` as `read_raw` does, and for other depths.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
     largest = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}.get(picture.dtype.name)
@@ -59,7 +46,7 @@ def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
     Raises
     ------
     InputError
-        If the file is missing, no picture, or has more than 100 million pixels: told before it is decoded.
+        If the file is missing, no picture, or has more than 100 million pixels: checked before it is decoded.
     """
     if path.is_dir():
         raise InputError(f"{shown(path)}: is a folder; must be {wanted}")
@@ -89,7 +76,7 @@ def _check_size(path: Path) -> None:
     except PillowImage.DecompressionBombError as error:
         raise InputError(_too_large(path, str(error).split(",")[0])) from None
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
-        # OpenCV reads more formats than this, and says what is wrong with the others.
+        # OpenCV reads more formats than Pillow, and names what is wrong with the others.
         return
     if width * height > MAX_PIXELS:
         raise InputError(_too_large(path, f"{width} x {height} px"))
@@ -100,7 +87,7 @@ def _too_large(path: Path, size: str) -> str:
 
 
 def is_coloured(picture: Image) -> bool:
-    """Tell whether a picture has colours: three channels that are not all the same."""
+    """Return whether a picture has colours: three channels that are not all the same."""
     if picture.ndim != 3:
         return False
     red, green, blue = cv2.split(picture)
@@ -109,18 +96,9 @@ def is_coloured(picture: Image) -> bool:
 
 @dataclass(frozen=True)
 class SequenceFrame:
-    """A frame of a sequence.
+    """A frame of a sequence: its number, the file's name or the video's with the number, and its time in a video.
 
-    Parameters
-    ----------
-    index : int
-        From 0.
-    name : str
-        The file, or the video's name with the index.
-    time_s : float or None
-        From the video's start; None in folders.
-    read : callable
-        Gives the values as encoded, in [0, 1]; raises `InputError` where they cannot be read.
+    `read` returns the values as `read_picture` does; it raises `InputError` where they cannot be read.
     """
 
     index: int
@@ -131,84 +109,73 @@ class SequenceFrame:
 
 @dataclass(frozen=True)
 class Source:
-    """A folder of pictures, or a video.
-
-    Parameters
-    ----------
-    path : Path
-    count : int
-        How many frames there are; of a video, how many it says it has.
-    is_video : bool
-    files : tuple of Path
-        Of a folder.
-    """
+    """A folder with its picture files, or a video, which has none; `count` is how many frames it says it has."""
 
     path: Path
     count: int
-    is_video: bool
     files: tuple[Path, ...] = ()
 
+    @property
+    def is_video(self) -> bool:
+        """Whether the frames come from a video."""
+        return not self.files
+
     def frames(self) -> Iterator[SequenceFrame]:
-        """Give the frames in order; a video's end where it cannot be read any more."""
-        if not self.is_video:
-            for index, file in enumerate(self.files):
-                yield SequenceFrame(index, file.name, None, lambda file=file: read_picture(file))  # type: ignore[misc]
-            return
-        capture = cv2.VideoCapture(str(self.path))
-        try:
-            rate = float(capture.get(cv2.CAP_PROP_FPS))
-            index = 0
-            # A frame that is not wanted is skipped without being decoded.
-            while capture.grab():
-                time = index / rate if rate > 0 else None
-                yield SequenceFrame(index, f"{self.path.name}#{index}", time, lambda: _retrieve(capture, self.path))
-                index += 1
-        finally:
-            capture.release()
+        """Yield the frames in order; a video ends where it cannot be read any more."""
+        for index, file in enumerate(self.files):
+            yield SequenceFrame(index, file.name, None, partial(read_picture, file))
+        if self.is_video:
+            yield from _video_frames(self.path)
 
 
-def _retrieve(capture: cv2.VideoCapture, path: Path) -> Image:
-    done, frame = capture.retrieve()
-    if not done or frame is None:
-        raise InputError(f"{shown(path)}: a frame cannot be decoded")
-    values = frame.astype(np.float32) / np.float32(255)
-    return values if values.ndim == 2 else np.ascontiguousarray(values[:, :, ::-1])
+def _video_frames(path: Path) -> Iterator[SequenceFrame]:
+    capture = cv2.VideoCapture(str(path))
+
+    def read() -> Image:
+        done, frame = capture.retrieve()
+        if not done or frame is None:
+            raise InputError(f"{shown(path)}: a frame cannot be decoded")
+        values = frame.astype(np.float32) / np.float32(255)
+        return values if values.ndim == 2 else np.ascontiguousarray(values[:, :, ::-1])
+
+    try:
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        index = 0
+        # A frame that is not wanted is skipped without being decoded.
+        while capture.grab():
+            yield SequenceFrame(index, f"{path.name}#{index}", index / rate if rate > 0 else None, read)
+            index += 1
+    finally:
+        capture.release()
 
 
 def is_sequence(path: Path) -> bool:
-    """Tell whether a path is a folder, or a video by its suffix."""
+    """Return whether a path is a folder, or a video by its suffix."""
     return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def open_source(path: Path) -> Source:
-    """Open a folder or a video.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it holds no frame.
-    """
+    """Open a folder or a video; raise `InputError` if there is none, or it holds no frame."""
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
         if not files:
             raise InputError(f"{shown(path)}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
-        return Source(path, len(files), False, tuple(sorted(files, key=_natural)))
+        return Source(path, len(files), tuple(sorted(files, key=_natural)))
     if not path.is_file():
         raise InputError(f"{shown(path)}: no such file")
-    capture = cv2.VideoCapture(str(path)) if path.stat().st_size else None
-    try:
-        if capture is None or not capture.isOpened() or not capture.grab():
-            raise InputError(f"{shown(path)}: no video that can be read ({path.stat().st_size} bytes)")
-        width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if width * height > MAX_PIXELS:
-            raise InputError(f"{shown(path)}: {width} x {height} px; at most {MAX_PIXELS} px are allowed")
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    finally:
-        if capture is not None:
-            capture.release()
-    return Source(path, max(count, 1), True)
+    size = path.stat().st_size
+    capture = cv2.VideoCapture(str(path)) if size else None
+    # OpenCV opens some files that hold no frame, so the first is fetched.
+    if capture is None or not capture.isOpened() or not capture.grab():
+        raise InputError(f"{shown(path)}: no video that can be read ({size} bytes)")
+    keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
+    width, height, count = (int(capture.get(key)) for key in keys)
+    capture.release()
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{shown(path)}: {width} x {height} px; at most {MAX_PIXELS} px are allowed")
+    return Source(path, max(count, 1))
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort frame10 behind frame9."""
+    """Return the key that sorts frame10 behind frame9."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.name) if part]

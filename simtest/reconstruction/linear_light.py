@@ -21,14 +21,8 @@ _LEVELS = 2**16
 class LinearPicture:
     """A picture in linear light.
 
-    Parameters
-    ----------
-    encoded : ndarray of float32, shape (H, W) or (H, W, C)
-        The values as given.
-    corrected : CorrectedFrame
-        The mean of the channels with everything undone that the calibration knows.
-    channels : ndarray of float32, shape (H, W, 3), optional
-        Linear values of each channel, falloff included: only where light is split by colour.
+    Kept are the values as given, shape (H, W) or (H, W, C), and the mean of the channels with everything undone that
+    the calibration knows; where light is to be split by colour also the linear channels, falloff included.
     """
 
     encoded: Image

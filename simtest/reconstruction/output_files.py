@@ -39,28 +39,18 @@ FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.pl
 def write_outputs(
     out: Path, record: PictureRecord, picture: npt.NDArray[np.float32], depth_mm: Sequence[float] | None = None
 ) -> list[Path]:
-    """Write what was reconstructed in a picture, its overlay and its page.
+    """Write what was reconstructed in a picture, its overlay and its page; return the files.
 
     Parameters
     ----------
     out : Path
-        Folder, made if need be.
+        Folder, made if need be; raises `InputError` where it cannot be written.
     record : PictureRecord
         What was reconstructed.
     picture : ndarray of float32, shape (H, W) or (H, W, 3)
         Values as encoded, in [0, 1].
     depth_mm : sequence of float, optional
         Depth of each specularity's points and arrow, mm; default 1.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
     """
     spots, camera = record.specularities, record.camera
     depths = [1.0] * len(spots) if depth_mm is None else depth_mm

@@ -24,17 +24,7 @@ LEAST_FRAMES = 3
 
 
 def write_picture_page(path: Path, record: PictureRecord, picture: npt.NDArray[np.float32]) -> None:
-    """Write the page of a picture: its highlights one by one, to zoom and click.
-
-    Parameters
-    ----------
-    path : Path
-        The HTML file.
-    record : PictureRecord
-        What was reconstructed.
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        In [0, 1], as encoded, RGB.
-    """
+    """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
     spots = record.specularities
     palette = colours(name for spot in spots for name in spot.estimates)
     data = {

@@ -27,15 +27,7 @@ TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """What came of a sequence.
-
-    Parameters
-    ----------
-    frames, failed, specularities, tracks : int
-        Counts; a track is of two frames or more.
-    files : list of Path
-        timeline.csv, tracks.json, index.html.
-    """
+    """What came of a sequence: how many frames, specularities and tracks of two frames or more, and the files."""
 
     frames: int
     failed: int

@@ -24,21 +24,7 @@ DAMPING = 0.5
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """A frame of a sequence, its specularities numbered by their tracks.
-
-    Parameters
-    ----------
-    name : str
-        The file, or the video's name with the index.
-    index : int
-        From 0.
-    time_s : float, optional
-        From the video's start; None in folders.
-    size : tuple of int
-        Width and height, px.
-    specularities : list of SpecularityRecord
-        Without drawings.
-    """
+    """A frame of a sequence, its specularities numbered by their tracks and without drawings; its size is in px."""
 
     name: str
     index: int

@@ -1,4 +1,4 @@
-"""Comparison of reconstructed normals with a reference: a registered model, or a depth map."""
+"""Compare reconstructed normals with a reference: a mesh registered to the camera, or a depth map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,12 +35,12 @@ from simtest.validation.depth_maps import sample as sample_map
 Array = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
-"""Most that R^T R may differ from the identity, entry by entry: poses are written with a few digits."""
+"""Largest difference of R^T R from the identity, entry by entry: poses are written with a few digits."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A mesh with a tree to cast rays on it.
+    """A mesh with a tree that rays are cast on; poses share it.
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ class Model:
         return tree, vertices, faces
 
     def cast(self, origin: Array, directions: Array) -> Array:
-        """Give the normals where rays from a point, shape (3,), along (N, 3), meet the mesh first, facing the rays.
+        """Return the normals, facing the rays, where rays from a point, shape (3,), along (N, 3), first meet the mesh.
 
-        NaN where none does, and for directions that are not finite.
+        NaN for rays that miss it, and for directions that are not finite.
         """
         tree, vertices, faces = self._tree
         known = np.asarray(np.isfinite(directions).all(axis=1))
@@ -73,7 +73,7 @@ class Model:
         origins = np.ascontiguousarray(np.broadcast_to(origin, rays.shape))
         face, _, weights = tree.intersect_ray_first(vertices, faces, origins, rays)
         hit = known & (face >= 0)
-        # What the tree gives for rays that miss is not set.
+        # For rays that miss, the tree leaves the weights unset.
         u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
         corners = self.normals[faces[np.where(hit, face, 0)]]
         normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
@@ -85,17 +85,7 @@ class Model:
 
 @dataclass(frozen=True)
 class MeshReference:
-    """A model placed in the camera frame.
-
-    Parameters
-    ----------
-    model : Model
-        The mesh.
-    camera_from_model : ndarray, shape (4, 4)
-        Rigid.
-    source : str
-        The file.
-    """
+    """A model with its rigid pose, shape (4, 4), lengths in mm, and the file it came from."""
 
     model: Model
     camera_from_model: Array
@@ -103,24 +93,14 @@ class MeshReference:
     notes: tuple[str, ...] = ()
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Give the model's normals where the sightlines of pixels, shape (N, 2), meet it first; NaN where none does."""
+        """Return the normals where the sightlines of pixels, shape (N, 2), first meet the model; NaN where they miss."""
         R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
         return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
 
 
 @dataclass(frozen=True)
 class DepthReference:
-    """A depth map's normals.
-
-    Parameters
-    ----------
-    map : ndarray, shape (H, W, 3)
-        Unit normals, camera frame; NaN where there is none.
-    verdict : DepthVerdict
-        Whether they can serve.
-    source : str
-        The file.
-    """
+    """The normals of a depth map: unit, camera frame, shape (H, W, 3), NaN where there is none."""
 
     map: Array
     verdict: DepthVerdict
@@ -128,11 +108,11 @@ class DepthReference:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is wrong with it."""
+        """What is wrong with the map."""
         return self.verdict.problems
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Give the normals at pixels, shape (N, 2); NaN where there is none."""
+        """Return the normals at pixels, shape (N, 2); NaN where there is none."""
         del camera
         normal = sample_map(self.map, pixels)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
@@ -144,7 +124,7 @@ Reference = MeshReference | DepthReference
 def load_reference(
     path: Path | None, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None
 ) -> Reference | None:
-    """Read a reference, if any: a mesh with its pose, or a depth map, which is in the camera frame already.
+    """Read a reference: a mesh with its pose, or a depth map in the camera frame; None where no file is named.
 
     Raises
     ------
@@ -182,7 +162,7 @@ def read_pose(path: Path) -> Array:
     Raises
     ------
     InputError
-        If a key is missing or malformed, or the rotation is none.
+        If a key is missing or malformed, or the 3 x 3 part is no rotation.
     """
     data = read_toml(path)
     where = shown(path)
@@ -205,7 +185,7 @@ def read_pose(path: Path) -> Array:
     if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         what = "a mirror image" if off <= ROTATION_TOLERANCE else f"R^T R differs from the identity by {off:.2g}"
         raise InputError(f"{where}: the pose's 3 x 3 part is no rotation ({what}); it must be one, lengths in mm")
-    # The digits of the file are a little off; the nearest rotation is meant.
+    # A file's digits are rounded: take the nearest rotation.
     u, _, vt = np.linalg.svd(R)
     pose[:3, :3] = u @ vt
     return pose

@@ -8,8 +8,7 @@ from simtest.detection.light_split import fill, split_light
 from simtest.detection.view_mask import find_view
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.reconstruction.detectors import detect_in_picture
-from simtest.reconstruction.pipeline import reconstruct_colour
+from simtest.reconstruction import detect_in_picture, reconstruct_colour
 from studies.detection.scores import Scores, score
 from studies.detection.truth import SpecularTruth, specular_truth
 

@@ -5,7 +5,7 @@ import pytest
 
 from simtest.calibration import Calibration, srgb_encode
 from simtest.detection.blobs import Kind
-from simtest.reconstruction.pipeline import reconstruct_colour
+from simtest.reconstruction import reconstruct_colour
 from simtest.rendering import Session
 from simtest.spec import load_scene
 from studies.detection.frames import SPLITS, study_frames
