@@ -47,7 +47,7 @@ class RenamedModules:
         """Have the module look its names up in the new one."""
         old, new = module.__name__, str(module.__spec__ and module.__spec__.origin)
         _warn(old, new)
-        module.__getattr__ = lambda name: lookup(old, name, new)
+        module.__getattr__ = lambda name: lookup(old, name, new)  # type: ignore[method-assign]
 
 
 def lookup(module: str, name: str, home: str | None = None) -> Any:
@@ -66,4 +66,4 @@ def _warn(old: str, new: str) -> None:
 
 def install() -> None:
     """Let old module names be imported."""
-    sys.meta_path.append(RenamedModules)  # type: ignore[arg-type]
+    sys.meta_path.append(RenamedModules)

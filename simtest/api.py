@@ -66,8 +66,7 @@ def render(
     BackendError
         If the rendering backend cannot be used.
     """
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return make_frame(described, variant, progress)
+    return make_frame(_scene(scene, settings), variant, progress)
 
 
 def export(
@@ -80,12 +79,10 @@ def export(
 
     Parameters
     ----------
-    scene : Scene, str or Path
-        A scene, a scene file, or the name of a shipped scene.
+    scene, settings
+        As of `render`.
     out : str or Path
         Folder, made if need be.
-    settings : mapping, optional
-        Values that replace those of a scene file, by key path.
     variant : str, optional
         Mitsuba variant that parses the scene; the files are the same for all.
 
@@ -103,8 +100,7 @@ def export(
     """
     from simtest.rendering.mitsuba_export import export_scene
 
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return export_scene(described, Path(out), variant)
+    return export_scene(_scene(scene, settings), Path(out), variant)
 
 
 def sample_views(
@@ -124,16 +120,12 @@ def sample_views(
 
     Parameters
     ----------
-    scene : Scene, str or Path
-        Of an anatomy.
+    scene, settings, variant
+        As of `render`; the scene is one of an anatomy.
     out : str or Path
         Folder, made if need be.
     count : int
         Views wanted, 1 to 1000.
-    settings : mapping, optional
-        Values that replace those of a scene file, by key path.
-    variant : str, optional
-        Mitsuba variant.
     progress : callable, optional
         Called with views found, views wanted, and what was tried.
     along : tuple of float, optional
@@ -155,7 +147,7 @@ def sample_views(
 
     if not 1 <= count <= MAX_VIEWS:
         raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    described = _scene(scene, settings)
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
     writer = ViewWriter(Path(out), film=along is not None)
@@ -217,26 +209,25 @@ def validate(
     return write_report(run.folder)
 
 
+def _scene(scene: Scene | str | Path, settings: Mapping[str, Any] | None) -> Scene:
+    return scene if isinstance(scene, Scene) else load_scene(scene, settings)
+
+
 @dataclass(frozen=True)
 class Extras:
-    """What else a picture is reconstructed with.
-
-    Parameters
-    ----------
-    reference : Path, optional
-        Mesh in mm, or a depth map, to compare with.
-    pose : Path, optional
-        camera_from_model of the mesh.
-    depth : str, optional
-        Depth of the arrows: a number in mm, or a depth map.
-    depth_scale_mm : float, optional
-        mm of one step of an integer depth map.
-    """
+    """What else a picture is reconstructed with."""
 
     reference: Path | None = None
+    """Mesh in mm, or a depth map, to compare with."""
+
     pose: Path | None = None
+    """camera_from_model of the mesh."""
+
     depth: str | None = None
+    """Depth of the arrows: a number in mm, or a depth map."""
+
     depth_scale_mm: float | None = None
+    """mm of one step of an integer depth map."""
 
 
 def reconstruct_picture(

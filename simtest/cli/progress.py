@@ -36,21 +36,14 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
 
     `afterwards` is what the body does once all steps are done. A single step shows no bar.
     """
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
     )  # fmt: skip
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = rich.Progress(*columns, console=Console(stderr=True))
     task = bar.add_task("starting", total=None)
     with stop_between_steps() as check:
 

@@ -54,15 +54,7 @@ class Specularity:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The normals of a picture.
-
-    Parameters
-    ----------
-    specularities : list of Specularity
-        The brightest first.
-    found : Found
-        What the detector found: the view, the highlights behind the specularities, and those of other kinds.
-    """
+    """The normals of a picture, and what they were made of: the view, and highlights of all kinds."""
 
     specularities: list[Specularity]
     found: Found

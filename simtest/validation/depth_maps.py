@@ -252,7 +252,7 @@ def _turn_deg(normals: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else math.nan
 
 
-def sample(values: Array, points_px: Array) -> Array:
+def interpolate(values: Array, points_px: Array) -> Array:
     """Interpolate a map, shape (H, W, ...), bilinearly at pixel positions, shape (N, 2); NaN next to unknown pixels."""
     height, width = values.shape[:2]
     # Beyond the outermost pixel centres their values go on.
@@ -278,7 +278,7 @@ def depths_at(
             raise InputError(
                 f"--depth {shown(option)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
             ) from None
-        return [float(sample(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
+        return [float(interpolate(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
     if not (math.isfinite(depth) and depth > 0):
         raise InputError(f"--depth {option}: must be a positive number of mm, or a depth map")
     return [depth] * len(points_px)

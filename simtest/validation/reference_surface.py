@@ -24,13 +24,12 @@ from simtest.runtime.resources import shown
 from simtest.spec.toml_input import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
-    DepthVerdict,
     depth_normals,
     depth_points,
+    interpolate,
     judge_depth,
     read_depth,
 )
-from simtest.validation.depth_maps import sample as sample_map
 
 Array = npt.NDArray[np.float64]
 
@@ -40,14 +39,7 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Model:
-    """A mesh with a tree that rays are cast on; poses share it.
-
-    Parameters
-    ----------
-    vertices, normals : ndarray, shape (V, 3)
-        Model frame; mm and unit.
-    faces : ndarray of int, shape (F, 3)
-    """
+    """A mesh that rays are cast on: vertices, mm, and unit normals, shape (V, 3); faces, shape (F, 3)."""
 
     vertices: Array
     normals: Array
@@ -93,28 +85,23 @@ class MeshReference:
     notes: tuple[str, ...] = ()
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Return the normals where the sightlines of pixels, shape (N, 2), first meet the model; NaN where they miss."""
+        """Return the normals where sightlines of pixels, shape (N, 2), first meet the model; NaN where they miss it."""
         R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
         return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
 
 
 @dataclass(frozen=True)
 class DepthReference:
-    """The normals of a depth map: unit, camera frame, shape (H, W, 3), NaN where there is none."""
+    """The normals of a depth map: unit, camera frame, shape (H, W, 3), NaN where there is none; and what is wrong."""
 
     map: Array
-    verdict: DepthVerdict
     source: str
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is wrong with the map."""
-        return self.verdict.problems
+    notes: tuple[str, ...] = ()
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
         """Return the normals at pixels, shape (N, 2); NaN where there is none."""
         del camera
-        normal = sample_map(self.map, pixels)
+        normal = interpolate(self.map, pixels)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
@@ -141,7 +128,7 @@ def load_reference(
         depth = read_depth(path, depth_scale_mm)
         points = depth_points(depth, camera)
         normals = depth_normals(points)
-        return DepthReference(normals, judge_depth(points[..., 2], normals, camera), str(path))
+        return DepthReference(normals, str(path), judge_depth(points[..., 2], normals, camera).problems)
     if pose is None:
         raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare
