@@ -127,12 +127,12 @@ def _cells(spot: "SpecularityRecord") -> list[str]:
     from simtest.reconstruction.description import deviation_deg
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
-    x, y = spot.peak_px or (math.nan, math.nan)
+    x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
     deviation = None if best is None else deviation_deg(best)
     margin = None if published is None else published.choice_margin
     return [
-        str(spot.id), f"{x:.1f}", f"{y:.1f}", spot.highlight.kind if spot.highlight else "",
-        f"{spot.highlight.score:.2f}" if spot.highlight else "", spot.best or "none",
+        str(spot.id), f"{x:.1f}", f"{y:.1f}", spot.kind or "", "" if spot.score is None else f"{spot.score:.2f}",
+        spot.best or "none",
         " ".join(f"{v:+.3f}" for v in best.normal) if best else "", "" if deviation is None else f"{deviation:.2f}",
         "" if margin is None else f"{margin:.1f}", ", ".join(best.flags) if best else "",
     ]  # fmt: skip

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.reconstruction.description import SpecularityRecord, Vector
+from simtest.reconstruction.description import Array, SpecularityRecord
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
 
@@ -23,21 +23,24 @@ ABOUT = (
 )
 
 
+SHAPES = {"pixel": (2,), "sightline": (3,), "normal": (3,), "basis": (2, 3), "covariance": (2, 2)}
+
+
 @dataclass(frozen=True)
 class Constraint:
     """The best normal of a specularity (see `ABOUT`), with the candidates of `circle_pose` where it has any."""
 
     id: int
     track: int | None
-    pixel: Vector | None
-    sightline: Vector
-    normal: Vector
-    basis: list[Vector]
-    covariance: list[Vector] | None
+    pixel: Array | None
+    sightline: Array
+    normal: Array
+    basis: Array
+    covariance: Array | None
     estimator: str
-    candidates: list[Vector]
+    candidates: Array
     score: float | None
-    flags: list[str]
+    flags: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,16 @@ class Constraints:
                 track=spot.track,
                 pixel=spot.peak_px,
                 sightline=spot.sightline,
-                normal=best.normal.tolist(),
-                basis=np.concatenate(tangent_basis(best.normal[None])).tolist(),
-                covariance=None if best.covariance is None else best.covariance.tolist(),
+                normal=best.normal,
+                basis=np.concatenate(tangent_basis(best.normal[None])),
+                covariance=best.covariance,
                 estimator=spot.best,
-                candidates=spot.normals.get("circle_pose", best).candidates.tolist(),
-                score=None if spot.highlight is None else spot.highlight.score,
-                flags=list(best.flags),
+                candidates=spot.normals.get("circle_pose", best).candidates,
+                score=spot.score,
+                flags=best.flags,
             )
             for spot in spots
-            if spot.best and spot.sightline and (best := spot.best_estimate)
+            if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
         ]
         return cls(image, camera, made)
 
@@ -82,20 +85,19 @@ class Constraints:
         with NaN where there is no second, estimator (N,) as text.
         """
         every = self.constraints
+        stacked = {}
+        for name, shape in SHAPES.items():
+            rows = [getattr(constraint, name) for constraint in every]
+            filled = [np.full(shape, np.nan) if row is None else row for row in rows]
+            stacked[name] = np.array(filled, dtype=float).reshape(-1, *shape)
         candidates = np.full((len(every), 2, 3), np.nan)
         for pair, constraint in zip(candidates, every, strict=True):
-            given = np.array(constraint.candidates, dtype=float)[:2]
-            pair[: len(given)] = given
-        unknown = [[np.nan] * 2] * 2
+            pair[: len(constraint.candidates)] = constraint.candidates[:2]
         return {
             "version": np.array(VERSION),
-            "id": np.array([c.id for c in every], dtype=int),
-            "pixel": np.array([c.pixel for c in every], dtype=float).reshape(-1, 2),
-            "sightline": np.array([c.sightline for c in every], dtype=float).reshape(-1, 3),
-            "normal": np.array([c.normal for c in every], dtype=float).reshape(-1, 3),
-            "basis": np.array([c.basis for c in every], dtype=float).reshape(-1, 2, 3),
-            "covariance": np.array([c.covariance or unknown for c in every], dtype=float).reshape(-1, 2, 2),
+            "id": np.array([constraint.id for constraint in every], dtype=int),
+            **stacked,
             "candidates": candidates,
-            "estimator": np.array([c.estimator for c in every], dtype=str),
+            "estimator": np.array([constraint.estimator for constraint in every], dtype=str),
             "K": self.camera.K,
         }

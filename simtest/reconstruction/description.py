@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.detection import Region
-from simtest.detection.blobs import Highlight, Kind
+from simtest.detection.blobs import Highlight
 from simtest.detection.view_mask import View
 from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import Estimate, drawable
@@ -21,7 +21,8 @@ from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
 
-Vector = list[float]
+Array = npt.NDArray[np.float64]
+Points = list[list[float]]
 
 FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
 
@@ -38,8 +39,8 @@ UNSOUND = frozenset({"saturated", "missing_isovalues", "ambiguous_light"})
 class Drawing:
     """What is there to be drawn of an estimate, px: its isophotes, each with its isovalue, and the fitted curves."""
 
-    isophotes: list[tuple[float, list[Vector]]]
-    curves: list[list[Vector]]
+    isophotes: list[tuple[float, Points]]
+    curves: list[Points]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class ErrorRecord:
 class ReferenceRecord:
     """The reference's normal at a specularity, and each estimator's error; None where the sightline misses it."""
 
-    normal: Vector | None
+    normal: Array | None
     errors: dict[str, ErrorRecord]
 
     def to_json(self) -> JsonObject | None:
@@ -86,20 +87,22 @@ class ComparisonRecord:
 
 @dataclass(frozen=True)
 class SpecularityRecord:
-    """A specularity, described: its region, px, its sightline, and what each estimator made of it.
+    """A specularity, described: its region and peak, px, its sightline, and what each estimator made of it.
 
-    There is no peak where there is no patch, and no sightline where the lens images none. `best` names the estimator
-    whose normal is the best one, `track` is the specularity's number over the frames of a sequence; `drawings` are by
-    estimator.
+    There is no peak where there is no patch, and no sightline where the lens images none. `kind` and `score` are those
+    of its `highlight`, if the detector judges any. `best` names the estimator whose normal is the best one, `track` is
+    the specularity's number over the frames of a sequence; `drawings` are by estimator.
     """
 
     id: int
-    box_px: list[int]
-    peak_px: Vector | None
-    sightline: Vector | None
-    highlight: Highlight | None
+    box_px: tuple[int, int, int, int]
+    peak_px: Array | None
+    sightline: Array | None
+    kind: str | None
+    score: float | None
     best: str | None
     estimates: Mapping[str, Estimate | Failure]
+    highlight: Highlight | None = None
     drawings: Mapping[str, Drawing] = field(default_factory=dict)
     track: int | None = None
     reference: ReferenceRecord | None = None
@@ -115,10 +118,10 @@ class SpecularityRecord:
         return None if self.best is None else self.normals[self.best]
 
     @property
-    def position_px(self) -> Vector:
+    def position_px(self) -> Array:
         """The peak, or the middle of the region where there is none."""
         x, y, width, height = self.box_px
-        return self.peak_px or [x + width / 2, y + height / 2]
+        return np.array([x + width / 2, y + height / 2]) if self.peak_px is None else self.peak_px
 
     def to_json(self) -> JsonObject:
         """Return an entry of ``specularities``."""
@@ -135,16 +138,11 @@ class SpecularityRecord:
 
     @classmethod
     def from_json(cls, data: JsonObject) -> "SpecularityRecord":
-        """Read an entry of a sequence's frame, which has neither drawings nor a reference."""
-        box, peak = data["box_px"], data["peak_px"]
+        """Read an entry, as far as tables and tracks need it."""
+        peak, sightline = (None if data[key] is None else np.array(data[key]) for key in ("peak_px", "sightline"))
         estimates = {name: _estimate_from_json(entry) for name, entry in data["estimates"].items()}
-        highlight = None
-        if "kind" in data:
-            region = Region(tuple(box), tuple(np.array(peak, dtype=int).tolist()), data["specular_peak"])
-            outline = np.reshape(data["outline"], (-1, 2))
-            kind, score, area_px = Kind(data["kind"]), data["score"], data["area_px"]
-            highlight = Highlight(region, kind, score, area_px, **data["shape"], outline=outline)
-        return cls(data["id"], box, peak, data["sightline"], highlight, data["best"], estimates)
+        judged = (data.get("kind"), data.get("score"))
+        return cls(data["id"], tuple(data["box_px"]), peak, sightline, *judged, data["best"], estimates)
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ class PictureRecord:
             "camera": describe_camera(self.camera),
             "encoding": self.encoding,
             "detector": self.detector,
-            "view": None if self.view.seen is None else {"circle": self.view.circle, "outline": outline_of(self.view)},
+            "view": _view_json(self.view),
             "warnings": self.warnings,
             "frame": FRAME,
             "specularities": self.specularities,
@@ -184,19 +182,17 @@ class PictureRecord:
 
 def describe(made: Reconstruction, camera: Camera) -> list[SpecularityRecord]:
     """Describe each specularity of a reconstruction, with what the detector says of it."""
-    judged = made.found.highlights
-    return [
-        _describe(index, specularity, judged[index] if judged else None, camera)
-        for index, specularity in enumerate(made.specularities)
-    ]
+    judged: Sequence[Highlight | None] = made.found.highlights or [None] * len(made.specularities)
+    return [_describe(i, *pair, camera) for i, pair in enumerate(zip(made.specularities, judged, strict=True))]
 
 
 def _describe(index: int, specularity: Specularity, highlight: Highlight | None, camera: Camera) -> SpecularityRecord:
     patch, estimates = specularity.patch, specularity.estimates
-    peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()
+    peak = None if isinstance(patch, Failure) else patch.peak_px
     sightline = None if peak is None else camera.unproject(peak)
     # A lens sees no direction beyond its fold.
-    seen = None if sightline is None or not np.isfinite(sightline).all() else sightline.tolist()
+    if sightline is not None and not np.isfinite(sightline).all():
+        sightline = None
     drawings = {
         name: Drawing(
             [(t, np.round(points, 3).tolist()) for t, points in result.contours(patch)],
@@ -205,8 +201,9 @@ def _describe(index: int, specularity: Specularity, highlight: Highlight | None,
         for name, result in estimates.items()
         if isinstance(result, Estimate)
     }
-    box = list(specularity.region.box)
-    return SpecularityRecord(index, box, peak, seen, highlight, best_of(estimates), estimates, drawings)
+    kind, score = (None, None) if highlight is None else (str(highlight.kind), highlight.score)
+    box, best = specularity.region.box, best_of(estimates)
+    return SpecularityRecord(index, box, peak, sightline, kind, score, best, estimates, highlight, drawings)
 
 
 def without_drawings(spots: Sequence[SpecularityRecord]) -> list[SpecularityRecord]:
@@ -228,55 +225,52 @@ def deviation_deg(estimate: Estimate) -> float | None:
     return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
 
 
-def outline_of(view: View) -> list[Vector]:
-    """Return the outline, px, of what is seen; empty where the whole picture is."""
+def _view_json(view: View) -> JsonObject | None:
+    """Describe the view's border: its circle where it is round, and the outline of what is seen."""
     if view.seen is None:
-        return []
+        return None
     contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
-    return [[float(x) + PIXEL_CENTRE, float(y) + PIXEL_CENTRE] for x, y in polygon]
+    return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
 
 
 def _highlight_json(highlight: Highlight) -> JsonObject:
     return {
-        "kind": str(highlight.kind),
+        "kind": highlight.kind,
         "score": highlight.score,
         "area_px": highlight.area_px,
         "specular_peak": highlight.region.contrast,
         "shape": {name: getattr(highlight, name) for name in ("axis_ratio", "residual", "wander", "tint", "clutter")},
-        "outline": np.round(highlight.outline, 2).tolist(),
+        "outline": np.round(highlight.outline, 2),
     }
 
 
 def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonObject:
     if isinstance(result, Failure):
-        return {"status": str(result.reason), "detail": result.detail}
-    entry = {
+        return {"status": result.reason, "detail": result.detail}
+    entry: JsonObject = {
         "status": "ok",
-        "normal": result.normal.tolist(),
-        "candidates": result.candidates.tolist(),
+        "normal": result.normal,
+        "candidates": result.candidates,
         "choice_margin": result.choice_margin,
         "look_px": [float(v) if np.isfinite(v) else None for v in result.look_px],
         "axis_ratio": result.axis_ratio,
         "isovalues": [isophote.isovalue for isophote in result.isophotes],
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "covariance": result.covariance,
         "curvature": None,
-        "flags": list(result.flags),
+        "flags": result.flags,
     }
-    if (curvature := result.curvature) is not None:
-        gains = None if curvature.hypotheses is None else curvature.hypotheses.tolist()
-        directions = curvature.directions.tolist()
-        entry["curvature"] = {"directions": directions, "axis_ratio": curvature.axis_ratio, "gains": gains}
+    if (shape := result.curvature) is not None:
+        entry["curvature"] = {"directions": shape.directions, "axis_ratio": shape.axis_ratio, "gains": shape.hypotheses}
     if drawing is not None:
         entry["isophotes"] = [{"t": t, "points": points} for t, points in drawing.isophotes]
-        entry["ellipses"] = [i.conic.image.tolist() for i in result.isophotes if i.conic is not None]
-        entry["cones"] = [isophote.cone.tolist() for isophote in result.isophotes]
+        entry["ellipses"] = [isophote.conic.image for isophote in result.isophotes if isophote.conic is not None]
+        entry["cones"] = [isophote.cone for isophote in result.isophotes]
         entry["curves"] = drawing.curves
     return entry
 
 
 def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
-    """Read an estimator's entry, as far as tables and tracks need it."""
     if entry["status"] != "ok":
         return Failure(Reason(entry["status"]), entry["detail"])
     covariance = None if entry["covariance"] is None else np.array(entry["covariance"])

@@ -14,12 +14,10 @@ from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction.constraints import Constraints
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord
+from simtest.reconstruction.description import Array, PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.files import make_folder, write_atomically, write_json
-
-Array = npt.NDArray[np.float64]
 
 MANY = 10
 """Above so many specularities normals.json is written on one line: most of it are outlines."""
@@ -78,19 +76,18 @@ def write_outputs(
 def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, ...]]:
     """Yield a row of `COLUMNS` for each specularity, estimator and candidate; candidate 0 is the proposed normal."""
     for spot in spots:
-        peak = spot.peak_px or (None, None)
-        judged = (spot.highlight.kind, spot.highlight.score) if spot.highlight else (None, None)
+        peak = (None, None) if spot.peak_px is None else spot.peak_px.tolist()
         for name, result in spot.estimates.items():
             best = int(name == spot.best)
             if isinstance(result, Failure):
                 nothing = (None,) * 7
-                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *peak, *judged)
+                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *peak, spot.kind, spot.score)
                 continue
             look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
             covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
             seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
             for k, normal in enumerate(result.candidates.tolist()):
-                yield (spot.id, name, "ok", k, *normal, *seen, *peak, *judged)
+                yield (spot.id, name, "ok", k, *normal, *seen, *peak, spot.kind, spot.score)
 
 
 def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:

@@ -7,11 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.pages.style import colours
-from simtest.reconstruction.description import SpecularityRecord, Vector
+from simtest.reconstruction.description import Array, Points, SpecularityRecord
 
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
-Array = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 SHORTEST_PX, CROWDED_PX = 900, 2000
@@ -85,7 +84,7 @@ def _draw_spot(
                 _arrow(canvas, result.look_px, normal, colour, size, 1 if k else 2)
 
 
-def _polyline(canvas: Bytes, points: Sequence[Vector], colour: Colour, scale: int) -> None:
+def _polyline(canvas: Bytes, points: Points, colour: Colour, scale: int) -> None:
     if len(points) < 2:
         return
     # Pixel centres are at + 0.5 here, and integers in OpenCV.

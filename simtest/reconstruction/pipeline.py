@@ -121,20 +121,15 @@ def reconstruct_colour(
         RGB values as encoded, in [0, 1].
     camera : Camera or Calibration
         Of the same size. Where it has no response, sRGB is taken; where it has no view mask, that of the picture.
-    estimators, smoothing_px
-        As of `reconstruct`.
     isolated : bool
         Leave out highlights of the other kinds.
+    estimators, smoothing_px
+        As of `reconstruct`, as are the errors raised.
 
     Returns
     -------
     Reconstruction
         Estimates of highlights that smoothing has made rounder have the flag ``small``.
-
-    Raises
-    ------
-    InputError
-        As `reconstruct`.
     """
     return run_pipeline(picture, camera, "colour", estimators, None, smoothing_px, isolated)
 

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.pages.html import write_page
 from simtest.pages.style import colours
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord, Vector, deviation_deg
+from simtest.reconstruction.description import PictureRecord, SpecularityRecord, deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.files import JsonObject
 
@@ -30,12 +29,7 @@ def write_picture_page(path: Path, record: PictureRecord, picture: npt.NDArray[n
     data = {
         "spots": [_spot(spot, palette) for spot in spots],
         "others": [
-            {
-                "kind": h.kind,
-                "outline": _rounded(h.outline, 1),
-                "peak": [v + PIXEL_CENTRE for v in h.region.peak],
-                "score": h.score,
-            }
+            {"kind": h.kind, "outline": np.round(h.outline, 1), "peak": np.add(h.region.peak, 0.5), "score": h.score}
             for h in record.other_highlights
         ],
         "colours": palette,
@@ -77,8 +71,8 @@ def _spot(spot: SpecularityRecord, palette: dict[str, str]) -> JsonObject:
         "id": spot.id,
         "peak": spot.position_px,
         "size": max(spot.box_px[2:]),
-        "kind": spot.highlight and spot.highlight.kind,
-        "score": spot.highlight and spot.highlight.score,
+        "kind": spot.kind,
+        "score": spot.score,
         "best": spot.best,
         "rows": [
             {"name": name, "colour": palette[name], **_row(name, result, spot)}
@@ -94,16 +88,12 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord) -> Json
     drawing = spot.drawings[name]
     return {
         "status": "ok",
-        "normals": _rounded(result.candidates, 4),
+        "normals": np.round(result.candidates, 4),
         "margin": result.choice_margin,
         "look": [v if np.isfinite(v) else None for v in result.look_px.tolist()],
-        "isophotes": [_rounded(points, 1) for _, points in drawing.isophotes],
-        "curves": [_rounded(curve, 1) for curve in drawing.curves],
+        "isophotes": [np.round(points, 1) for _, points in drawing.isophotes],
+        "curves": [np.round(curve, 1) for curve in drawing.curves],
         "deviation": deviation_deg(result),
         "flags": result.flags,
         "error": error and error.error_deg,
     }
-
-
-def _rounded(points: npt.ArrayLike, digits: int) -> list[Vector]:
-    return np.round(np.asarray(points, dtype=float), digits).tolist()

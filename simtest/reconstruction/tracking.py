@@ -7,10 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from simtest.reconstruction.description import SpecularityRecord, Vector
+from simtest.reconstruction.description import Array, SpecularityRecord
 from simtest.runtime.files import JsonObject
-
-Array = npt.NDArray[np.float64]
 
 REACH_SHARE = 0.03
 """How far a specularity may move between frames from where it is expected, as a share of the picture's longer side."""
@@ -47,8 +45,8 @@ class Track:
     track: int
     frames: list[int]
     times_s: list[float | None]
-    peaks_px: list[Vector | None]
-    normals: list[Vector | None]
+    peaks_px: list[Array | None]
+    normals: list[Array | None]
 
 
 def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
@@ -62,7 +60,7 @@ def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
             track.frames.append(frame.index)
             track.times_s.append(frame.time_s)
             track.peaks_px.append(spot.peak_px)
-            track.normals.append(None if best is None else best.normal.tolist())
+            track.normals.append(None if best is None else best.normal)
     return [tracks[number] for number in sorted(tracks)]
 
 
@@ -94,7 +92,7 @@ class Tracker:
         self._tracks: list[_Moving] = []
         self._count = 0
 
-    def update(self, positions_px: Sequence[Sequence[float]]) -> list[int]:
+    def update(self, positions_px: Sequence[npt.ArrayLike]) -> list[int]:
         """Return the track of each specularity of the next frame, by their positions, px."""
         points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)

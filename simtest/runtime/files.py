@@ -60,12 +60,15 @@ def sync_folder(folder: Path) -> None:
 def write_json(path: Path, value: Any, compact: bool = False) -> None:
     """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none.
 
-    Records in it are written by their `to_json`, or by their fields where they have none.
+    Arrays in it are written as lists, records by their `to_json`, or by their fields where they have none.
     """
     how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
-    text = json.dumps(value, allow_nan=False, default=_as_json, **how) + "\n"
+    text = json.dumps(value, allow_nan=False, default=as_json, **how) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
-def _as_json(record: Any) -> Any:
-    return record.to_json() if hasattr(record, "to_json") else vars(record)
+def as_json(value: Any) -> Any:
+    """Return what JSON holds of an array or a record."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return value.to_json() if hasattr(value, "to_json") else vars(value)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -38,37 +37,6 @@ WORST_ERROR_DEG = 1.0
 
 WORST_TURN_DEG = 10.0
 """Largest turn of the normal over the width of its own window, at nine tenths of the pixels."""
-
-
-@dataclass(frozen=True)
-class DepthVerdict:
-    """Whether a depth map's normals can serve as a reference for highlights.
-
-    Parameters
-    ----------
-    valid_share : float
-        Share of the pixels that have a normal.
-    frontal_share : float
-        Share of the normals within 1 deg of the direction back along the optical axis.
-    flat_share : float
-        Share of neighbouring pixels with exactly the same depth.
-    step_mm : float
-        Median step between neighbouring values; 0 where they are not quantised.
-    error_deg : float
-        Standard deviation of a normal at the median depth that such steps cause.
-    turn_deg : float
-        Ninth decile of the angle that the normal turns over its own window.
-    problems : tuple of str
-        In words; empty if the map can serve.
-    """
-
-    valid_share: float
-    frontal_share: float
-    flat_share: float
-    step_mm: float
-    error_deg: float
-    turn_deg: float
-    problems: tuple[str, ...] = field(default=())
 
 
 def read_depth(path: Path, scale_mm: float | None = None) -> Array:
@@ -138,21 +106,10 @@ def _read_exr(path: Path) -> npt.NDArray[np.generic]:
 
 
 def depth_points(depth: Array, camera: Camera, kind: Literal["z", "distance"] = "z") -> Array:
-    """Return the surface points of a depth map, shape (H, W, 3), mm, camera frame.
+    """Return the surface points of a depth map, mm, shape (H, W, 3), camera frame.
 
-    Parameters
-    ----------
-    depth : ndarray, shape (H, W)
-        mm.
-    camera : Camera
-        Of the same size.
-    kind : {"z", "distance"}
-        Along the optical axis, or along the sightline.
-
-    Raises
-    ------
-    InputError
-        If the sizes differ.
+    The depth is along the optical axis (`kind` "z"), or along the sightline ("distance"). Raises `InputError` if the
+    camera is of another size.
     """
     if depth.shape != (camera.height, camera.width):
         raise InputError(
@@ -202,54 +159,36 @@ def _whole(known: Mask) -> Mask:
     return cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
 
 
-def judge_depth(depth: Array, normals: Array, camera: Camera) -> DepthVerdict:
-    """Judge whether the normals of a depth map are degenerate, or too coarse for highlights.
-
-    Parameters
-    ----------
-    depth : ndarray, shape (H, W)
-        mm.
-    normals : ndarray, shape (H, W, 3)
-        See `depth_normals`.
-    camera : Camera
-        Calibration.
-
-    Returns
-    -------
-    DepthVerdict
-    """
+def depth_problems(depth: Array, normals: Array, camera: Camera) -> tuple[str, ...]:
+    """Return why a depth map, mm, with its normals, shape (H, W, 3), is degenerate or too coarse for highlights."""
     sound = np.isfinite(normals).all(axis=-1)
-    share = float(sound.mean())
     if not sound.any():
-        return DepthVerdict(0.0, math.nan, math.nan, math.nan, math.nan, math.nan, ("no pixel has a normal",))
+        return ("no pixel has a normal",)
+    problems = []
+    # degenerate: no slopes, or a staircase
     frontal = float(np.mean(-normals[sound][:, 2] > math.cos(math.radians(FRONTAL_DEG))))
     pairs = np.isfinite(depth[:, 1:]) & np.isfinite(depth[:, :-1])
     flat = float(np.mean((depth[:, 1:] == depth[:, :-1])[pairs])) if pairs.any() else math.nan
+    if frontal > FRONTAL_SHARE:
+        problems.append(f"degenerate: {100 * frontal:.0f} % of the normals point straight back along the optical axis")
+    elif flat > FLAT_SHARE:
+        problems.append(f"degenerate: {100 * flat:.0f} % of neighbouring pixels have the same depth, a staircase")
+    # too coarse: its values are quantised, so that they repeat
     values = np.unique(depth[np.isfinite(depth)])
     step = float(np.median(np.diff(values))) if len(values) < depth.size / 50 and len(values) > 1 else 0.0
     # Quantisation is noise of step / sqrt(12); the least-squares slope over the window keeps this share of it.
     side = 2 * RADIUS_PX + 1
     left = step / math.sqrt(12) / math.sqrt(side * sum(k * k for k in range(-RADIUS_PX, RADIUS_PX + 1)))
     error = math.degrees(math.atan(left * camera.fx / float(np.nanmedian(depth))))
-    turn = _turn_deg(normals)
-    problems = []
-    if frontal > FRONTAL_SHARE:
-        problems.append(f"degenerate: {100 * frontal:.0f} % of the normals point straight back along the optical axis")
-    elif flat > FLAT_SHARE:
-        problems.append(f"degenerate: {100 * flat:.0f} % of neighbouring pixels have the same depth, a staircase")
     if error > WORST_ERROR_DEG:
         problems.append(f"too coarse for highlights: steps of {step:.3g} mm cost a normal {error:.2g} deg")
-    if turn > WORST_TURN_DEG:
-        problems.append(f"too coarse for highlights: normals turn by {turn:.2g} deg over {side} px")
-    return DepthVerdict(share, frontal, flat, step, error, turn, tuple(problems))
-
-
-def _turn_deg(normals: Array) -> float:
-    """Return the ninth decile of the angle between normals a window apart, deg."""
-    side = 2 * RADIUS_PX + 1
+    # too coarse: the normal turns within its own window
     cosine = np.einsum("hwi,hwi->hw", normals[:, side:], normals[:, :-side])
     cosine = cosine[np.isfinite(cosine)]
-    return float(np.degrees(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else math.nan
+    turn = math.degrees(math.acos(float(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else 0.0
+    if turn > WORST_TURN_DEG:
+        problems.append(f"too coarse for highlights: normals turn by {turn:.2g} deg over {side} px")
+    return tuple(problems)
 
 
 def interpolate(values: Array, points_px: Array) -> Array:
@@ -267,7 +206,7 @@ def interpolate(values: Array, points_px: Array) -> Array:
 
 
 def depths_at(
-    option: str, points_px: Sequence[Sequence[float] | None], size: tuple[int, int], scale_mm: float | None
+    option: str, points_px: Sequence[npt.ArrayLike | None], size: tuple[int, int], scale_mm: float | None
 ) -> list[float]:
     """Return the depth at pixel positions, mm: one number for all, or that of a depth map; NaN where there is none."""
     try:

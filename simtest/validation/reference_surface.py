@@ -26,8 +26,8 @@ from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
     depth_normals,
     depth_points,
+    depth_problems,
     interpolate,
-    judge_depth,
     read_depth,
 )
 
@@ -128,7 +128,7 @@ def load_reference(
         depth = read_depth(path, depth_scale_mm)
         points = depth_points(depth, camera)
         normals = depth_normals(points)
-        return DepthReference(normals, str(path), judge_depth(points[..., 2], normals, camera).problems)
+        return DepthReference(normals, str(path), depth_problems(points[..., 2], normals, camera))
     if pose is None:
         raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare
@@ -231,7 +231,7 @@ def _errors(spot: SpecularityRecord, normal: Array) -> ReferenceRecord:
         return ReferenceRecord(None, {})
     angles = {name: angle_deg(estimate.candidates, normal) for name, estimate in spot.normals.items()}
     errors = {name: ErrorRecord(float(own[0]), float(own.min())) for name, own in angles.items()}
-    return ReferenceRecord(normal.tolist(), errors)
+    return ReferenceRecord(normal, errors)
 
 
 def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:

@@ -17,7 +17,7 @@ from simtest.reconstruction.image_io import is_coloured, open_source, read_pictu
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.reconstruction.tracking import Tracker
-from simtest.validation.depth_maps import depth_normals, depth_points, depths_at, judge_depth, read_depth
+from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
 from simtest.validation.reference_surface import load_reference, read_pose
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
@@ -389,15 +389,14 @@ def test_depth_maps_of_all_formats(tmp_path, suffix):
     integers = suffix in ("png", "tiff")
     found = read_depth(path, scale if integers else None)
     np.testing.assert_allclose(found, depth, atol=0.6 * scale if integers else 1e-4)
-    verdict = judge_depth(found, depth_normals(depth_points(found, CAMERA)), CAMERA)
-    assert verdict.problems == ()
+    assert depth_problems(found, depth_normals(depth_points(found, CAMERA)), CAMERA) == ()
     if integers:
         told(lambda: read_depth(path), "--depth-scale must say how many mm one step is")
 
 
 def test_degenerate_and_coarse_maps_are_told():
     def problems(depth):
-        return judge_depth(depth, depth_normals(depth_points(depth, CAMERA)), CAMERA).problems
+        return depth_problems(depth, depth_normals(depth_points(depth, CAMERA)), CAMERA)
 
     assert "degenerate" in problems(np.full((HEIGHT, WIDTH), 50.0))[0]
     slanted = plane_depth(np.array([0.5, 0.0, -0.8]) / np.hypot(0.5, 0.8))
