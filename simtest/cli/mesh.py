@@ -11,6 +11,8 @@ from simtest.cli.options import replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
+Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)]
+
 
 @mesh.command
 def check(
@@ -62,9 +64,7 @@ class Recipe:
     """The options of an anatomy: its recipe, and where its mesh goes."""
 
     out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
-    seed: Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)] = (
-        None
-    )
+    seed: Seed = None
     edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
     recipe: Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")] = None
     settings: Annotated[list[str] | None, replacing("length_mm=40")] = None

@@ -69,10 +69,13 @@ def reconstruct(
     from simtest.reconstruction.image_io import is_sequence
     from simtest.reconstruction.picture import Options, parse_roi
 
+    sequence = is_sequence(image)
+    if sequence and (reference or camera_from_model or depth):
+        raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     box = None if roi is None else parse_roi(roi)
     names = None if estimators is None else tuple(estimators)
     options = Options(camera, fov, names, box, encoding, every, detector, smoothing)
-    if not is_sequence(image):
+    if not sequence:
         from simtest.api import Extras, reconstruct_picture
 
         extras = Extras(reference, camera_from_model, depth, depth_scale)
@@ -81,8 +84,6 @@ def reconstruct(
         count = len(record.specularities)
         print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
     else:
-        if reference or camera_from_model or depth:
-            raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
         from simtest.cli.progress import progress_bar
         from simtest.reconstruction.sequence import reconstruct_sequence
 

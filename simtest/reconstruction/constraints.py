@@ -22,8 +22,8 @@ ABOUT = (
     "candidates[i] holds all normals that the data allow."
 )
 
-
 SHAPES = {"pixel": (2,), "sightline": (3,), "normal": (3,), "basis": (2, 3), "covariance": (2, 2)}
+"""Of what constraints.npz stacks."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ UNSOUND = frozenset({"saturated", "missing_isovalues", "ambiguous_light"})
 
 @dataclass(frozen=True)
 class Drawing:
-    """What is there to be drawn of an estimate, px: its isophotes, each with its isovalue, and the fitted curves."""
+    """What drawings need of an estimate, px: its isophotes, each with its isovalue, and the fitted curves."""
 
     isophotes: list[tuple[float, Points]]
     curves: list[Points]
@@ -207,7 +207,7 @@ def _describe(index: int, specularity: Specularity, highlight: Highlight | None,
 
 
 def without_drawings(spots: Sequence[SpecularityRecord]) -> list[SpecularityRecord]:
-    """Return the same without the points that are there to be drawn."""
+    """Return the same without what only drawings need."""
     return [replace(spot, drawings={}) for spot in spots]
 
 

@@ -91,18 +91,19 @@ def find_peaks(light: LinearPicture, calibration: Calibration, smoothing_px: flo
 
 
 def find_in_colour(light: LinearPicture, calibration: Calibration, smoothing_px: float, isolated: bool) -> Found:
-    """Find the highlights by the tissue's colour; the frame that remains is the specular light alone."""
+    """Find the highlights by the tissue's colour; the frame that patches are cut from is the specular light alone."""
     corrected, channels = light.corrected, light.channels
     assert channels is not None
     assert corrected.saturated is not None
-    shown = _shown(light.encoded, channels, corrected.saturated, calibration.camera.seen)
-    detection = shown.detection
-    # Light was split in linear values, whose noise is white; falloff is divided away afterwards.
+    found = _detect(light.encoded, channels, corrected.saturated, calibration.camera.seen)
+    detection = found.detection
+    # Light is split before the falloff is divided away: there its noise is white.
     specular = detection.light.specular
     own = specular if corrected.gain is None else specular * corrected.gain
     frame = SmoothedFrame.of(
-        replace(corrected, intensity=own, linear=specular), calibration, smoothing_px, shown.view.seen
+        replace(corrected, intensity=own, linear=specular), calibration, smoothing_px, found.view.seen
     )
+    # select
     taken = detection.isolated if isolated else detection.highlights
     return Found(
         frame,
@@ -110,7 +111,7 @@ def find_in_colour(light: LinearPicture, calibration: Calibration, smoothing_px:
         [frame.patch(highlight.region.box, highlight.region.peak) for highlight in taken],
         taken,
         [highlight for highlight in detection.highlights if isolated and not highlight.is_isolated],
-        shown.view,
+        found.view,
     )
 
 
@@ -153,10 +154,10 @@ def detect_in_picture(
     -------
     PictureDetection
     """
-    return _shown(picture, decode(picture, response or Response("srgb")), clipped_pixels(picture, level), seen)
+    return _detect(picture, decode(picture, response or Response("srgb")), clipped_pixels(picture, level), seen)
 
 
-def _shown(encoded: Image, channels: Image, clipped: Mask, seen: Mask | None) -> PictureDetection:
+def _detect(encoded: Image, channels: Image, clipped: Mask, seen: Mask | None) -> PictureDetection:
     view = find_view(encoded) if seen is None else View(seen)
     return PictureDetection(view, detect_colour(channels, clipped, view.seen))
 
@@ -166,6 +167,7 @@ def _noise(
 ) -> float | Image:
     """Return the noise of a corrected frame before smoothing: the larger of what is known and what is seen."""
     known = None
+    # Without a noise model, and with the same gain everywhere, one number serves for all pixels.
     if not calibration.noise.is_silent or corrected.gain is not None:
         known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)
     # A sensor that clips at full scale clips at 0 as well.
@@ -183,7 +185,7 @@ def _at(noise: float | Image, pixel: tuple[int, int]) -> float:
 
 
 def _noise_left(smoothing_px: float) -> float:
-    """Return the share of white noise that a Gaussian of this width leaves: 1 / (2 sqrt(pi) s) where it is wide."""
+    """Return the share of white noise that a Gaussian of this width leaves: 1 / (2 sqrt(pi) s) if it is wide."""
     return 1 / math.sqrt(1 + 4 * math.pi * smoothing_px**2)
 
 

@@ -37,6 +37,7 @@ def read_picture(path: Path) -> Image:
     scaled: Image = np.asarray(picture, dtype=np.float32) / np.float32(largest)
     if scaled.ndim == 3 and scaled.shape[2] == 1:
         scaled = scaled[:, :, 0]
+    # OpenCV's order of channels is BGR or BGRA.
     return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, 2::-1])
 
 
@@ -69,6 +70,7 @@ def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
 def _check_size(path: Path) -> None:
     """Raise `InputError` where a file's header announces too many pixels."""
     try:
+        # Pillow warns of large pictures, and refuses them at twice its own limit.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with PillowImage.open(path) as header:

@@ -14,7 +14,7 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 _LEVELS = 2**16
-"""As many values as a picture can have; its response is looked up in a table of them."""
+"""How many values a picture can have; its response is looked up in a table of them."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class LinearPicture:
 
 
 def linear_picture(encoded: Image, calibration: Calibration, in_colour: bool) -> LinearPicture:
-    """Bring a picture to linear light, and keep its channels apart where light is to be split by colour."""
+    """Bring a picture to linear light; `in_colour` keeps its channels too, for light that is split by colour."""
     if not in_colour:
         return LinearPicture(encoded, calibration.correct(encoded))
     level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
@@ -45,6 +45,7 @@ def decode(picture: Image, response: Response) -> Image:
     """Return the linear values of a picture of at most 16 bits, shape (H, W, 3), in [0, 1]."""
     if response.kind == "linear":
         return picture
+    # A table of all 16-bit values is faster than the curve at each pixel, and exact for pictures of 8 and 16 bits.
     table = response.decode(np.linspace(0, 1, _LEVELS)).astype(np.float32)
     steps = cv2.multiply(picture, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)
     return np.asarray(table[steps])

@@ -20,7 +20,7 @@ from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.files import make_folder, write_atomically, write_json
 
 MANY = 10
-"""Above so many specularities normals.json is written on one line: most of it are outlines."""
+"""Above this many specularities normals.json is written on one line, since most of it is outlines."""
 
 ARROW_SIDES = 6
 
@@ -39,16 +39,8 @@ def write_outputs(
 ) -> list[Path]:
     """Write what was reconstructed in a picture, its overlay and its page; return the files.
 
-    Parameters
-    ----------
-    out : Path
-        Folder, made if need be; raises `InputError` where it cannot be written.
-    record : PictureRecord
-        What was reconstructed.
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        Values as encoded, in [0, 1].
-    depth_mm : sequence of float, optional
-        Depth of each specularity's points and arrow, mm; default 1.
+    The folder is made if need be; `InputError` is raised where it cannot be written. A specularity's points and arrow
+    stand at its depth, mm, by default at 1.
     """
     spots, camera = record.specularities, record.camera
     depths = [1.0] * len(spots) if depth_mm is None else depth_mm
@@ -80,6 +72,7 @@ def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, .
         for name, result in spot.estimates.items():
             best = int(name == spot.best)
             if isinstance(result, Failure):
+                # candidate, normal, look and axis ratio; then margin and covariance
                 nothing = (None,) * 7
                 yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *peak, spot.kind, spot.score)
                 continue
@@ -104,6 +97,7 @@ def normals_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: S
     The points are at the depth of their specularity; through a fisheye, which sees sideways and backwards too, at that
     distance.
     """
+    # Estimators are numbered by name, so that the file does not depend on the order in which they ran.
     lines, names = [], sorted({name for spot in spots for name in spot.estimates})
     for spot, depth in zip(spots, depths_mm, strict=True):
         for name, result in spot.normals.items():
@@ -146,6 +140,7 @@ def _add_arrow(
     vertices: list[list[float]], faces: list[tuple[int, int, int]], start: Array, along: Array, length: float
 ) -> None:
     """Add a shaft and a head: rings of `ARROW_SIDES` points, joined, and a tip."""
+    # two directions across the arrow, the first from the axis that it does not run along
     side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     other = np.cross(along, side)

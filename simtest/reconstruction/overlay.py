@@ -30,27 +30,18 @@ FRACTION_BITS = 4
 def draw_overlay(picture: Image, spots: Sequence[SpecularityRecord]) -> Bytes:
     """Draw a picture with what was reconstructed in it, as the article does: isophote, ellipse, both normals, number.
 
-    Each specularity is numbered by its track where it has one, else by its id.
-
-    Parameters
-    ----------
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        In [0, 1], as encoded, RGB.
-    spots : sequence of SpecularityRecord
-        What was reconstructed, with drawings.
-
-    Returns
-    -------
-    ndarray of uint8, shape (h, w, 3)
-        In OpenCV's order of channels, with a legend below.
+    The picture, shape (H, W) or (H, W, 3), is RGB in [0, 1], as encoded; the drawing is in OpenCV's order of channels,
+    with a legend below. Specularities are numbered by their tracks where they have one, else by their ids.
     """
     height, width = picture.shape[:2]
+    # enlarge
     wanted = CROWDED_PX if len(spots) > MANY else SHORTEST_PX
     scale = max(1, -(-wanted // max(height, width)))
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
     canvas = cv2.cvtColor(values, cv2.COLOR_GRAY2BGR if values.ndim == 2 else cv2.COLOR_RGB2BGR)
     if scale > 1:
         canvas = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    # draw
     palette = {name: _bgr(colour) for name, colour in colours(n for s in spots for n in s.estimates).items()}
     reach = ARROW_SHARE * max(width, height) * scale * min(1.0, 3 / np.sqrt(max(len(spots), 1)))
     shown: dict[str, Colour] = {}

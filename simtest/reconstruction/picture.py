@@ -80,7 +80,7 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
 
 
 def read_calibration(options: Options, picture: Image) -> tuple[Calibration, list[str]]:
-    """Return the calibration of pictures like this one, and what to mind of it.
+    """Return the calibration of pictures of this size, and warnings about it.
 
     Added is what every picture file has: an encoding, and a largest value, at which it is clipped. Raises `InputError`
     if the camera's file is malformed, or states the response and the options do too.
@@ -108,7 +108,7 @@ def default_estimators(calibration: Calibration) -> tuple[str, ...]:
 def reconstruct_values(
     name: str, picture: Image, calibration: Calibration, options: Options, cautions: Sequence[str] = ()
 ) -> PictureRecord:
-    """Reconstruct a picture, shape (H, W) or (H, W, 3), as encoded in [0, 1], and describe what came of it.
+    """Reconstruct a picture, shape (H, W) or (H, W, 3), as encoded in [0, 1], and describe the result.
 
     Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
     the picture.

@@ -164,10 +164,11 @@ def run_pipeline(
 
 def _estimate(found: Found, estimators: Mapping[str, Estimator], calibration: Calibration) -> list[Specularity]:
     """Run each estimator on all patches of a picture."""
-    # Where the others are tells which light a highlight belongs to, so each patch holds their peaks.
+    # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in found.regions]
     patches = [_beside(patch, (*peaks[:i], *peaks[i + 1 :])) for i, patch in enumerate(found.patches)]
     made = {name: run_each(each, patches, calibration.camera, calibration.priors) for name, each in estimators.items()}
+    # Flags that depend on the frame are added behind those of the estimators.
     limited = found.frame.corrected.limited
     rounded_px = SMALL_RADIUS * found.frame.smoothing_px
     small = [_radius_px(highlight) < rounded_px for highlight in found.highlights] or [False] * len(patches)
@@ -193,6 +194,7 @@ def _flagged(
     """Add the flags that depend on the frame, not on the estimator."""
     if isinstance(result, Failure) or isinstance(patch, Failure):
         return result
+    # What an estimate used is what its lowest isophote encloses.
     masks = {"saturated": patch.saturated}
     if limited is not None:
         (x, y), (height, width) = patch.origin_px, patch.values.shape

@@ -59,6 +59,7 @@ def _data_address(picture: npt.NDArray[np.float32]) -> str:
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
     values = values if values.ndim == 2 else cv2.cvtColor(values, cv2.COLOR_RGB2BGR)
     data = b""
+    # lower the quality until the page is small enough
     for quality in (92, 80, 65, 45):
         data = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(data) <= MAX_PICTURE_BYTES:
@@ -84,6 +85,7 @@ def _spot(spot: SpecularityRecord, palette: dict[str, str]) -> JsonObject:
 def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": str(result.reason), "detail": result.detail}
+    # Rounded: a tenth of a pixel cannot be seen, and the digits would double the page.
     error = spot.reference.errors.get(name) if spot.reference else None
     drawing = spot.drawings[name]
     return {

@@ -27,7 +27,7 @@ TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """What came of a sequence: how many frames, specularities and tracks of two frames or more, and the files."""
+    """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written."""
 
     frames: int
     failed: int
@@ -47,14 +47,10 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         Folder: run.json, frames/NNNNNN.json and .jpg, timeline.csv, tracks.json, index.html. Frames that are there
         already are not done again.
     options : Options
-        How.
+        Camera, detector and estimators.
     progress : callable, optional
         Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
         is kept.
-
-    Returns
-    -------
-    SequenceResult
 
     Raises
     ------
@@ -69,6 +65,7 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         if progress is not None:
             progress(frame.index, max(source.count, frame.index + 1), frame.name)
         run.take(frame)
+    # A run that read nothing is an error; one that ended early keeps what it has.
     if not run.frames:
         raise InputError(f"{shown(path)}: no frame could be read ({run.first_error or 'it has none'})")
     if source.is_video and run.taken < source.count - 1:
@@ -84,7 +81,7 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
 
 
 class _Run:
-    """The frames done so far."""
+    """The frames of a sequence that are done so far, with what carries over from one to the next."""
 
     def __init__(self, folder: Path, options: Options) -> None:
         self.folder, self.options = folder, options
@@ -99,6 +96,7 @@ class _Run:
         """Reconstruct a frame, or read what an earlier run made of it."""
         self.taken += 1
         stem = self.folder / f"{frame.index:06d}"
+        # done by an earlier run: only the tracks are counted anew
         done = _read_done(stem.with_suffix(".json"), frame.name)
         if done is not None:
             self.frames.append(replace(done, specularities=self._tracked(done.specularities, done.size)))
@@ -116,6 +114,7 @@ class _Run:
     def _reconstruct(self, frame: SequenceFrame, stem: Path) -> TrackedFrame:
         picture = frame.read()
         size = (picture.shape[1], picture.shape[0])
+        # The first picture's size completes a camera that is known by its field of view alone.
         if self._calibration is None:
             self._calibration, self._cautions = read_calibration(self.options, picture)
             for caution in self._cautions:
@@ -137,7 +136,7 @@ class _Run:
 
 
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
-    """Read what an earlier run made of a frame; None where it did nothing, or what it left cannot be used."""
+    """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
         frame = TrackedFrame.from_json(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):

@@ -77,9 +77,9 @@ class _Moving:
 
 
 class Tracker:
-    """Numbers specularities alike over the frames of a sequence.
+    """Assigns the specularities of each frame to tracks.
 
-    Each is assigned to the track nearest to it, all together by the least sum of distances; the rest begin new tracks.
+    All are assigned together, by the least sum of distances to where tracks are expected; the rest begin new tracks.
 
     Parameters
     ----------

@@ -70,6 +70,7 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
         values = _read_exr(path)
     else:
         values = np.asarray(read_raw(path, "a depth map"))
+    # A grey map that was saved as RGB is accepted.
     if values.ndim == 3:
         colours = values[:, :, :3]
         if (colours != colours[:, :, :1]).any():
@@ -147,6 +148,7 @@ def depth_normals(points: Array) -> Array:
 
 def _jumps(depth: Array, known: Mask) -> Mask:
     """Mark the pixels where the depth jumps."""
+    # the second difference along rows and columns
     bend = np.zeros(depth.shape)
     bend[:, 1:-1] = np.abs(depth[:, 2:] + depth[:, :-2] - 2 * depth[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(depth[2:] + depth[:-2] - 2 * depth[1:-1]))

@@ -59,6 +59,7 @@ class Model:
 
         NaN for rays that miss it, and for directions that are not finite.
         """
+        # The tree takes finite rays alone; others are sent anywhere and marked as misses.
         tree, vertices, faces = self._tree
         known = np.asarray(np.isfinite(directions).all(axis=1))
         rays = np.ascontiguousarray(np.where(known[:, None], directions, 1.0))
@@ -67,6 +68,7 @@ class Model:
         hit = known & (face >= 0)
         # For rays that miss, the tree leaves the weights unset.
         u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
+        # interpolate the normals of the corners
         corners = self.normals[faces[np.where(hit, face, 0)]]
         normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -86,6 +88,7 @@ class MeshReference:
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
         """Return the normals where sightlines of pixels, shape (N, 2), first meet the model; NaN where they miss it."""
+        # In the model's frame the camera stands at -R^T t.
         R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
         return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
 
@@ -168,6 +171,7 @@ def read_pose(path: Path) -> Array:
         pose[:3, :3] = _numbers(data, "rotation", ((3, 3),), where)
         pose[:3, 3] = _numbers(data, "translation_mm", ((3,),), where)
     R = pose[:3, :3]
+    # A pose must be rigid: no scale, no shear, no mirror image.
     off = float(np.abs(R.T @ R - np.eye(3)).max())
     if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         what = "a mirror image" if off <= ROTATION_TOLERANCE else f"R^T R differs from the identity by {off:.2g}"
@@ -214,6 +218,7 @@ def compare(record: PictureRecord, reference: Reference) -> PictureRecord:
         spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals)))
         for spot in record.specularities
     ]
+    # summarise the sightlines that meet the reference
     met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
     names = dict.fromkeys(name for errors in met for name in errors)
     comparison = ComparisonRecord(

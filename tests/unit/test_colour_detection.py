@@ -6,6 +6,7 @@ from simtest.calibration import Calibration, srgb_encode
 from simtest.detection.blobs import Kind
 from simtest.detection.light_split import fill, split_light
 from simtest.detection.view_mask import find_view
+from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
@@ -112,6 +113,11 @@ def test_normals_of_a_sphere_point_back_along_the_sightlines():
         assert isinstance(estimate, Estimate)
         angle = np.degrees(np.arccos(-estimate.normal @ camera.unproject(spot.patch.peak_px)))
         assert angle < 0.3
+
+
+def test_smoothing_has_the_limits_of_grey_pictures():
+    with pytest.raises(InputError, match=r"smoothing_px = 51: must be a number in \[0, 50\]"):
+        reconstruct_colour(picture(lobe(90, 70, 5.0)), Camera.from_fov(60.0, WIDTH, HEIGHT), smoothing_px=51)
 
 
 def test_small_highlights_are_flagged():

@@ -208,6 +208,7 @@ def test_a_stopped_run_goes_on(folder, tmp_path):
     kept = tmp_path / "out" / "frames" / "000000.json"
     before = kept.stat().st_mtime_ns
     (tmp_path / "out" / "frames" / "000001.json").write_text("{half a fi")
+    (tmp_path / "out" / "frames" / "000002.json").write_text('{"image": "frame10.png", "size": [320, 240]}')
     run(folder, tmp_path / "out")
     assert kept.stat().st_mtime_ns == before
     run(folder, tmp_path / "whole")
