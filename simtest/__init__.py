@@ -1,10 +1,29 @@
 """simtest: a rendering-validated simulation testbed for reconstruction from specular highlights in endoscopy.
 
-The public names are loaded when they are first used; importing the package loads neither the renderer nor the
-viewers.
+From a picture to normals:
+
+1. read: a picture, folder or video becomes values as encoded (reconstruction.image_io)
+2. linear light: response, vignetting and emission are undone, as far as they are known (calibration)
+3. detect: regions of interest, by local maxima or by the tissue's colour, and their smoothed patches (detection)
+4. estimate: normals, with covariances, from the isophotes of each patch (estimators, inverse; on geometry)
+5. describe and write: normals.json, tables, overlay, page (reconstruction, pages)
+
+From a description to validated figures:
+
+1. describe: a scene, experiment or dataset in TOML becomes a frozen model (spec)
+2. build and render: surface, reflectance and lights become radiance (surfaces, rendering)
+3. label: camera and sensor make a frame of it; its true highlights are solved on the smooth surface (simulation)
+4. reconstruct the frame as above, without its truth (reconstruction)
+5. judge: match with the truth, measure errors, compare with closed-form laws (validation)
+6. report: a run's figures and page (report), labelled datasets (dataset), the regression gate (nightly)
+
+Everything stands on runtime (files, seeds, processes). The commands are in cli, the functions behind them in api.
+Public names are loaded at first use; importing the package loads neither the renderer nor the viewers.
 """
 
 from typing import TYPE_CHECKING, Any
+
+from simtest import _renamed
 
 if TYPE_CHECKING:
     from simtest.api import LabelledFrame, export, render, validate
@@ -12,7 +31,7 @@ if TYPE_CHECKING:
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
     from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask
-    from simtest.reconstruction.pipeline import Specularity, reconstruct
+    from simtest.reconstruction import Specularity, reconstruct
     from simtest.spec import (
         Experiment,
         Scene,
@@ -29,7 +48,7 @@ _HOMES = {
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
     "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "ViewMask"),
-    "simtest.reconstruction.pipeline": ("Specularity", "reconstruct"),
+    "simtest.reconstruction": ("Specularity", "reconstruct"),
     "simtest.spec": (
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
     ),
@@ -63,6 +82,8 @@ __all__ = [
     "save_camera",
     "validate",
 ]
+
+_renamed.install()
 
 
 def __getattr__(name: str) -> Any:

@@ -1,13 +1,13 @@
-"""The workflows behind the commands: render a labelled frame, run an experiment with its report."""
+"""The workflows behind the commands: render a labelled frame, run an experiment with its report, reconstruct a file."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
-from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction import reconstruct
 from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import make_folder, write_json
 from simtest.simulation.labelled_frame import LabelledFrame, make_frame
@@ -16,8 +16,8 @@ from simtest.spec import Experiment, Scene, load_experiment, load_scene
 from simtest.validation.runner import Progress
 
 if TYPE_CHECKING:
-    from simtest.geometry import Camera
-    from simtest.validation.reference_surface import Reference
+    from simtest.reconstruction.description import PictureRecord
+    from simtest.reconstruction.picture import Options
 
 __all__ = [
     "Extras",
@@ -33,7 +33,7 @@ __all__ = [
 MAX_VIEWS = 1000
 
 TRIES = 10
-"""Places that are tried for each view wanted."""
+"""Viewpoints that are tried for each view wanted."""
 
 
 def render(
@@ -66,8 +66,7 @@ def render(
     BackendError
         If the rendering backend cannot be used.
     """
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return make_frame(described, variant, progress)
+    return make_frame(_scene(scene, settings), variant, progress)
 
 
 def export(
@@ -80,12 +79,10 @@ def export(
 
     Parameters
     ----------
-    scene : Scene, str or Path
-        A scene, a scene file, or the name of a shipped scene.
+    scene, settings
+        As of `render`.
     out : str or Path
         Folder, made if need be.
-    settings : mapping, optional
-        Values that replace those of a scene file, by key path.
     variant : str, optional
         Mitsuba variant that parses the scene; the files are the same for all.
 
@@ -103,8 +100,7 @@ def export(
     """
     from simtest.rendering.mitsuba_export import export_scene
 
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
-    return export_scene(described, Path(out), variant)
+    return export_scene(_scene(scene, settings), Path(out), variant)
 
 
 def sample_views(
@@ -118,22 +114,18 @@ def sample_views(
 ) -> SampledViews:
     """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
 
-    Tried are the viewpoints 0, 1, 2, ..., or, where ``surface.view`` is not auto, places spread evenly over the camera
-    path; ten for each view wanted at most. Written are views.json, with the poses and what was left out, a picture of
-    each view, and sheet.png, which shows all of them; of a sequence film.avi too.
+    At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
+    spread over the camera path. The folder gets views.json, with the poses and what was left out, a picture of each
+    view, sheet.png, which shows all of them, and film.avi of a sequence.
 
     Parameters
     ----------
-    scene : Scene, str or Path
-        Of an anatomy.
+    scene, settings, variant
+        As of `render`; the scene is one of an anatomy.
     out : str or Path
         Folder, made if need be.
     count : int
         Views wanted, 1 to 1000.
-    settings : mapping, optional
-        Values that replace those of a scene file, by key path.
-    variant : str, optional
-        Mitsuba variant.
     progress : callable, optional
         Called with views found, views wanted, and what was tried.
     along : tuple of float, optional
@@ -155,7 +147,7 @@ def sample_views(
 
     if not 1 <= count <= MAX_VIEWS:
         raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
-    described = scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    described = _scene(scene, settings)
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     make_folder(Path(out))
     writer = ViewWriter(Path(out), film=along is not None)
@@ -194,7 +186,7 @@ def validate(
     workers : int
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
-        Who does the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+        What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
 
     Returns
     -------
@@ -217,41 +209,30 @@ def validate(
     return write_report(run.folder)
 
 
+def _scene(scene: Scene | str | Path, settings: Mapping[str, Any] | None) -> Scene:
+    return scene if isinstance(scene, Scene) else load_scene(scene, settings)
+
+
 @dataclass(frozen=True)
 class Extras:
-    """What else a picture is reconstructed with.
-
-    Parameters
-    ----------
-    reference : Path, optional
-        Mesh in mm, or a depth map, to compare with.
-    pose : Path, optional
-        camera_from_model of the mesh.
-    depth : str, optional
-        Depth of the arrows: a number in mm, or a depth map.
-    depth_scale_mm : float, optional
-        mm of one step of an integer depth map.
-    """
+    """What else a picture is reconstructed with."""
 
     reference: Path | None = None
+    """Mesh in mm, or a depth map, to compare with."""
+
     pose: Path | None = None
+    """camera_from_model of the mesh."""
+
     depth: str | None = None
+    """Depth of the arrows: a number in mm, or a depth map."""
+
     depth_scale_mm: float | None = None
+    """mm of one step of an integer depth map."""
 
 
 def reconstruct_picture(
-    image: Path,
-    out: Path,
-    camera_file: Path | None = None,
-    fov_deg: float | None = None,
-    estimators: Sequence[str] | None = None,
-    roi: str | None = None,
-    encoding: str | None = None,
-    every: bool = False,
-    detector: str = "auto",
-    smoothing_px: float | None = None,
-    extras: Extras | None = None,
-) -> tuple[int, list[Path]]:
+    image: Path, out: Path, options: "Options", extras: Extras | None = None
+) -> tuple["PictureRecord", list[Path]]:
     """Reconstruct the normals of a picture and write them.
 
     Parameters
@@ -260,30 +241,15 @@ def reconstruct_picture(
         The picture.
     out : Path
         Folder, made if need be.
-    camera_file : Path, optional
-        Calibration or camera file; this or `fov_deg` must be given, not both.
-    fov_deg : float, optional
-        Horizontal field of view, deg.
-    estimators : sequence of str, optional
-        Names; default those of the package that need no more than the calibration states.
-    roi : str, optional
-        "x,y,w,h" in px; default: detected.
-    encoding : {"srgb", "linear"}, optional
-        How the picture's values are encoded, where the calibration does not state the response; default sRGB.
-        Isophotes are those of linear values.
-    every : bool
-        Take peaks too that the border cuts or whose shape is not that of one point highlight.
-    detector : {"auto", "colour", "peaks"}
-        How highlights are found (`Options`).
-    smoothing_px : float, optional
-        Standard deviation of the Gaussian smoothing, px.
+    options : Options
+        Camera, detector and estimators.
     extras : Extras, optional
         Reference surface and depths.
 
     Returns
     -------
-    count : int
-        Specularities found.
+    record : PictureRecord
+        The specularities found, with their normals.
     files : list of Path
         normals.json, normals.csv, normals.ply, overlay.png, and the others.
 
@@ -293,40 +259,28 @@ def reconstruct_picture(
         If the input is malformed or the folder cannot be written.
     """
     from simtest.reconstruction.image_io import read_picture
-    from simtest.reconstruction.picture import NOTHING, parse_roi, picture_document, write_document
-    from simtest.reconstruction.single import Options, check_camera_given, completed, read_camera
+    from simtest.reconstruction.output_files import write_outputs
+    from simtest.reconstruction.picture import NOTHING, read_calibration, reconstruct_values
     from simtest.validation.depth_maps import depths_at
-    from simtest.validation.reference_surface import comparison
+    from simtest.validation.reference_surface import compare, load_reference
 
-    box = parse_roi(roi) if roi is not None else None
-    options = Options(None if estimators is None else tuple(estimators), box, encoding, every, detector, smoothing_px)
-    check_camera_given(camera_file, fov_deg)
+    extras = extras or Extras()
+    # read
     picture = read_picture(image)
-    height, width = picture.shape[:2]
-    calibration, cautions = read_camera(camera_file, fov_deg, (width, height))
+    calibration, cautions = read_calibration(options, picture)
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
-    calibration = completed(calibration, encoding)
-    reference = _reference(extras, calibration.camera)
-    document = picture_document(image, picture, calibration, options, cautions)
-    spots = document["specularities"]
-    if not spots:
-        document["warnings"].append(NOTHING)
+    reference = load_reference(extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm)
+    # linear light, detect, estimate, describe
+    record = reconstruct_values(str(image), picture, calibration, options, cautions)
+    if not record.specularities:
         warnings.warn(NOTHING, stacklevel=2)
+        record = replace(record, warnings=[*record.warnings, NOTHING])
     depth = None
-    if extras is not None and extras.depth is not None:
-        looks = [spot["peak_px"] for spot in spots]
-        depth = depths_at(extras.depth, looks, (width, height), extras.depth_scale_mm)
+    if extras.depth is not None:
+        peaks = [spot.peak_px for spot in record.specularities]
+        depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale_mm)
     if reference is not None:
-        document["reference"] = comparison(spots, calibration.camera, reference)
-    return len(spots), write_document(out, document, picture, calibration.camera, depth)
-
-
-def _reference(extras: Extras | None, camera: "Camera") -> "Reference | None":
-    from simtest.validation.reference_surface import load_reference
-
-    if extras is None or extras.reference is None:
-        if extras is not None and extras.pose is not None:
-            raise InputError("--camera-from-model: needs --reference, the mesh that it places")
-        return None
-    return load_reference(extras.reference, extras.pose, camera, extras.depth_scale_mm)
+        record = compare(record, reference)
+    # write
+    return record, write_outputs(out, record, picture, depth)

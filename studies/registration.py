@@ -15,6 +15,7 @@ import numpy as np
 
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, generator
@@ -24,7 +25,7 @@ from simtest.spec.toml_files import toml_value
 from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.recipe import load_anatomy
 from simtest.validation.matching import match
-from simtest.validation.reference_surface import MeshReference, Model, angle_deg
+from simtest.validation.reference_surface import MeshReference, Model
 
 VIEWS, SPECULARITIES = 5, 26
 TRIED = 48
@@ -112,7 +113,7 @@ def study(found: list[Observation], model: Model, error: tuple[float, float]) ->
             for spot, normal in zip(here, normals, strict=True):
                 if np.isfinite(normal).all():
                     for name, candidates in spot.normals.items():
-                        angles.setdefault(name, []).append(min(angle_deg(c, normal) for c in candidates))
+                        angles.setdefault(name, []).append(float(min(angle_deg(c, normal) for c in candidates)))
     return {name: np.array(values) for name, values in angles.items()}
 
 

@@ -51,7 +51,7 @@ def arrows() -> dict[tuple[str, str], list[str]]:
     drawn: dict[tuple[str, str], list[str]] = defaultdict(list)
     for path in sources():
         start = entry_of(path)
-        if start == "__init__":
+        if start in ("__init__", "__main__"):
             continue
         for end, line in imported_entries(ast.parse(path.read_text()), entries):
             if end != start:

@@ -4,6 +4,8 @@
 holds what is known of lights, distance and lobe, with its uncertainty.
 """
 
+from typing import Any
+
 from simtest.calibration.calibration import Calibration, CorrectedFrame
 from simtest.calibration.frame import Frame
 from simtest.calibration.noise_estimate import estimate_noise
@@ -28,3 +30,9 @@ __all__ = [
     "srgb_decode",
     "srgb_encode",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    from simtest._renamed import lookup
+
+    return lookup(__name__, name)

@@ -9,17 +9,17 @@ import warnings
 
 from cyclopts import App, CycloptsError
 
-from simtest.errors import BackendError, InputError, SimtestError
+from simtest.errors import InputError, SimtestError
 
 APP = App(
     name="simtest",
     help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
     version_flags=["--version"],
     version=lambda: _version(),
-    # Ours says what is kept.
+    # `main` reports what is kept.
     suppress_keyboard_interrupt=False,
 )
-# Told here, since a sub-command's own text is loaded with it.
+# Stated here, since a sub-command's own text is loaded with its module.
 _COMMANDS = {
     "doctor": "Check the rendering backend.",
     "schema": "Print the JSON schema of a scene, experiment, dataset, camera, calibration or profile file.",
@@ -66,26 +66,23 @@ def main() -> None:
         code = APP(exit_on_error=False, print_error=False, result_action="return_value")
         # Output may wait in a buffer whose reader has gone.
         sys.stdout.flush()
-    except CycloptsError as error:
-        sys.exit(_say(" ".join(str(error).split()), BAD_USE))
-    except BackendError as error:
-        sys.exit(_say(str(error), failed))
-    except InputError as error:
-        sys.exit(_say(str(error), BAD_USE))
+    except (CycloptsError, InputError) as error:
+        sys.exit(_report(str(error), BAD_USE))
     except SimtestError as error:
-        sys.exit(_say(str(error), failed))
+        sys.exit(_report(str(error), failed))
     except KeyboardInterrupt as stopped:
         kept = "what is finished is kept, and the same command goes on from there"
-        sys.exit(_say(f"stopped; {str(stopped) or kept}", INTERRUPTED))
+        sys.exit(_report(f"stopped; {str(stopped) or kept}", INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except Exception as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        sys.exit(_say(f"internal error, please report it ({text}); --traceback shows where", failed))
+        what = f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+        sys.exit(_report(what, failed))
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _say(text: str, code: int) -> int:
+def _report(text: str, code: int) -> int:
+    """Print an error as one line and return the exit code."""
     print(f"simtest: {' '.join(text.split())}", file=sys.stderr)
     return code

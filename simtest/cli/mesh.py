@@ -11,22 +11,7 @@ from simtest.cli.options import replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class MeshOptions:
-    """What `simtest mesh colon` and `liver` take."""
-
-    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
-    seed: Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)] = (
-        None
-    )
-    edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
-    recipe: Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")] = None
-    settings: Annotated[list[str] | None, replacing("length_mm=40")] = None
-    curvature: Annotated[
-        bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
-    ] = False
+Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)]
 
 
 @mesh.command
@@ -40,7 +25,7 @@ def check(
     kind: Literal["auto", "lumen", "organ"] = "auto",
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> int:
-    """Say what is wrong with a mesh, what is mended when it is used, and whether it is fine enough for highlights.
+    """Check what is wrong with a mesh, what is mended when it is used, and whether it is fine enough for highlights.
 
     Exit 1 if it is too coarse or has a problem that cannot be mended, 2 if it is no mesh that can be used.
 
@@ -73,30 +58,44 @@ def check(
     return 0 if verdict.usable else 1
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Recipe:
+    """The options of an anatomy: its recipe, and where its mesh goes."""
+
+    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
+    seed: Seed = None
+    edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
+    recipe: Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")] = None
+    settings: Annotated[list[str] | None, replacing("length_mm=40")] = None
+    curvature: Annotated[
+        bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
+    ] = False
+
+
 @mesh.command
-def colon(*, options: MeshOptions) -> None:
+def colon(*, options: Recipe) -> None:
     """Make a colon from its recipe: another one for each seed, the same bytes for the same."""
     _make("colon", options)
 
 
 @mesh.command
-def liver(*, options: MeshOptions) -> None:
+def liver(*, options: Recipe) -> None:
     """Make a liver from its recipe: another one for each seed, the same bytes for the same."""
     _make("liver", options)
 
 
-def _make(kind: str, options: MeshOptions) -> None:
+def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
     from simtest.errors import InputError
     from simtest.spec import parse_settings
     from simtest.surfaces.factory import make_mesh
     from simtest.surfaces.mesh_file import check_target, write_mesh
     from simtest.surfaces.recipe import load_anatomy
 
-    out = options.out
-    check_target(out)
-    if options.curvature and out.suffix.lower() != ".ply":
-        raise InputError(f"--curvature: {out.suffix} files hold none; allowed: .ply")
-    recipe = load_anatomy(kind, options.recipe, options.seed, parse_settings(options.settings or []))
-    made, k_min, k_max = make_mesh(recipe, options.edge_mm)
-    write_mesh(out, made, {"k_min": k_min, "k_max": k_max} if options.curvature else None)
-    print(f"{out}: {len(made.vertices)} vertices, {len(made.faces)} faces")
+    check_target(given.out)
+    if given.curvature and given.out.suffix.lower() != ".ply":
+        raise InputError(f"--curvature: {given.out.suffix} files hold none; allowed: .ply")
+    anatomy = load_anatomy(kind, given.recipe, given.seed, parse_settings(given.settings or []))
+    made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
+    write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
+    print(f"{given.out}: {len(made.vertices)} vertices, {len(made.faces)} faces")

@@ -16,9 +16,9 @@ def whole_number(_: Any, tokens: Sequence[Token]) -> int:
 
 
 def replacing(example: str) -> Parameter:
-    """Give the option that replaces values of a file, with an example of one."""
-    told = f"Replace a value: key=value, such as {example}; may be repeated."
-    return Parameter(name="--set", negative="", help=told)
+    """Return the option that replaces values of a file, with an example of one in its help."""
+    text = f"Replace a value: key=value, such as {example}; may be repeated."
+    return Parameter(name="--set", negative="", help=text)
 
 
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def stop_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the callable that is given is called; a second Ctrl-C stops at once.
+    """Yield a callable that raises KeyboardInterrupt if Ctrl-C was pressed meanwhile; a second press stops at once.
 
-    Raised anywhere, KeyboardInterrupt can be lost in a callback, or break the renderer while it is being imported.
+    Raised anywhere else, KeyboardInterrupt can be lost in a callback, or break the renderer while it is imported.
     """
     presses = 0
 
@@ -32,25 +32,18 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
-    """Show a bar while the body runs; gives the callable that moves it (done, total, what).
+    """Show a bar while the body runs, and yield the callable that moves it: (done, total, what).
 
-    `afterwards` is what the body does when all steps are done. A single step shows no bar.
+    `afterwards` is what the body does once all steps are done. A single step shows no bar.
     """
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     columns = (
-        BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
     )  # fmt: skip
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = rich.Progress(*columns, console=Console(stderr=True))
     task = bar.add_task("starting", total=None)
     with stop_between_steps() as check:
 
@@ -58,7 +51,7 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
             check()
             if done == total and not bar.live.is_started:
                 return
-            # Not before the first step: bad input is told in one line.
+            # Not before the first step: bad input is reported in one line, without a bar.
             bar.start()
             bar.update(task, completed=done, total=total, description=afterwards if done == total else what)
 

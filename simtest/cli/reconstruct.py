@@ -1,11 +1,15 @@
 """`simtest reconstruct`."""
 
+import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from simtest.cli.options import Estimators, Out
+
+if TYPE_CHECKING:
+    from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 
 TABLE_WIDTH = 125
 
@@ -61,79 +65,75 @@ def reconstruct(
     image : Path
         PNG, JPEG, BMP or TIFF; a folder of these; or a video that OpenCV reads.
     """
-    from simtest.api import Extras, reconstruct_picture
     from simtest.errors import InputError
-    from simtest.reconstruction.image_sources import is_sequence
-    from simtest.reconstruction.picture import parse_roi
+    from simtest.reconstruction.image_io import is_sequence
+    from simtest.reconstruction.picture import Options, parse_roi
 
-    if not is_sequence(image):
-        extras = Extras(reference, camera_from_model, depth, depth_scale)
-        count, files = reconstruct_picture(
-            image, out, camera, fov, estimators, roi, encoding, every, detector, smoothing, extras
-        )
-        _print_table(files[0])
-        print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
-        for file in files:
-            print(file)
-        return
-    if reference or camera_from_model or depth:
+    sequence = is_sequence(image)
+    if sequence and (reference or camera_from_model or depth):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
-    from simtest.cli.progress import progress_bar
-    from simtest.reconstruction.sequence import reconstruct_sequence
-    from simtest.reconstruction.single import Options
-
     box = None if roi is None else parse_roi(roi)
-    options = Options(None if estimators is None else tuple(estimators), box, encoding, every, detector, smoothing)
-    with progress_bar("writing the tables") as progress:
-        result = reconstruct_sequence(image, out, camera, fov, options, progress)
-    unread = f", {result.failed} unreadable" if result.failed else ""
-    print(
-        f"{result.frames} frames{unread}: {result.specularities} specularities, {result.tracks} seen in several frames"
-    )
-    for file in result.files:
+    names = None if estimators is None else tuple(estimators)
+    options = Options(camera, fov, names, box, encoding, every, detector, smoothing)
+    if not sequence:
+        from simtest.api import Extras, reconstruct_picture
+
+        extras = Extras(reference, camera_from_model, depth, depth_scale)
+        record, files = reconstruct_picture(image, out, options, extras)
+        _print_tables(record)
+        count = len(record.specularities)
+        print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
+    else:
+        from simtest.cli.progress import progress_bar
+        from simtest.reconstruction.sequence import reconstruct_sequence
+
+        with progress_bar("writing the tables") as progress:
+            made = reconstruct_sequence(image, out, options, progress)
+        files = made.files
+        unread = f", {made.failed} unreadable" if made.failed else ""
+        print(f"{made.frames} frames{unread}: {made.specularities} specularities, {made.tracks} seen in several frames")
+    for file in files:
         print(file)
 
 
-def _print_table(file: Path) -> None:
+def _print_tables(record: "PictureRecord") -> None:
     """Print the best normal of each specularity, and how the estimators compare with a reference."""
-    import json
-
     from rich.console import Console
     from rich.table import Table
 
-    document = json.loads(file.read_text(encoding="utf-8"))
     console = Console()
     # Narrower, normals would be cut off.
     console.width = max(console.width, TABLE_WIDTH)
-    if document["specularities"]:
+    if record.specularities:
         table = Table("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
-        for spot in document["specularities"]:
+        for spot in record.specularities:
             table.add_row(*_cells(spot))
         console.print(table)
-    if compared := document.get("reference"):
-        for problem in compared["problems"]:
+    if (compared := record.reference) is not None:
+        for problem in compared.problems:
             print(f"reference: {problem}")
         table = Table("estimator", "n", "mean ± std (deg)", "better candidate (deg)")
-        for name, row in compared["estimators"].items():
-            table.add_row(name, str(row["n"]), _pair(row, "mean_deg", "std_deg"),
-                          _pair(row, "mean_oracle_deg", "std_oracle_deg"))  # fmt: skip
+        for name, errors in compared.estimators.items():
+            proposed = _pair(errors.mean_deg, errors.std_deg)
+            table.add_row(name, str(errors.n), proposed, _pair(errors.mean_oracle_deg, errors.std_oracle_deg))
         console.print(table)
-        print(f"{compared['missed']} sightlines miss {compared['source']}")
+        print(f"{compared.missed} sightlines miss {compared.source}")
 
 
-def _pair(row: dict[str, float | None], mean: str, spread: str) -> str:
-    return f"{row[mean]:.2f}" + ("" if row[spread] is None else f" ± {row[spread]:.2f}")
+def _pair(mean: float, spread: float | None) -> str:
+    return f"{mean:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
 
 
-def _cells(spot: dict[str, Any]) -> list[str]:
-    result = spot["estimates"].get(spot["best"]) or {}
-    published = spot["estimates"].get("circle_pose") or {}
-    x, y = spot["peak_px"] or (float("nan"), float("nan"))
-    covariance, margin = result.get("covariance"), published.get("choice_margin")
-    deviation = "" if covariance is None else f"{57.29578 * (covariance[0][0] + covariance[1][1]) ** 0.5:.2f}"
-    score = spot.get("score")
+def _cells(spot: "SpecularityRecord") -> list[str]:
+    from simtest.reconstruction.description import deviation_deg
+
+    best, published = spot.best_estimate, spot.normals.get("circle_pose")
+    x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
+    deviation = None if best is None else deviation_deg(best)
+    margin = None if published is None else published.choice_margin
     return [
-        str(spot["id"]), f"{x:.1f}", f"{y:.1f}", spot.get("kind", ""), "" if score is None else f"{score:.2f}",
-        spot["best"] or "none", " ".join(f"{v:+.3f}" for v in result.get("normal", ())), deviation,
-        "" if margin is None else f"{margin:.1f}", ", ".join(result.get("flags", ())),
+        str(spot.id), f"{x:.1f}", f"{y:.1f}", spot.kind or "", "" if spot.score is None else f"{spot.score:.2f}",
+        spot.best or "none",
+        " ".join(f"{v:+.3f}" for v in best.normal) if best else "", "" if deviation is None else f"{deviation:.2f}",
+        "" if margin is None else f"{margin:.1f}", ", ".join(best.flags) if best else "",
     ]  # fmt: skip

@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from simtest.runtime.files import as_json
+
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
@@ -35,6 +37,14 @@ def environment() -> "Environment":
     return made
 
 
+def write_page(path: Path, template: str, data: Any, **values: Any) -> None:
+    """Render a template and write it; `data` stands in it as JSON for the page's script."""
+    from markupsafe import Markup
+
+    html = environment().get_template(template).render(data=Markup(script_json(data)), **values)
+    path.write_text(html, encoding="utf-8")
+
+
 def breakable(name: str) -> "Markup":
     """Give a name that may be broken behind its underscores, where a column is narrow."""
     from markupsafe import Markup, escape
@@ -49,7 +59,7 @@ def script_text(text: str) -> str:
 
 def script_json(value: Any) -> str:
     """Write a value as compact JSON that may stand inside a script element."""
-    return script_text(json.dumps(value, allow_nan=False, separators=(",", ":")))
+    return script_text(json.dumps(value, allow_nan=False, separators=(",", ":"), default=as_json))
 
 
 @cache

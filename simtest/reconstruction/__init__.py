@@ -1,5 +1,16 @@
-"""From a picture, film or array to normals and what is written of them; never sees the truth."""
+"""From a picture, film or array to normals and what is written of them; never sees the truth.
 
-from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, Specularity, reconstruct
+image_io reads. pipeline leads from values to normals: linear light, a detector, the estimators. description makes
+records of them, which output_files, overlay, constraints and result_page write. picture does all this for one picture,
+sequence for a folder or a video, with tracking.
+"""
 
-__all__ = ["DEFAULT_ESTIMATORS", "Specularity", "reconstruct"]
+from simtest.reconstruction.pipeline import (
+    DEFAULT_ESTIMATORS,
+    Specularity,
+    detect_in_picture,
+    reconstruct,
+    reconstruct_colour,
+)
+
+__all__ = ["DEFAULT_ESTIMATORS", "Specularity", "detect_in_picture", "reconstruct", "reconstruct_colour"]

@@ -1,13 +1,16 @@
 """Sparse normals as constraints that a reconstruction of the surface can take: constraints.json and constraints.npz."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.files import write_atomically, write_json
+from simtest.reconstruction.description import Array, SpecularityRecord
+from simtest.runtime.files import JsonObject
+from simtest.spec import describe_camera
 
 VERSION = 1
 
@@ -19,68 +22,82 @@ ABOUT = (
     "candidates[i] holds all normals that the data allow."
 )
 
-
-def constraints(document: dict[str, Any]) -> dict[str, Any]:
-    """Give the constraints of a document of normals: the best normal of each specularity that has one."""
-    made = []
-    for spot in document["specularities"]:
-        result = spot["estimates"].get(spot["best"]) if spot["best"] else None
-        if result is None or result["status"] != "ok" or spot["sightline"] is None:
-            continue
-        published = spot["estimates"].get("circle_pose", {})
-        made.append(
-            {
-                "id": spot["id"],
-                "track": spot.get("track"),
-                "pixel": spot["peak_px"],
-                "sightline": spot["sightline"],
-                "normal": result["normal"],
-                "basis": np.concatenate(tangent_basis(np.array([result["normal"]]))).tolist(),
-                "covariance": result["covariance"],
-                "estimator": spot["best"],
-                "candidates": published.get("candidates", result["candidates"]),
-                "score": spot.get("score"),
-                "flags": result["flags"],
-            }
-        )
-    return {"version": VERSION, "about": ABOUT, "image": document["image"], "camera": document["camera"],
-            "constraints": made}  # fmt: skip
+SHAPES = {"pixel": (2,), "sightline": (3,), "normal": (3,), "basis": (2, 3), "covariance": (2, 2)}
+"""Of what constraints.npz stacks."""
 
 
-def write_constraints(json_file: Path, npz_file: Path, document: dict[str, Any]) -> None:
-    """Write the constraints twice: as JSON, and as arrays without pickles.
+@dataclass(frozen=True)
+class Constraint:
+    """The best normal of a specularity (see `ABOUT`), with the candidates of `circle_pose` where it has any."""
 
-    The arrays: id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates
-    (N, 2, 3) with NaN where there is no second, estimator (N,) as text, and K (3, 3).
-    """
-    described = constraints(document)
-    write_json(json_file, described)
-    write_atomically(npz_file, lambda part: np.savez(part, **arrays(described)))
+    id: int
+    track: int | None
+    pixel: Array | None
+    sightline: Array
+    normal: Array
+    basis: Array
+    covariance: Array | None
+    estimator: str
+    candidates: Array
+    score: float | None
+    flags: tuple[str, ...]
 
 
-def arrays(described: dict[str, Any]) -> dict[str, Any]:
-    """Give constraints as arrays (see `write_constraints`)."""
-    entries = described["constraints"]
+@dataclass(frozen=True)
+class Constraints:
+    """The constraints of a picture."""
 
-    def stacked(give: Callable[[dict[str, Any]], Any], shape: tuple[int, ...]) -> np.ndarray:
-        return np.array([give(entry) for entry in entries], dtype=float).reshape(-1, *shape)
+    image: str
+    camera: Camera
+    constraints: list[Constraint]
 
-    def both(entry: dict[str, Any]) -> np.ndarray:
-        pair = np.full((2, 3), np.nan)
-        given = np.array(entry["candidates"], dtype=float)[:2]
-        pair[: len(given)] = given
-        return pair
+    @classmethod
+    def of(cls, image: str, camera: Camera, spots: Sequence[SpecularityRecord]) -> "Constraints":
+        """Take the best normal of each specularity that has one and a sightline."""
+        made = [
+            Constraint(
+                id=spot.id,
+                track=spot.track,
+                pixel=spot.peak_px,
+                sightline=spot.sightline,
+                normal=best.normal,
+                basis=np.concatenate(tangent_basis(best.normal[None])),
+                covariance=best.covariance,
+                estimator=spot.best,
+                candidates=spot.normals.get("circle_pose", best).candidates,
+                score=spot.score,
+                flags=best.flags,
+            )
+            for spot in spots
+            if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
+        ]
+        return cls(image, camera, made)
 
-    unknown = np.full((2, 2), np.nan)
-    return {
-        "version": np.array(VERSION),
-        "id": np.array([entry["id"] for entry in entries], dtype=int),
-        "pixel": stacked(lambda e: e["pixel"], (2,)),
-        "sightline": stacked(lambda e: e["sightline"], (3,)),
-        "normal": stacked(lambda e: e["normal"], (3,)),
-        "basis": stacked(lambda e: e["basis"], (2, 3)),
-        "covariance": stacked(lambda e: e["covariance"] or unknown, (2, 2)),
-        "candidates": stacked(both, (2, 3)),
-        "estimator": np.array([entry["estimator"] for entry in entries], dtype=str),
-        "K": np.array(described["camera"]["K"]),
-    }
+    def to_json(self) -> JsonObject:
+        """Return the content of constraints.json."""
+        about = {"version": VERSION, "about": ABOUT, "image": self.image}
+        return {**about, "camera": describe_camera(self.camera), "constraints": self.constraints}
+
+    def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
+        """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
+
+        id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3)
+        with NaN where there is no second, estimator (N,) as text.
+        """
+        every = self.constraints
+        stacked = {}
+        for name, shape in SHAPES.items():
+            rows = [getattr(constraint, name) for constraint in every]
+            filled = [np.full(shape, np.nan) if row is None else row for row in rows]
+            stacked[name] = np.array(filled, dtype=float).reshape(-1, *shape)
+        candidates = np.full((len(every), 2, 3), np.nan)
+        for pair, constraint in zip(candidates, every, strict=True):
+            pair[: len(constraint.candidates)] = constraint.candidates[:2]
+        return {
+            "version": np.array(VERSION),
+            "id": np.array([constraint.id for constraint in every], dtype=int),
+            **stacked,
+            "candidates": candidates,
+            "estimator": np.array([constraint.estimator for constraint in every], dtype=str),
+            "K": self.camera.K,
+        }

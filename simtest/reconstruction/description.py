@@ -1,207 +1,279 @@
-"""What was reconstructed, as normals.json, normals.csv and normals.ply hold it."""
+"""The stage after the estimators: describe what was reconstructed, as records that files and pages are made of.
 
-import csv
-import json
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+docs/reconstruct.md explains the keys. `write_json` writes a record by its `to_json`, or else by its fields.
+"""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
 import numpy as np
+import numpy.typing as npt
 
+from simtest.conventions import PIXEL_CENTRE
 from simtest.detection.blobs import Highlight
-from simtest.errors import Failure
-from simtest.estimators.protocol import Estimate, EstimatedCurvature, drawable
-from simtest.geometry import Camera, KannalaBrandt
-from simtest.reconstruction.pipeline import Specularity
+from simtest.detection.view_mask import View
+from simtest.errors import Failure, Reason
+from simtest.estimators.protocol import Estimate, drawable
+from simtest.geometry import Camera
+from simtest.reconstruction.pipeline import Reconstruction, Specularity
+from simtest.runtime import provenance
+from simtest.runtime.files import JsonObject
+from simtest.spec import describe_camera
 
-BEST = ("bisector", "curved", "cone_axis", "brightest_point")
+Array = npt.NDArray[np.float64]
+Points = list[list[float]]
+
+FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
+
+FOLLOWS_ISOPHOTES = ("bisector", "curved")
+BEST = (*FOLLOWS_ISOPHOTES, "cone_axis", "brightest_point")
 """Estimators whose normal is the best one, in this order: that which knows the lights, that which follows the isophotes
 to the peak, that which averages them, and the one that needs none. `circle_pose` takes a curved surface for a plane."""
 
 UNSOUND = frozenset({"saturated", "missing_isovalues", "ambiguous_light"})
-"""With these flags `curved` and `bisector`, which follow the isophotes to the peak, give way to the next."""
+"""With these flags the estimators that follow the isophotes to the peak give way to the next."""
 
 
-def best_of(estimates: dict[str, Estimate | Failure]) -> str | None:
-    """Give the name of the estimator whose normal is the best one; None where all failed."""
-    answered = [name for name in BEST if isinstance(estimates.get(name), Estimate)]
-    for name in answered:
-        result = estimates[name]
-        assert isinstance(result, Estimate)
-        if name in ("bisector", "curved") and UNSOUND & set(result.flags):
-            continue
-        return name
-    return answered[0] if answered else next((n for n, e in estimates.items() if isinstance(e, Estimate)), None)
+@dataclass(frozen=True)
+class Drawing:
+    """What drawings need of an estimate, px: its isophotes, each with its isovalue, and the fitted curves."""
+
+    isophotes: list[tuple[float, Points]]
+    curves: list[Points]
 
 
-def describe(
-    index: int, specularity: Specularity, camera: Camera, highlight: Highlight | None = None
-) -> dict[str, Any]:
-    """Describe a specularity for normals.json: its region, and each estimator's result or reason of failure."""
-    results = {name: _entry(result, specularity, camera) for name, result in specularity.estimates.items()}
-    peak = None if isinstance(specularity.patch, Failure) else specularity.patch.peak_px.tolist()
-    entry = {"id": index, "box_px": list(specularity.region.box), "peak_px": peak}
+@dataclass(frozen=True)
+class ErrorRecord:
+    """Angle to a reference, deg: of the proposed normal, and of the better candidate."""
+
+    error_deg: float
+    error_oracle_deg: float
+
+
+@dataclass(frozen=True)
+class ReferenceRecord:
+    """The reference's normal at a specularity, and each estimator's error; None where the sightline misses it."""
+
+    normal: Array | None
+    errors: dict[str, ErrorRecord]
+
+    def to_json(self) -> JsonObject | None:
+        """Return the entry ``reference`` of a specularity."""
+        return None if self.normal is None else vars(self)
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """An estimator's errors against a reference, deg; a single one has no spread."""
+
+    n: int
+    mean_deg: float
+    std_deg: float | None
+    mean_oracle_deg: float
+    std_oracle_deg: float | None
+
+
+@dataclass(frozen=True)
+class ComparisonRecord:
+    """How normals compare with a reference: its file, what is wrong with it, and each estimator's errors."""
+
+    source: str
+    problems: list[str]
+    compared: int
+    missed: int
+    estimators: dict[str, ErrorSummary]
+
+
+@dataclass(frozen=True)
+class SpecularityRecord:
+    """A specularity, described: its region and peak, px, its sightline, and what each estimator made of it.
+
+    There is no peak where there is no patch, and no sightline where the lens images none. `kind` and `score` are those
+    of its `highlight`, if the detector judges any. `best` names the estimator whose normal is the best one, `track` is
+    the specularity's number over the frames of a sequence; `drawings` are by estimator.
+    """
+
+    id: int
+    box_px: tuple[int, int, int, int]
+    peak_px: Array | None
+    sightline: Array | None
+    kind: str | None
+    score: float | None
+    best: str | None
+    estimates: Mapping[str, Estimate | Failure]
+    highlight: Highlight | None = None
+    drawings: Mapping[str, Drawing] = field(default_factory=dict)
+    track: int | None = None
+    reference: ReferenceRecord | None = None
+
+    @property
+    def normals(self) -> dict[str, Estimate]:
+        """The results of the estimators that did not fail."""
+        return {name: result for name, result in self.estimates.items() if isinstance(result, Estimate)}
+
+    @property
+    def best_estimate(self) -> Estimate | None:
+        """The result of the best estimator."""
+        return None if self.best is None else self.normals[self.best]
+
+    @property
+    def position_px(self) -> Array:
+        """The peak, or the middle of the region where there is none."""
+        x, y, width, height = self.box_px
+        return np.array([x + width / 2, y + height / 2]) if self.peak_px is None else self.peak_px
+
+    def to_json(self) -> JsonObject:
+        """Return an entry of ``specularities``."""
+        return {
+            "id": self.id,
+            "box_px": self.box_px,
+            "peak_px": self.peak_px,
+            "sightline": self.sightline,
+            **({} if self.highlight is None else _highlight_json(self.highlight)),
+            "best": self.best,
+            "estimates": {name: _estimate_json(e, self.drawings.get(name)) for name, e in self.estimates.items()},
+            **{name: value for name in ("track", "reference") if (value := getattr(self, name)) is not None},
+        }
+
+    @classmethod
+    def from_json(cls, data: JsonObject) -> "SpecularityRecord":
+        """Read an entry, as far as tables and tracks need it."""
+        peak, sightline = (None if data[key] is None else np.array(data[key]) for key in ("peak_px", "sightline"))
+        estimates = {name: _estimate_from_json(entry) for name, entry in data["estimates"].items()}
+        judged = (data.get("kind"), data.get("score"))
+        return cls(data["id"], tuple(data["box_px"]), peak, sightline, *judged, data["best"], estimates)
+
+
+@dataclass(frozen=True)
+class PictureRecord:
+    """A picture and all that was reconstructed in it; `encoding` is the kind of the response that was undone."""
+
+    image: str
+    camera: Camera
+    encoding: str
+    detector: str
+    view: View
+    warnings: list[str]
+    specularities: list[SpecularityRecord]
+    other_highlights: Sequence[Highlight]
+    reference: ComparisonRecord | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the content of normals.json."""
+        others = [
+            {"box_px": h.region.box, "peak_px": [v + PIXEL_CENTRE for v in h.region.peak], **_highlight_json(h)}
+            for h in self.other_highlights
+        ]
+        return {
+            "image": self.image,
+            "camera": describe_camera(self.camera),
+            "encoding": self.encoding,
+            "detector": self.detector,
+            "view": _view_json(self.view),
+            "warnings": self.warnings,
+            "frame": FRAME,
+            "specularities": self.specularities,
+            "other_highlights": others,
+            "provenance": provenance.environment(),
+            **({} if self.reference is None else {"reference": self.reference}),
+        }
+
+
+def describe(made: Reconstruction, camera: Camera) -> list[SpecularityRecord]:
+    """Describe each specularity of a reconstruction, with what the detector says of it."""
+    judged: Sequence[Highlight | None] = made.highlights or [None] * len(made.specularities)
+    return [_describe(i, *pair, camera) for i, pair in enumerate(zip(made.specularities, judged, strict=True))]
+
+
+def _describe(index: int, specularity: Specularity, highlight: Highlight | None, camera: Camera) -> SpecularityRecord:
+    patch, estimates = specularity.patch, specularity.estimates
+    peak = None if isinstance(patch, Failure) else patch.peak_px
     sightline = None if peak is None else camera.unproject(peak)
     # A lens sees no direction beyond its fold.
-    entry["sightline"] = None if sightline is None or not np.isfinite(sightline).all() else sightline.tolist()
-    if highlight is not None:
-        entry |= describe_highlight(highlight)
-    return {**entry, "best": best_of(specularity.estimates), "estimates": results}
+    if sightline is not None and not np.isfinite(sightline).all():
+        sightline = None
+    drawings = {
+        name: Drawing(
+            [(t, np.round(points, 3).tolist()) for t, points in result.contours(patch)],
+            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
+        )
+        for name, result in estimates.items()
+        if isinstance(result, Estimate)
+    }
+    kind, score = (None, None) if highlight is None else (str(highlight.kind), highlight.score)
+    box, best = specularity.region.box, best_of(estimates)
+    return SpecularityRecord(index, box, peak, sightline, kind, score, best, estimates, highlight, drawings)
 
 
-def describe_highlight(highlight: Highlight) -> dict[str, Any]:
-    """Describe what the detection says of a highlight."""
+def without_drawings(spots: Sequence[SpecularityRecord]) -> list[SpecularityRecord]:
+    """Return the same without what only drawings need."""
+    return [replace(spot, drawings={}) for spot in spots]
+
+
+def best_of(estimates: Mapping[str, Estimate | Failure]) -> str | None:
+    """Return the name of the estimator whose normal is the best one; None where all failed."""
+    answered = {name: result for name, result in estimates.items() if isinstance(result, Estimate)}
+    ranked = [name for name in BEST if name in answered]
+    sound = [name for name in ranked if name not in FOLLOWS_ISOPHOTES or not UNSOUND & set(answered[name].flags)]
+    # An unsound normal is better than none, and another package's than that.
+    return next(iter((*sound, *ranked, *answered)), None)
+
+
+def deviation_deg(estimate: Estimate) -> float | None:
+    """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
+    return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
+
+
+def _view_json(view: View) -> JsonObject | None:
+    """Describe the view's border: its circle where it is round, and the outline of what is seen."""
+    if view.seen is None:
+        return None
+    contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
+    return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
+
+
+def _highlight_json(highlight: Highlight) -> JsonObject:
     return {
-        "kind": str(highlight.kind),
+        "kind": highlight.kind,
         "score": highlight.score,
         "area_px": highlight.area_px,
         "specular_peak": highlight.region.contrast,
-        "shape": {
-            "axis_ratio": highlight.axis_ratio,
-            "residual": highlight.residual,
-            "wander": highlight.wander,
-            "tint": highlight.tint,
-            "clutter": highlight.clutter,
-        },
-        "outline": np.round(highlight.outline, 2).tolist(),
+        "shape": {name: getattr(highlight, name) for name in ("axis_ratio", "residual", "wander", "tint", "clutter")},
+        "outline": np.round(highlight.outline, 2),
     }
 
 
-def _entry(result: Estimate | Failure, specularity: Specularity, camera: Camera) -> dict[str, Any]:
+def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonObject:
     if isinstance(result, Failure):
-        return {"status": str(result.reason), "detail": result.detail}
-    return {
+        return {"status": result.reason, "detail": result.detail}
+    entry: JsonObject = {
         "status": "ok",
-        "normal": result.normal.tolist(),
-        "candidates": result.candidates.tolist(),
+        "normal": result.normal,
+        "candidates": result.candidates,
         "choice_margin": result.choice_margin,
         "look_px": [float(v) if np.isfinite(v) else None for v in result.look_px],
         "axis_ratio": result.axis_ratio,
         "isovalues": [isophote.isovalue for isophote in result.isophotes],
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
-        "curvature": None if result.curvature is None else _curvature_entry(result.curvature),
-        "flags": list(result.flags),
-        "isophotes": [
-            {"t": t, "points": np.round(points, 3).tolist()} for t, points in result.contours(specularity.patch)
-        ],
-        "ellipses": [i.conic.image.tolist() for i in result.isophotes if i.conic is not None],
-        "cones": [isophote.cone.tolist() for isophote in result.isophotes],
-        "curves": [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
+        "covariance": result.covariance,
+        "curvature": None,
+        "flags": result.flags,
     }
+    if (shape := result.curvature) is not None:
+        entry["curvature"] = {"directions": shape.directions, "axis_ratio": shape.axis_ratio, "gains": shape.hypotheses}
+    if drawing is not None:
+        entry["isophotes"] = [{"t": t, "points": points} for t, points in drawing.isophotes]
+        entry["ellipses"] = [isophote.conic.image for isophote in result.isophotes if isophote.conic is not None]
+        entry["cones"] = [isophote.cone for isophote in result.isophotes]
+        entry["curves"] = drawing.curves
+    return entry
 
 
-def _curvature_entry(curvature: EstimatedCurvature) -> dict[str, Any]:
-    return {
-        "directions": curvature.directions.tolist(),
-        "axis_ratio": curvature.axis_ratio,
-        "gains": None if curvature.hypotheses is None else curvature.hypotheses.tolist(),
-    }
-
-
-COLUMNS = (
-    "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
-    "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
-    "score",
-)  # fmt: skip
-
-
-def rows(spots: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give a row for each specularity, estimator and candidate normal; candidate 0 is the proposed one."""
-    made = []
-    for spot in spots:
-        peak = spot["peak_px"] or (None, None)
-        common = {"specularity": spot["id"], "peak_x_px": peak[0], "peak_y_px": peak[1],
-                  "kind": spot.get("kind"), "score": spot.get("score")}  # fmt: skip
-        for name, result in spot["estimates"].items():
-            for k, normal in enumerate(result.get("candidates", [None])):
-                row = {**common, **result, "estimator": name, "best": int(name == spot["best"])}
-                row["candidate"] = k if normal else ""
-                row |= dict(zip(("normal_x", "normal_y", "normal_z"), normal or (), strict=False))
-                row |= dict(zip(("look_x_px", "look_y_px"), result.get("look_px", ()), strict=False))
-                if result.get("covariance"):
-                    (a, b), (_, c) = result["covariance"]
-                    row |= {"cov_11": a, "cov_12": b, "cov_22": c}
-                row["flags"] = ";".join(result.get("flags", ()))
-                made.append({column: row.get(column) for column in COLUMNS})
-    return made
-
-
-def write_csv(path: Path, table: Sequence[dict[str, Any]], columns: Sequence[str] = COLUMNS) -> None:
-    """Write rows as CSV; what is None stays empty."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(table)
-
-
-def ply(spots: Sequence[dict[str, Any]], camera: Camera, depth_mm: Sequence[float] | None = None) -> str:
-    """Give the proposed normals as oriented points on the sightlines they look along (PLY, ASCII).
-
-    The points are at the depth given for each specularity, else at unit depth; through a fisheye, which sees sideways
-    and backwards too, the same as distances.
-    """
-    fisheye = isinstance(camera.distortion, KannalaBrandt)
-    lines, names = [], sorted({name for spot in spots for name in spot["estimates"]})
-    for i, spot in enumerate(spots):
-        for name, result in spot["estimates"].items():
-            if result["status"] != "ok" or None in result["look_px"]:
-                continue
-            ray = camera.unproject(result["look_px"])
-            depth = 1.0 if depth_mm is None else depth_mm[i]
-            place = depth * (ray if fisheye else ray / ray[2])
-            if np.isfinite(place).all():
-                values = [*place.tolist(), *result["normal"]]
-                lines.append(" ".join(f"{v:.9g}" for v in values) + f" {spot['id']} {names.index(name)}")
-    header = [
-        "ply", "format ascii 1.0", f"comment estimators by number: {json.dumps(names)}", f"element vertex {len(lines)}",
-        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
-        "property int specularity", "property int estimator", "end_header",
-    ]  # fmt: skip
-    return "\n".join([*header, *lines]) + "\n"
-
-
-ARROW_SIDES = 6
-
-
-def arrows_ply(spots: Sequence[dict[str, Any]], camera: Camera, depth_mm: Sequence[float] | None = None) -> str:
-    """Give the best normal of each specularity as an arrow of triangles, a tenth of its distance long (PLY, ASCII)."""
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    for i, spot in enumerate(spots):
-        result = spot["estimates"].get(spot["best"]) if spot["best"] else None
-        if result is None or None in result["look_px"]:
-            continue
-        ray = camera.unproject(result["look_px"])
-        fisheye = isinstance(camera.distortion, KannalaBrandt)
-        place = (1.0 if depth_mm is None else depth_mm[i]) * (ray if fisheye else ray / ray[2])
-        if np.isfinite(place).all():
-            _add_arrow(vertices, faces, place, np.array(result["normal"]), 0.1 * float(np.linalg.norm(place)))
-    header = [
-        "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
-        *(f"property float {name}" for name in "xyz"), f"element face {len(faces)}",
-        "property list uchar int vertex_indices", "end_header",
-    ]  # fmt: skip
-    body = [" ".join(f"{v:.7g}" for v in vertex) for vertex in vertices]
-    return "\n".join([*header, *body, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n"
-
-
-def _add_arrow(
-    vertices: list[list[float]], faces: list[tuple[int, int, int]], start: np.ndarray, along: np.ndarray, length: float
-) -> None:
-    """Add a shaft and a head: rings of `ARROW_SIDES` points, joined, and a tip."""
-    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(along, side)
-    phase = 2 * np.pi * np.arange(ARROW_SIDES) / ARROW_SIDES
-    around = np.cos(phase)[:, None] * side + np.sin(phase)[:, None] * other
-    first = len(vertices)
-    for at, radius in ((0.0, 0.03), (0.7, 0.03), (0.7, 0.09)):
-        vertices += (start + length * (at * along + radius * around)).tolist()
-    vertices.append((start + length * along).tolist())
-    n = ARROW_SIDES
-    for i in range(n):
-        j = (i + 1) % n
-        for ring in (0, n):
-            a, b, c, d = (first + ring + k for k in (i, j, n + i, n + j))
-            faces += [(a, b, d), (a, d, c)]
-        faces.append((first + 2 * n + i, first + 2 * n + j, first + 3 * n))
+def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
+    if entry["status"] != "ok":
+        return Failure(Reason(entry["status"]), entry["detail"])
+    covariance = None if entry["covariance"] is None else np.array(entry["covariance"])
+    normal, candidates, look_px = (np.array(entry[key], dtype=float) for key in ("normal", "candidates", "look_px"))
+    margin, flags = entry["choice_margin"], tuple(entry["flags"])
+    return Estimate(normal, candidates, look_px, entry["axis_ratio"], (), margin, covariance, flags)

@@ -1,13 +1,13 @@
 """The picture with its isophotes, ellipses and normals: overlay.png of `simtest reconstruct`."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.pages.style import colours
+from simtest.reconstruction.description import Array, Points, SpecularityRecord
 
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -27,77 +27,67 @@ NUMBER: Colour = (0, 255, 255)
 FRACTION_BITS = 4
 
 
-def draw_overlay(picture: Image, spots: Sequence[dict[str, Any]], numbers: Sequence[str] | None = None) -> Bytes:
+def draw_overlay(picture: Image, spots: Sequence[SpecularityRecord]) -> Bytes:
     """Draw a picture with what was reconstructed in it, as the article does: isophote, ellipse, both normals, number.
 
-    Parameters
-    ----------
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        In [0, 1], as encoded, RGB.
-    spots : sequence of dict
-        Specularities as in normals.json.
-    numbers : sequence of str, optional
-        What stands beside each; default their ids.
-
-    Returns
-    -------
-    ndarray of uint8, shape (h, w, 3)
-        In OpenCV's order of channels, with a legend below.
+    The picture, shape (H, W) or (H, W, 3), is RGB in [0, 1], as encoded; the drawing is in OpenCV's order of channels,
+    with a legend below. Specularities are numbered by their tracks where they have one, else by their ids.
     """
     height, width = picture.shape[:2]
+    # enlarge
     wanted = CROWDED_PX if len(spots) > MANY else SHORTEST_PX
     scale = max(1, -(-wanted // max(height, width)))
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
     canvas = cv2.cvtColor(values, cv2.COLOR_GRAY2BGR if values.ndim == 2 else cv2.COLOR_RGB2BGR)
     if scale > 1:
         canvas = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    palette = {name: _bgr(colour) for name, colour in colours(n for s in spots for n in s["estimates"]).items()}
+    # draw
+    palette = {name: _bgr(colour) for name, colour in colours(n for s in spots for n in s.estimates).items()}
     reach = ARROW_SHARE * max(width, height) * scale * min(1.0, 3 / np.sqrt(max(len(spots), 1)))
     shown: dict[str, Colour] = {}
-    for i, spot in enumerate(spots):
-        _draw_spot(canvas, spot, palette, scale, reach, shown)
-        x, y, w, h = spot["box_px"]
-        place = (int((x + 0.75 * w) * scale), int((y + 0.25 * h) * scale))
-        _text(canvas, numbers[i] if numbers else str(spot["id"]), place, NUMBER, 0.42)
+    for spot in spots:
+        _draw_spot(canvas, spot, palette, (scale, reach), shown)
+        x, y, w, h = spot.box_px
+        corner = (int((x + 0.75 * w) * scale), int((y + 0.25 * h) * scale))
+        _text(canvas, str(spot.id if spot.track is None else spot.track), corner, NUMBER, 0.42)
     return np.vstack([canvas, _legend(canvas.shape[1], len(spots), shown)])
 
 
 def _draw_spot(
-    canvas: Bytes, spot: dict[str, Any], palette: dict[str, Colour], scale: int, reach: float, shown: dict[str, Colour]
-) -> None:
+    canvas: Bytes, spot: SpecularityRecord, palette: dict[str, Colour], size: tuple[int, float],
+    shown: dict[str, Colour],
+) -> None:  # fmt: skip
     """Draw the isophote at half height, the ellipses and candidates of circle_pose, and the best normal."""
-    for name in dict.fromkeys(("circle_pose", spot["best"])):
-        result = spot["estimates"].get(name) if name else None
-        if result is None or result["status"] != "ok":
+    for name in dict.fromkeys(("circle_pose", spot.best)):
+        result = spot.normals.get(name) if name else None
+        if name is None or result is None:
             continue
         colour = palette[name]
         shown[name] = colour
         if name == "circle_pose":
-            for isophote in result["isophotes"]:
-                _polyline(canvas, isophote["points"], ISOPHOTE, scale)
+            for _, points in spot.drawings[name].isophotes:
+                _polyline(canvas, points, ISOPHOTE, size[0])
                 shown["isophote"] = ISOPHOTE
-            for curve in result["curves"]:
-                _polyline(canvas, curve, colour, scale)
-        if None not in result["look_px"]:
-            for k, normal in enumerate(result["candidates"]):
-                _arrow(canvas, result["look_px"], normal, colour, (scale, reach), 1 if k else 2)
+            for curve in spot.drawings[name].curves:
+                _polyline(canvas, curve, colour, size[0])
+        if np.isfinite(result.look_px).all():
+            for k, normal in enumerate(result.candidates):
+                _arrow(canvas, result.look_px, normal, colour, size, 1 if k else 2)
 
 
-def _polyline(canvas: Bytes, points: Sequence[Sequence[float]], colour: Colour, scale: int) -> None:
+def _polyline(canvas: Bytes, points: Points, colour: Colour, scale: int) -> None:
     if len(points) < 2:
         return
     # Pixel centres are at + 0.5 here, and integers in OpenCV.
-    places = np.rint((np.array(points) * scale - 0.5) * 2**FRACTION_BITS).astype(np.int32)
-    cv2.polylines(canvas, [places.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
+    corners = np.rint((np.array(points) * scale - 0.5) * 2**FRACTION_BITS).astype(np.int32)
+    cv2.polylines(canvas, [corners.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
-def _arrow(
-    canvas: Bytes, look: Sequence[float], normal: Sequence[float], colour: Colour, size: tuple[int, float], width: int
-) -> None:
-    """Draw a normal by its part across the view."""
+def _arrow(canvas: Bytes, look: Array, normal: Array, colour: Colour, size: tuple[int, float], width: int) -> None:
+    """Draw the part of a normal across the view."""
     scale, reach = size
-    start = np.array(look) * scale - 0.5
-    end = start + reach * np.array(normal[:2])
+    start = look * scale - 0.5
+    end = start + reach * normal[:2]
     if not (np.abs([start, end]) < 2**20).all():
         return
     ends = [tuple(int(v) for v in np.rint(point * 2**FRACTION_BITS)) for point in (start, end)]
@@ -106,9 +96,9 @@ def _arrow(
     cv2.arrowedLine(canvas, ends[0], ends[1], colour, width, cv2.LINE_AA, FRACTION_BITS, tip)
 
 
-def _text(canvas: Bytes, text: str, place: tuple[int, int], colour: Colour, size: float) -> None:
+def _text(canvas: Bytes, text: str, corner: tuple[int, int], colour: Colour, size: float) -> None:
     for shade, width in (((0, 0, 0), 3), (colour, 1)):
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
+        cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
 
 
 def _legend(width: int, count: int, shown: dict[str, Colour]) -> Bytes:

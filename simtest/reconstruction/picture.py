@@ -1,56 +1,79 @@
-"""Reconstruction from a picture file: reading it, and writing the normals in formats that others read."""
+"""One picture: its camera, how it is to be reconstructed, and the record of its normals."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration
+from simtest.calibration import Calibration, Response
+from simtest.conventions import DEFAULT_SMOOTHING_PX
+from simtest.detection.colour import ColourDetector
+from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import write_constraints
-from simtest.reconstruction.description import arrows_ply, ply, rows, write_csv
-from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.picture_page import write_picture_page
-from simtest.reconstruction.single import Options, reconstruct_values
-from simtest.runtime import provenance
-from simtest.runtime.files import make_folder, write_atomically, write_json
-from simtest.spec import describe_camera
+from simtest.reconstruction.description import PictureRecord, describe
+from simtest.reconstruction.image_io import is_coloured
+from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, SMOOTHING_BY_COLOUR_PX, run_pipeline
+from simtest.spec import load_calibration
 
-FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
+Image = npt.NDArray[np.float32]
+
+DETECTORS = ("auto", "colour", "peaks")
+
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
 
 
-MANY = 10
-"""Above so many specularities normals.json is written on one line: most of it are outlines."""
+@dataclass(frozen=True)
+class Options:
+    """How pictures are reconstructed.
 
+    Parameters
+    ----------
+    camera : Path, optional
+        Calibration or camera file; this or `fov_deg` must be given, not both.
+    fov_deg : float, optional
+        Horizontal field of view, deg.
+    estimators : tuple of str, optional
+        Names; default those of the package that need no more than the calibration states.
+    roi : tuple of int, optional
+        Column, row, width, height; default: detected.
+    encoding : {"srgb", "linear"}, optional
+        How the values are encoded, where the calibration does not state the response; default sRGB. Isophotes are
+        those of linear values.
+    every : bool
+        Take highlights of every kind, and peaks that the border cuts or whose shape is not that of one point highlight.
+    detector : {"auto", "colour", "peaks"}
+        How highlights are found: by the tissue's colour, or as peaks of the mean of the channels. auto: by colour in
+        pictures that have any and are not linear.
+    smoothing_px : float, optional
+        Standard deviation of the Gaussian smoothing; default 1 px by colour, else 2 px.
 
-def picture_document(
-    image: Path | str, picture: npt.NDArray[np.float32], calibration: Calibration, options: Options,
-    cautions: Sequence[str] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Reconstruct a picture and give what normals.json holds."""
-    result = reconstruct_values(picture, calibration, options)
-    camera = calibration.camera
-    return {
-        "image": str(image),
-        "camera": describe_camera(camera),
-        "encoding": calibration.response.kind if calibration.response else "linear",
-        "detector": result.detector,
-        "view": result.view,
-        "warnings": list(cautions),
-        "frame": FRAME,
-        "specularities": result.spots,
-        "other_highlights": result.others,
-        "provenance": provenance.environment(),
-    }
+    Raises
+    ------
+    InputError
+        If the camera is given twice or not at all, or the detector is none of these.
+    """
+
+    camera: Path | None = None
+    fov_deg: float | None = None
+    estimators: tuple[str, ...] | None = None
+    roi: tuple[int, int, int, int] | None = None
+    encoding: str | None = None
+    every: bool = False
+    detector: str = "auto"
+    smoothing_px: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.detector not in DETECTORS:
+            raise InputError(f"--detector {self.detector}: must be one of {', '.join(DETECTORS)}")
+        if (self.camera is None) == (self.fov_deg is None):
+            raise InputError("--camera or --fov: exactly one of them must be given")
 
 
 def parse_roi(text: str) -> tuple[int, int, int, int]:
-    """Give a region of interest from "x,y,w,h"."""
+    """Return the region of interest "x,y,w,h"."""
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
@@ -58,42 +81,69 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
     return x, y, width, height
 
 
-def write_document(
-    out: Path, document: dict[str, Any], picture: npt.NDArray[np.float32], camera: Camera, depth: list[float] | None
-) -> list[Path]:
-    """Write what was reconstructed in a picture, its overlay and its page; return the files.
+def read_calibration(options: Options, picture: Image) -> tuple[Calibration, list[str]]:
+    """Return the calibration of pictures of this size, and warnings about it.
 
-    Parameters
-    ----------
-    out : Path
-        Folder, made if need be.
-    document : dict
-        As `picture_document` makes it.
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        The picture.
-    camera : Camera
-        Its camera.
-    depth : list of float, optional
-        Depth of each specularity's arrow, mm; default 1.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
+    Added is what every picture file has: an encoding, and a largest value, at which it is clipped. Raises `InputError`
+    if the camera's file is malformed, or states the response and the options do too.
     """
-    names = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
-             "constraints.npz", "index.html")  # fmt: skip
-    files = [out / name for name in names]
-    spots = document["specularities"]
-    make_folder(out)
-    try:
-        write_json(files[0], document, compact=len(spots) > MANY)
-        write_atomically(files[1], lambda part: write_csv(part, rows(spots)))
-        write_atomically(files[2], lambda part: part.write_text(ply(spots, camera, depth), encoding="ascii"))
-        write_atomically(files[3], lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
-        write_atomically(files[4], lambda part: part.write_text(arrows_ply(spots, camera, depth), encoding="ascii"))
-        write_constraints(files[5], files[6], document)
-        write_atomically(files[7], lambda part: write_picture_page(part, document, picture))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
-    return files
+    if options.camera is not None:
+        calibration, cautions = load_calibration(options.camera), []
+    else:
+        assert options.fov_deg is not None
+        calibration = Calibration(Camera.from_fov(options.fov_deg, picture.shape[1], picture.shape[0]))
+        cautions = [f"no calibration: all angles depend on the field of view of {options.fov_deg:g} deg being right"]
+    if calibration.response is not None and options.encoding is not None:
+        raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
+    response = calibration.response or (Response() if options.encoding == "linear" else Response("srgb"))
+    level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
+    return replace(calibration, response=response, saturation_level=level), cautions
+
+
+def default_estimators(calibration: Calibration) -> tuple[str, ...]:
+    """Return the names of the estimators that the calibration states enough for."""
+    priors = calibration.priors
+    lights = len(priors.lights) > 0 and priors.distance_mm is not None
+    return (*DEFAULT_ESTIMATORS, *(("bisector",) if lights else ()))
+
+
+def reconstruct_values(
+    name: str, picture: Image, calibration: Calibration, options: Options, cautions: Sequence[str] = ()
+) -> PictureRecord:
+    """Reconstruct a picture, shape (H, W) or (H, W, 3), as encoded in [0, 1], and describe the result.
+
+    Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
+    the picture.
+    """
+    estimators = list(options.estimators or default_estimators(calibration))
+    detector = _detector(picture, calibration, options)
+    smoothing_px = SMOOTHING_BY_COLOUR_PX if detector == "colour" else DEFAULT_SMOOTHING_PX
+    if options.smoothing_px is not None:
+        smoothing_px = options.smoothing_px
+    finder = (ColourDetector if detector == "colour" else PeakDetector)(isolated=not options.every)
+    # linear light, detect, estimate
+    made = run_pipeline(picture, calibration, finder, estimators, options.roi, smoothing_px)
+    # describe
+    return PictureRecord(
+        image=name,
+        camera=calibration.camera,
+        encoding=calibration.response.kind if calibration.response else "linear",
+        detector=detector,
+        view=made.view,
+        warnings=list(cautions),
+        specularities=describe(made, calibration.camera),
+        other_highlights=made.others,
+    )
+
+
+def _detector(picture: Image, calibration: Calibration, options: Options) -> str:
+    """Choose the detector of a picture by name."""
+    if options.detector == "colour" and (picture.ndim != 3 or options.roi is not None):
+        what = "--roi names the region" if picture.ndim == 3 else "the picture is grey"
+        raise InputError(f"--detector colour: {what}; must be peaks")
+    if options.roi is not None:
+        return "peaks"
+    linear = calibration.response is not None and calibration.response.kind == "linear"
+    if options.detector == "auto":
+        return "colour" if is_coloured(picture) and not linear else "peaks"
+    return options.detector

@@ -1,4 +1,4 @@
-"""From one frame and its camera to normals: detect the specularities, run the estimators on each."""
+"""The pipeline from the values of a picture to normals: linear light, detect, estimate; one for grey and for colour."""
 
 import math
 import operator
@@ -8,20 +8,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, CorrectedFrame, Frame
+from simtest.calibration import Calibration, Frame, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
-from simtest.detection import Region, detect, estimate_noise, flat_pixels, peak_shape
+from simtest.detection import Region
+from simtest.detection.blobs import Highlight
+from simtest.detection.colour import ColourDetection, ColourDetector, ColourFrameDetection
+from simtest.detection.detector import Detection, Detector, load_detector
+from simtest.detection.peaks import PeakDetector
+from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
-from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry import Camera, Patch
+from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
-
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
 MAX_SMOOTHING_PX = 50
+
+SMOOTHING_BY_COLOUR_PX = 1.0
+"""Highlights of real pictures are small, and 2 px would round them."""
+
+SMALL_RADIUS = 3.0
+"""A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
+estimates have the flag ``small``."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,32 @@ class Specularity:
     region: Region
     patch: Patch | Failure
     estimates: dict[str, Estimate | Failure]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The normals of a picture, and the detection that they stand on."""
+
+    specularities: list[Specularity]
+    detection: Detection
+
+    @property
+    def highlights(self) -> Sequence[Highlight]:
+        """How each detected region was judged; empty where the detector judges none."""
+        return self.detection.highlights if isinstance(self.detection, ColourFrameDetection) else ()
+
+    @property
+    def others(self) -> Sequence[Highlight]:
+        """The highlights that the detector left out."""
+        if not isinstance(self.detection, ColourFrameDetection):
+            return ()
+        taken = {id(highlight) for highlight in self.detection.highlights}
+        return [highlight for highlight in self.detection.colour.highlights if id(highlight) not in taken]
+
+    @property
+    def view(self) -> View:
+        """The part of the picture that shows tissue, as far as the detector looked for it."""
+        return self.detection.view if isinstance(self.detection, ColourFrameDetection) else WHOLE
 
 
 def reconstruct(
@@ -84,111 +120,131 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN or infinity; if an
         argument is of the wrong kind or out of range.
     """
-    calibration = _calibration(camera)
-    view = calibration.camera
-    image = check_frame(frame, view)
-    corrected = calibration.correct(image)
-    number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
-    if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
-        raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    roi = None if roi is None else _check_roi(roi)
-    chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
-    frame_cut = FrameCut.of(corrected, calibration, smoothing_px)
-    if roi is not None:
-        patch = frame_cut.patch(roi)
-        peak = (roi[0], roi[1]) if isinstance(patch, Failure) else tuple(int(v) for v in patch.peak_px)
-        found = [(Region(roi, (peak[0], peak[1]), None), patch)]
-    else:
-        noise = frame_cut.noise
-        regions = detect(frame_cut.smoothed, noise, isolated, view.seen)
-        found = [(region, frame_cut.patch(region.box, region.peak)) for region in regions]
-        if isolated:
-            left, flat = _noise_left(smoothing_px), flat_pixels(image)
-            found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(noise, r.peak), flat)]
-    return run_estimators(found, chosen, Frame(image, calibration, smoothing_px), corrected.limited)
+    return run_pipeline(frame, camera, PeakDetector(isolated), estimators, roi, smoothing_px).specularities
 
 
-@dataclass(frozen=True)
-class FrameCut:
-    """A corrected frame, smoothed, that patches are cut from.
+def reconstruct_colour(
+    picture: npt.ArrayLike,
+    camera: Camera | Calibration,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator] = DEFAULT_ESTIMATORS,
+    smoothing_px: float = SMOOTHING_BY_COLOUR_PX,
+    isolated: bool = True,
+) -> Reconstruction:
+    """Reconstruct the normals at the isolated highlights of a colour picture.
+
+    The estimators see the specular light alone: the tissue's part of each pixel is taken off (`split_light`).
 
     Parameters
     ----------
-    corrected : CorrectedFrame
-        The frame.
-    smoothed : ndarray of float32, shape (H, W)
-        Its intensity, smoothed.
-    noise : float, or ndarray of float32, shape (H, W)
-        Standard deviation of the intensity's noise before smoothing.
-    smoothing_px : float
-        Standard deviation of the Gaussian, px.
-    seen : ndarray of bool, shape (H, W), or None
-        The pixels inside the view mask.
-    """
-
-    corrected: CorrectedFrame
-    smoothed: Image
-    noise: float | Image
-    smoothing_px: float
-    seen: Mask | None
-
-    @classmethod
-    def of(
-        cls, corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float, seen: Mask | None = None
-    ) -> "FrameCut":
-        """Smooth a frame and estimate its noise; `seen` is that of the calibration's camera where it is not given."""
-        seen = calibration.camera.seen if seen is None else seen
-        smoothed = smooth(corrected.intensity, smoothing_px, seen)
-        return cls(corrected, smoothed, _noise(corrected, calibration, smoothing_px, seen), smoothing_px, seen)
-
-    def patch(self, box: tuple[int, int, int, int], peak: tuple[int, int] | None = None) -> Patch | Failure:
-        """Cut a region of interest out (see `Patch.cut`)."""
-        return Patch.cut(
-            self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen, raw=self.corrected.intensity,
-            noise=self.noise, smoothing_px=self.smoothing_px,
-        )  # fmt: skip
-
-
-def run_estimators(
-    found: Sequence[tuple[Region, Patch | Failure]],
-    estimators: Mapping[str, AnyEstimator],
-    frame: Frame,
-    limited: Mask | None = None,
-) -> list[Specularity]:
-    """Run estimators on regions of interest.
-
-    Parameters
-    ----------
-    found : sequence of tuple
-        Regions with their patches.
-    estimators : mapping
-        Estimator by name.
-    frame : Frame
-        The frame that the patches are cut from, with its calibration.
-    limited : ndarray of bool, shape (H, W), optional
-        Where too little light is left for the whole correction (`CorrectedFrame.limited`).
+    picture : array_like, shape (H, W, 3)
+        RGB values as encoded, in [0, 1].
+    camera : Camera or Calibration
+        Of the same size. Where it has no response, sRGB is taken; where it has no view mask, that of the picture.
+    isolated : bool
+        Leave out highlights of the other kinds.
+    estimators, smoothing_px
+        As of `reconstruct`, as are the errors raised.
 
     Returns
     -------
-    list of Specularity
-        In the same order; then one for each estimate of a `FrameEstimator` that no patch takes.
+    Reconstruction
+        Estimates of highlights that smoothing has made rounder have the flag ``small``.
     """
-    peaks = [(r.peak[0] + PIXEL_CENTRE, r.peak[1] + PIXEL_CENTRE) for r, _ in found]
-    # A user's region may overlap detected peaks, so it gets no list of neighbours.
-    known = [region.contrast is not None for region, _ in found]
-    patches = [
-        _beside(patch, (*peaks[:i], *peaks[i + 1 :])) if known[i] else patch for i, (_, patch) in enumerate(found)
-    ]
+    return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
+
+
+@dataclass(frozen=True)
+class PictureDetection:
+    """What a colour picture shows: the part of it that is tissue, and its highlights."""
+
+    view: View
+    detection: ColourDetection
+
+
+def detect_in_picture(
+    picture: Image, response: Response | None = None, level: float = 1.0, seen: Mask | None = None
+) -> PictureDetection:
+    """Find the highlights of a colour picture, without a camera.
+
+    Parameters
+    ----------
+    picture : ndarray of float32, shape (H, W, 3)
+        RGB values as encoded, in [0, 1], of 16 bits at most.
+    response : Response, optional
+        How light became values; default sRGB.
+    level : float
+        Value at and above which a channel is clipped.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default: found in the picture.
+
+    Returns
+    -------
+    PictureDetection
+    """
+    # Detection by colour uses no angle, so any field of view serves.
+    camera = Camera.from_fov(60.0, picture.shape[1], picture.shape[0])
+    calibration = Calibration(camera, response=response or Response("srgb"), saturation_level=level)
+    found = ColourDetector().detect(Frame(picture, calibration, seen=seen), camera)
+    return PictureDetection(found.view, found.colour)
+
+
+def run_pipeline(
+    picture: npt.ArrayLike,
+    camera: Camera | Calibration,
+    detector: str | Detector,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator],
+    roi: tuple[int, int, int, int] | None,
+    smoothing_px: float,
+) -> Reconstruction:
+    """Reconstruct the normals of a picture with any detector (see `reconstruct` and `reconstruct_colour`)."""
+    calibration = _calibration(camera)
+    image = check_frame(picture, calibration.camera)
+    number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
+    if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
+        raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
+    box = None if roi is None else _check_roi(roi)
+    chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
+    # linear light: a frame computes each step of its correction when it is first asked for
+    frame = Frame(image, calibration, smoothing_px)
+    # detect
+    if box is not None:
+        detection = _cut_region(frame, box)
+    else:
+        detection = load_detector(detector).detect(frame, calibration.camera, calibration.priors)
+    # estimate
+    return _estimate(detection, chosen)
+
+
+def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
+    """Take a user's region of interest for the one specularity; raise `InputError` where it leaves the frame."""
+    patch = frame.patch(box)
+    x, y = box[:2] if isinstance(patch, Failure) else (int(v) for v in patch.peak_px)
+    return Detection((Region(box, (x, y), None),), frame)
+
+
+def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> Reconstruction:
+    """Run each estimator on all patches of a picture, or on the whole frame."""
+    frame, regions = detection.frame, detection.regions
+    # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
+    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
+    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
+    patches = [_beside(patch, (*peaks[:i], *peaks[i + 1 :])) for i, patch in enumerate(cut)]
     made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
-    detected = [
-        Specularity(region, patch, {name: _flagged(made[name].of_patches[i], patch, limited) for name in made})
-        for i, ((region, _), patch) in enumerate(zip(found, patches, strict=True))
-    ]
-    return detected + [_undetected(name, each, frame) for name in made for each in made[name].elsewhere]
+    # Flags that depend on the frame are added behind those of the estimators.
+    limited = frame.corrected.limited
+    result = Reconstruction([], detection)
+    rounded_px = SMALL_RADIUS * frame.smoothing_px
+    small = [_radius_px(highlight) < rounded_px for highlight in result.highlights] or [False] * len(patches)
+    for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
+        estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
+        result.specularities.append(Specularity(region, patch, estimates))
+    undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
+    result.specularities.extend(undetected)
+    return result
 
 
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
-    """Return the specularity of an estimate that no patch takes: one pixel, and no patch."""
+    """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
     height, width = frame.encoded.shape[:2]
     x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
     no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
@@ -199,54 +255,55 @@ def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> 
     return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
 
 
-def _noise(
-    corrected: CorrectedFrame, calibration: Calibration, smoothing_px: float, seen: Mask | None
-) -> float | Image:
-    """Give the noise of a corrected frame before smoothing: estimated where it is white, then amplified with it."""
-    # A sensor that clips at full scale clips at 0 as well.
-    clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
-    white = estimate_noise(corrected.linear, seen, clipped)
-    if calibration.noise.is_silent and corrected.gain is None:
-        return white
-    known = calibration.noise.at(smooth(corrected.linear, smoothing_px, seen), corrected.channels)
-    noise = np.maximum(white, known)
-    return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
+def _radius_px(highlight: Highlight) -> float:
+    return math.sqrt(highlight.area_px / math.pi)
 
 
-def _at(noise: float | Image, pixel: tuple[int, int]) -> float:
-    return float(noise) if isinstance(noise, float) else float(noise[pixel[1], pixel[0]])
-
-
-def _noise_left(smoothing_px: float) -> float:
-    """Give the share of white noise that a Gaussian of this width leaves: 1 / (2 sqrt(pi) s) where it is wide."""
-    return 1 / math.sqrt(1 + 4 * math.pi * smoothing_px**2)
-
-
-def _is_highlight(region: Region, patch: Patch | Failure, noise: float, flat: Mask | None) -> bool:
-    """Tell whether nothing in a peak's shape speaks against one point highlight."""
-    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, noise, flat)
-    return isinstance(shape, Failure) or shape.is_highlight
-
-
-def _flagged(result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None) -> Estimate | Failure:
-    """Add the flags that hang on the frame, not on the estimator."""
+def _flagged(
+    result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None, small: bool
+) -> Estimate | Failure:
+    """Add the flags that depend on the frame, not on the estimator."""
     if isinstance(result, Failure) or isinstance(patch, Failure):
         return result
+    # What an estimate used is what its lowest isophote encloses.
     masks = {"saturated": patch.saturated}
     if limited is not None:
         (x, y), (height, width) = patch.origin_px, patch.values.shape
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    if not touched:
-        return result
-    isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
-    used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
-    flags = tuple(name for name, mask in touched.items() if (mask & used).any())
-    return replace(result, flags=(*result.flags, *flags))
+    flags = ("small",) if small else ()
+    if touched:
+        isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
+        used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
+        flags = (*(name for name, mask in touched.items() if (mask & used).any()), *flags)
+    return replace(result, flags=(*result.flags, *flags)) if flags else result
+
+
+def _calibration(camera: Camera | Calibration) -> Calibration:
+    if isinstance(camera, Calibration):
+        return camera
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
+    return Calibration(camera)
+
+
+def _check_names(names: Sequence[str]) -> Sequence[str]:
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
+    return names
+
+
+def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
+    try:
+        x, y, width, height = (operator.index(value) for value in roi)
+    except (TypeError, ValueError):
+        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
+    return x, y, width, height
 
 
 def check_frame(frame: npt.ArrayLike, camera: Camera) -> Image:
-    """Give a frame as float32 values, shape (H, W) or (H, W, C); raise `InputError` where it does not fit."""
+    """Return a frame as float32 values, shape (H, W) or (H, W, C); raise `InputError` where it does not fit."""
     try:
         given = np.asarray(frame)
     except (TypeError, ValueError):
@@ -272,26 +329,3 @@ def check_frame(frame: npt.ArrayLike, camera: Camera) -> Image:
         bad = int(np.count_nonzero(~finite))
         raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
     return image
-
-
-def _calibration(camera: Camera | Calibration) -> Calibration:
-    if isinstance(camera, Calibration):
-        return camera
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
-    return Calibration(camera)
-
-
-def _check_names(names: Sequence[str]) -> Sequence[str]:
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
-    return names
-
-
-def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Give a region as four plain integers; that it lies inside the frame is checked where it is cut."""
-    try:
-        x, y, width, height = (operator.index(value) for value in roi)
-    except (TypeError, ValueError):
-        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
-    return x, y, width, height

@@ -2,42 +2,32 @@
 
 import json
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.reconstruction.description import COLUMNS, rows, write_csv
-from simtest.reconstruction.image_sources import SequenceFrame, Source, open_source
+from simtest.reconstruction.description import SpecularityRecord, without_drawings
+from simtest.reconstruction.image_io import SequenceFrame, open_source
+from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.picture import picture_document
-from simtest.reconstruction.sequence_page import write_sequence_page
-from simtest.reconstruction.single import Options, check_camera_given, completed, read_camera
-from simtest.reconstruction.tracking import Tracker
+from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
+from simtest.reconstruction.result_page import write_sequence_page
+from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
 from simtest.runtime.files import make_folder, write_atomically, write_json
 from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
 
 TIMELINE = ("frame", "time_s", "track", *COLUMNS)
-DRAWN = ("isophotes", "ellipses", "cones", "curves")
-"""What a frame's JSON does without: points that are there to be drawn."""
 
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """What came of a sequence.
-
-    Parameters
-    ----------
-    frames, failed, specularities, tracks : int
-        Counts; a track is of two frames or more.
-    files : list of Path
-    """
+    """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written."""
 
     frames: int
     failed: int
@@ -46,14 +36,7 @@ class SequenceResult:
     files: list[Path]
 
 
-def reconstruct_sequence(
-    path: Path,
-    out: Path,
-    camera_file: Path | None = None,
-    fov_deg: float | None = None,
-    options: Options | None = None,
-    progress: Progress | None = None,
-) -> SequenceResult:
+def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Progress | None = None) -> SequenceResult:
     """Reconstruct the frames of a folder or a video.
 
     Parameters
@@ -63,56 +46,46 @@ def reconstruct_sequence(
     out : Path
         Folder: run.json, frames/NNNNNN.json and .jpg, timeline.csv, tracks.json, index.html. Frames that are there
         already are not done again.
-    camera_file, fov_deg
-        As of `simtest.reconstruction.picture.reconstruct_picture`.
-    options : Options, optional
-        How.
+    options : Options
+        Camera, detector and estimators.
     progress : callable, optional
         Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
         is kept.
-
-    Returns
-    -------
-    SequenceResult
 
     Raises
     ------
     InputError
         If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
-    options = options or Options()
-    check_camera_given(camera_file, fov_deg)
     source = open_source(path)
-    folder = out / "frames"
-    make_folder(folder)
-    _check_settings(out / "run.json", path, camera_file, fov_deg, options)
-    run = _Run(source, folder, (camera_file, fov_deg), options)
+    make_folder(out / "frames")
+    _check_settings(out / "run.json", path, options)
+    run = _Run(out / "frames", options)
     for frame in source.frames():
         if progress is not None:
             progress(frame.index, max(source.count, frame.index + 1), frame.name)
         run.take(frame)
-    if not run.documents:
+    # A run that read nothing is an error; one that ended early keeps what it has.
+    if not run.frames:
         raise InputError(f"{shown(path)}: no frame could be read ({run.first_error or 'it has none'})")
     if source.is_video and run.taken < source.count - 1:
         warnings.warn(
             f"{shown(path)}: ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
-    files = _write(out, run.documents)
+    tracks = tracks_of(run.frames)
+    files = _write(out, run.frames, tracks)
     if progress is not None:
         progress(run.taken, run.taken, "")
-    spots = [spot for document in run.documents for spot in document["specularities"]]
-    tracks = tracks_of(run.documents)
-    return SequenceResult(run.taken, run.failed, len(spots), sum(len(t["frames"]) > 1 for t in tracks), files)
+    found = sum(len(frame.specularities) for frame in run.frames)
+    return SequenceResult(run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files)
 
 
 class _Run:
-    """The frames done so far."""
+    """The frames of a sequence that are done so far, with what carries over from one to the next."""
 
-    def __init__(
-        self, source: Source, folder: Path, camera: tuple[Path | None, float | None], options: Options
-    ) -> None:
-        self.source, self.folder, self.camera, self.options = source, folder, camera, options
-        self.documents: list[dict[str, Any]] = []
+    def __init__(self, folder: Path, options: Options) -> None:
+        self.folder, self.options = folder, options
+        self.frames: list[TrackedFrame] = []
         self.taken = self.failed = 0
         self.first_error = ""
         self._calibration: Calibration | None = None
@@ -123,122 +96,85 @@ class _Run:
         """Reconstruct a frame, or read what an earlier run made of it."""
         self.taken += 1
         stem = self.folder / f"{frame.index:06d}"
-        document = _read_done(stem.with_suffix(".json"), frame.name)
-        if document is None:
-            try:
-                document = self._reconstruct(frame, stem)
-            except InputError as error:
-                # The first frame tells of a wrong camera or estimator; a file that is no picture is passed over.
-                if not self.documents and self._calibration is not None:
-                    raise
-                self.failed += 1
-                self.first_error = self.first_error or str(error)
-                warnings.warn(f"frame {frame.index}: {error}", stacklevel=3)
-                return
-        else:
-            self._numbers(document, tuple(document["size"]))
-        self.documents.append(document)
+        # done by an earlier run: only the tracks are counted anew
+        done = _read_done(stem.with_suffix(".json"), frame.name)
+        if done is not None:
+            self.frames.append(replace(done, specularities=self._tracked(done.specularities, done.size)))
+            return
+        try:
+            self.frames.append(self._reconstruct(frame, stem))
+        except InputError as error:
+            # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
+            if not self.frames and self._calibration is not None:
+                raise
+            self.failed += 1
+            self.first_error = self.first_error or str(error)
+            warnings.warn(f"frame {frame.index}: {error}", stacklevel=3)
 
-    def _reconstruct(self, frame: SequenceFrame, stem: Path) -> dict[str, Any]:
+    def _reconstruct(self, frame: SequenceFrame, stem: Path) -> TrackedFrame:
         picture = frame.read()
         size = (picture.shape[1], picture.shape[0])
+        # The first picture's size completes a camera that is known by its field of view alone.
         if self._calibration is None:
-            calibration, self._cautions = read_camera(*self.camera, size)
+            self._calibration, self._cautions = read_calibration(self.options, picture)
             for caution in self._cautions:
                 warnings.warn(caution, stacklevel=5)
-            self._calibration = completed(calibration, self.options.encoding)
-        document = picture_document(frame.name, picture, self._calibration, self.options, self._cautions)
-        document |= {"frame_index": frame.index, "time_s": frame.time_s, "size": list(size)}
-        numbers = self._numbers(document, size)
-        overlay = draw_overlay(picture, document["specularities"], [str(n) for n in numbers])
+        record = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
+        spots = self._tracked(record.specularities, size)
+        overlay = draw_overlay(picture, spots)
         write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
-        for spot in document["specularities"]:
-            for result in spot["estimates"].values():
-                for key in DRAWN:
-                    result.pop(key, None)
+        spots = without_drawings(spots)
+        entry = {"frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
-        write_json(stem.with_suffix(".json"), document, compact=True)
-        return document
+        write_json(stem.with_suffix(".json"), replace(record, specularities=spots).to_json() | entry, compact=True)
+        return TrackedFrame(frame.name, frame.index, frame.time_s, size, spots)
 
-    def _numbers(self, document: dict[str, Any], size: tuple[int, ...]) -> list[int]:
-        if self._tracker is None:
-            self._tracker = Tracker((size[0], size[1]))
-        spots = document["specularities"]
-        numbers = self._tracker.update([_place(spot) for spot in spots])
-        for spot, number in zip(spots, numbers, strict=True):
-            spot["track"] = number
-        return numbers
+    def _tracked(self, spots: list[SpecularityRecord], size: tuple[int, int]) -> list[SpecularityRecord]:
+        self._tracker = self._tracker or Tracker(size)
+        numbers = self._tracker.update([spot.position_px for spot in spots])
+        return [replace(spot, track=number) for spot, number in zip(spots, numbers, strict=True)]
 
 
-def _place(spot: dict[str, Any]) -> Sequence[float]:
-    x, y, width, height = spot["box_px"]
-    return spot["peak_px"] or (x + width / 2, y + height / 2)
-
-
-def _read_done(path: Path, name: str) -> dict[str, Any] | None:
-    """Give what an earlier run made of a frame; None where it did nothing, or what it left cannot be used."""
+def _read_done(path: Path, name: str) -> TrackedFrame | None:
+    """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        frame = TrackedFrame.from_json(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    usable = isinstance(document, dict) and document.get("image") == name and "size" in document
-    return document if usable else None
+    return frame if frame.name == name else None
 
 
-def _check_settings(
-    path: Path, source: Path, camera_file: Path | None, fov_deg: float | None, options: Options
-) -> None:
+def _check_settings(path: Path, source: Path, options: Options) -> None:
     """Write the run's settings, or raise `InputError` where another run's stand."""
-    settings = json.loads(
-        json.dumps({"source": str(source), "camera": camera_file and str(camera_file), "fov_deg": fov_deg,
-                    **asdict(options)})
-    )  # fmt: skip
-    if path.is_file():
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            before = None
-        if before != settings:
-            keys = [k for k in settings if not isinstance(before, dict) or before.get(k) != settings[k]]
-            raise InputError(
-                f"--out {shown(path.parent)}: holds a run with another {', '.join(keys) or 'set of settings'}; "
-                "give another folder"
-            )
+    # Through JSON, so that paths and tuples compare with the text and lists that are read.
+    settings = json.loads(json.dumps({"source": source, **asdict(options)}, default=str))
+    if not path.is_file():
+        write_json(path, settings)
         return
-    write_json(path, settings)
-
-
-def tracks_of(documents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give each track: its frames, positions and best normals, in order."""
-    tracks: dict[int, dict[str, Any]] = {}
-    for document in documents:
-        for spot in document["specularities"]:
-            track = tracks.setdefault(
-                spot["track"], {"track": spot["track"], "frames": [], "times_s": [], "peaks_px": [], "normals": []}
-            )
-            best = spot["estimates"].get(spot["best"]) if spot["best"] else None
-            track["frames"].append(document["frame_index"])
-            track["times_s"].append(document["time_s"])
-            track["peaks_px"].append(spot["peak_px"])
-            track["normals"].append(None if best is None else best["normal"])
-    return [tracks[number] for number in sorted(tracks)]
-
-
-def _frame_rows(document: dict[str, Any]) -> list[dict[str, Any]]:
-    spots = document["specularities"]
-    tracks = {spot["id"]: spot["track"] for spot in spots}
-    frame = {"frame": document["frame_index"], "time_s": document["time_s"]}
-    return [{**frame, "track": tracks[row["specularity"]], **row} for row in rows(spots)]
-
-
-def _write(out: Path, documents: list[dict[str, Any]]) -> list[Path]:
-    files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
-    table = [row for document in documents for row in _frame_rows(document)]
-    tracks = tracks_of(documents)
     try:
-        write_atomically(files[0], lambda part: write_csv(part, table, TIMELINE))
+        before = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        before = None
+    if before != settings:
+        keys = [key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key]]
+        raise InputError(
+            f"--out {shown(path.parent)}: holds a run with another {', '.join(keys) or 'set of settings'}; "
+            "give another folder"
+        )
+
+
+def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[Path]:
+    files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
+    table = [
+        (frame.index, frame.time_s, spot.track, *row)
+        for frame in frames
+        for spot in frame.specularities
+        for row in normals_rows([spot])
+    ]
+    try:
+        write_atomically(files[0], lambda part: write_csv(part, TIMELINE, table))
         write_json(files[1], tracks, compact=True)
-        write_atomically(files[2], lambda part: write_sequence_page(part, documents, tracks))
+        write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     except OSError as error:
         raise InputError(f"--out {shown(out)}: cannot be written ({error.strerror})") from error
     return files

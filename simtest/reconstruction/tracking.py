@@ -1,4 +1,4 @@
-"""Follows the same specularity from frame to frame by where it is."""
+"""The specularities of a sequence: what is kept of each frame, and which of them are the same from frame to frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-Array = npt.NDArray[np.float64]
+from simtest.reconstruction.description import Array, SpecularityRecord
+from simtest.runtime.files import JsonObject
 
 REACH_SHARE = 0.03
 """How far a specularity may move between frames from where it is expected, as a share of the picture's longer side."""
@@ -19,22 +20,66 @@ DAMPING = 0.5
 """Share of the last step that is expected again."""
 
 
+@dataclass(frozen=True)
+class TrackedFrame:
+    """A frame of a sequence, its specularities numbered by their tracks and without drawings; its size is in px."""
+
+    name: str
+    index: int
+    time_s: float | None
+    size: tuple[int, int]
+    specularities: list[SpecularityRecord]
+
+    @classmethod
+    def from_json(cls, data: JsonObject) -> "TrackedFrame":
+        """Read the JSON file of a frame."""
+        width, height = data["size"]
+        spots = [SpecularityRecord.from_json(entry) for entry in data["specularities"]]
+        return cls(data["image"], data["frame_index"], data["time_s"], (width, height), spots)
+
+
+@dataclass(frozen=True)
+class Track:
+    """The same specularity over frames: where it was seen, and its best normals; an entry of tracks.json."""
+
+    track: int
+    frames: list[int]
+    times_s: list[float | None]
+    peaks_px: list[Array | None]
+    normals: list[Array | None]
+
+
+def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
+    """Return the tracks of a sequence by their numbers."""
+    tracks: dict[int, Track] = {}
+    for frame in frames:
+        for spot in frame.specularities:
+            assert spot.track is not None
+            track = tracks.setdefault(spot.track, Track(spot.track, [], [], [], []))
+            best = spot.best_estimate
+            track.frames.append(frame.index)
+            track.times_s.append(frame.time_s)
+            track.peaks_px.append(spot.peak_px)
+            track.normals.append(None if best is None else best.normal)
+    return [tracks[number] for number in sorted(tracks)]
+
+
 @dataclass
-class _Track:
+class _Moving:
     number: int
-    place: Array
+    position: Array
     step: Array = field(default_factory=lambda: np.zeros(2))
     unseen: int = 0
 
     @property
     def expected(self) -> Array:
-        return self.place + DAMPING * self.step
+        return self.position + DAMPING * self.step
 
 
 class Tracker:
-    """Numbers specularities alike over the frames of a sequence.
+    """Assigns the specularities of each frame to tracks.
 
-    Each is given to the track nearest to it, all together by the least sum of distances; the rest begin new tracks.
+    All are assigned together, by the least sum of distances to where tracks are expected; the rest begin new tracks.
 
     Parameters
     ----------
@@ -44,13 +89,14 @@ class Tracker:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.reach = REACH_SHARE * max(size)
-        self._tracks: list[_Track] = []
+        self._tracks: list[_Moving] = []
         self._count = 0
 
-    def update(self, places: Sequence[Sequence[float]]) -> list[int]:
-        """Give the track of each specularity of the next frame, by their positions, px."""
-        points = np.asarray(places, dtype=float).reshape(-1, 2)
+    def update(self, positions_px: Sequence[npt.ArrayLike]) -> list[int]:
+        """Return the track of each specularity of the next frame, by their positions, px."""
+        points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)
+        # continue tracks
         if len(points) and self._tracks:
             expected = np.array([track.expected for track in self._tracks])
             gaps = np.linalg.norm(points[:, None] - expected[None], axis=2)
@@ -58,14 +104,16 @@ class Tracker:
             for i, j in zip(*linear_sum_assignment(np.minimum(gaps, self.reach)), strict=True):
                 if gaps[i, j] < self.reach:
                     track = self._tracks[j]
-                    track.step, track.place, track.unseen = points[i] - track.place, points[i], -1
+                    track.step, track.position, track.unseen = points[i] - track.position, points[i], -1
                     numbers[i] = track.number
+        # end those that were lost
         for track in self._tracks:
             track.unseen += 1
         self._tracks = [track for track in self._tracks if track.unseen <= LOST_FRAMES]
+        # begin new ones
         for i, number in enumerate(numbers):
             if number < 0:
                 numbers[i] = self._count
-                self._tracks.append(_Track(self._count, points[i]))
+                self._tracks.append(_Moving(self._count, points[i]))
                 self._count += 1
         return numbers

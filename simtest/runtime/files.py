@@ -11,6 +11,8 @@ from simtest.runtime.resources import shown
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 """What a JSON file can hold."""
+JsonObject = dict[str, Any]
+"""An object as it stands in a JSON file: what records become when they are written, and are made of when read."""
 
 
 def refuse_file(folder: Path) -> None:
@@ -54,7 +56,17 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_json(path: Path, value: Any, compact: bool = False) -> None:
-    """Write JSON atomically, on one line if `compact`; raise `ValueError` for NaN and infinity, which JSON lacks."""
-    separators, indent = ((",", ":"), None) if compact else (None, 2)
-    text = json.dumps(value, allow_nan=False, separators=separators, indent=indent) + "\n"
+    """Write JSON atomically, on one line where `compact`; NaN and infinity are refused, since JSON has none.
+
+    Arrays in it are written as lists, records by their `to_json`, or by their fields where they have none.
+    """
+    how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
+    text = json.dumps(value, allow_nan=False, default=as_json, **how) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def as_json(value: Any) -> Any:
+    """Return what JSON holds of an array or a record."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return value.to_json() if hasattr(value, "to_json") else vars(value)

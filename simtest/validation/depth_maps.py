@@ -1,11 +1,7 @@
-"""Depth maps of other data sets: reading them, their normals, and whether these are worth anything.
-
-16-bit PNG or TIFF with a scale, NPY, and EXR, as SimCol3D and C3VD have them.
-"""
+"""Depth maps of other data sets (SimCol3D, C3VD): read them, compute their normals, judge whether these can serve."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -25,53 +21,22 @@ Mask = npt.NDArray[np.bool_]
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 
 RADIUS_PX = 2
-"""Normals are of the plane through the points of so many pixels to each side."""
+"""Half the side of the window whose points a normal's plane goes through."""
 
 JUMP_SHARE = 0.05
-"""A second difference above this share of the depth is an edge of a fold, where no plane fits."""
+"""A second difference above this share of the depth is the edge of a fold, where no plane fits."""
 
 FRONTAL_DEG, FRONTAL_SHARE = 1.0, 0.9
-"""Where nine tenths of the normals point so nearly back along the optical axis the map holds no slopes."""
+"""A map holds no slopes where nine tenths of its normals point this nearly back along the optical axis."""
 
 FLAT_SHARE = 0.5
-"""Where half of the neighbouring pixels have the very same depth it is a staircase."""
+"""A map is a staircase where half of the neighbouring pixels have exactly the same depth."""
 
 WORST_ERROR_DEG = 1.0
-"""Most that the steps of the values may cost a normal: cone_axis is better than this on colons and livers."""
+"""Largest error of a normal that the steps of the values may cause: cone_axis errs less on colons and livers."""
 
 WORST_TURN_DEG = 10.0
-"""Most that the normal may turn over the width of its own window, at nine tenths of the pixels."""
-
-
-@dataclass(frozen=True)
-class DepthVerdict:
-    """Whether a depth map's normals can serve as a reference for highlights.
-
-    Parameters
-    ----------
-    valid_share : float
-        Share of the pixels that have a normal.
-    frontal_share : float
-        Share of the normals within 1 deg of the direction back along the optical axis.
-    flat_share : float
-        Share of neighbouring pixels with the very same depth.
-    step_mm : float
-        Smallest step between values.
-    error_deg : float
-        What such steps cost a normal at the median depth, standard deviation.
-    turn_deg : float
-        Ninth decile of how far the normal turns over its own window.
-    problems : tuple of str
-        In words; empty where there are none.
-    """
-
-    valid_share: float
-    frontal_share: float
-    flat_share: float
-    step_mm: float
-    error_deg: float
-    turn_deg: float
-    problems: tuple[str, ...] = field(default=())
+"""Largest turn of the normal over the width of its own window, at nine tenths of the pixels."""
 
 
 def read_depth(path: Path, scale_mm: float | None = None) -> Array:
@@ -82,7 +47,7 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     path : Path
         PNG or TIFF of 8 or 16 bits or float, NPY, or EXR.
     scale_mm : float, optional
-        mm of one step, for integers: they mean nothing without. For others a factor to mm, default 1.
+        mm of one step, required for integers; for others a factor to mm, default 1.
 
     Returns
     -------
@@ -92,7 +57,7 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     Raises
     ------
     InputError
-        If the file is missing, of another kind, has several different channels, or an integer map has no scale.
+        If the file is missing or of another kind, its channels differ, or an integer map has no scale.
     """
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
@@ -105,6 +70,7 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
         values = _read_exr(path)
     else:
         values = np.asarray(read_raw(path, "a depth map"))
+    # A grey map that was saved as RGB is accepted.
     if values.ndim == 3:
         colours = values[:, :, :3]
         if (colours != colours[:, :, :1]).any():
@@ -141,21 +107,10 @@ def _read_exr(path: Path) -> npt.NDArray[np.generic]:
 
 
 def depth_points(depth: Array, camera: Camera, kind: Literal["z", "distance"] = "z") -> Array:
-    """Give the surface points of a depth map, shape (H, W, 3), mm, camera frame.
+    """Return the surface points of a depth map, mm, shape (H, W, 3), camera frame.
 
-    Parameters
-    ----------
-    depth : ndarray, shape (H, W)
-        mm.
-    camera : Camera
-        Of the same size.
-    kind : {"z", "distance"}
-        Along the optical axis, or along the sightline.
-
-    Raises
-    ------
-    InputError
-        If the sizes differ.
+    The depth is along the optical axis (`kind` "z"), or along the sightline ("distance"). Raises `InputError` if the
+    camera is of another size.
     """
     if depth.shape != (camera.height, camera.width):
         raise InputError(
@@ -168,18 +123,21 @@ def depth_points(depth: Array, camera: Camera, kind: Literal["z", "distance"] = 
 
 
 def depth_normals(points: Array) -> Array:
-    """Give the normals of a map of points, shape (H, W, 3), unit, facing the camera; NaN where there is none.
+    """Compute the normals of a map of points, shape (H, W, 3): unit, facing the camera, NaN where there is none.
 
-    The normal is across the two mean differences of the points of a window: exact on planes, through any lens.
+    The normal is perpendicular to the two mean differences of the points of a window: exact on planes, through any
+    lens.
     """
     window = np.arange(-RADIUS_PX, RADIUS_PX + 1, dtype=float)
     slope, mean = window / (window**2).sum(), np.full(len(window), 1 / len(window))
     known = np.asarray(np.isfinite(points).all(axis=-1))
     values = np.where(known[..., None], points, 0.0)
+    # mean differences along rows and columns
     along_x = cv2.sepFilter2D(values, cv2.CV_64F, slope, mean, borderType=cv2.BORDER_REPLICATE)
     along_y = cv2.sepFilter2D(values, cv2.CV_64F, mean, slope, borderType=cv2.BORDER_REPLICATE)
     normal = np.cross(along_x, along_y)
     length = np.linalg.norm(normal, axis=-1)
+    # reject windows with a hole or a jump
     sound = _whole(known & ~_jumps(values[..., 2], known)) & (length > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         normal /= length[..., None]
@@ -189,7 +147,8 @@ def depth_normals(points: Array) -> Array:
 
 
 def _jumps(depth: Array, known: Mask) -> Mask:
-    """Tell where the depth jumps."""
+    """Mark the pixels where the depth jumps."""
+    # the second difference along rows and columns
     bend = np.zeros(depth.shape)
     bend[:, 1:-1] = np.abs(depth[:, 2:] + depth[:, :-2] - 2 * depth[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(depth[2:] + depth[:-2] - 2 * depth[1:-1]))
@@ -197,67 +156,50 @@ def _jumps(depth: Array, known: Mask) -> Mask:
 
 
 def _whole(known: Mask) -> Mask:
-    """Tell which pixels' windows hold nothing unknown, and do not leave the map."""
+    """Mark the pixels whose windows lie inside the map and hold known depths only."""
     size = 2 * RADIUS_PX + 1
     return cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
 
 
-def judge_depth(depth: Array, normals: Array, camera: Camera) -> DepthVerdict:
-    """Judge a depth map: whether its normals are degenerate, or too coarse for highlights.
-
-    Parameters
-    ----------
-    depth : ndarray, shape (H, W)
-        mm.
-    normals : ndarray, shape (H, W, 3)
-        See `depth_normals`.
-    camera : Camera
-        Calibration.
-
-    Returns
-    -------
-    DepthVerdict
-    """
+def depth_problems(depth: Array, normals: Array, camera: Camera) -> tuple[str, ...]:
+    """Return why a depth map, mm, with its normals, shape (H, W, 3), is degenerate or too coarse for highlights."""
     sound = np.isfinite(normals).all(axis=-1)
-    share = float(sound.mean())
     if not sound.any():
-        return DepthVerdict(0.0, math.nan, math.nan, math.nan, math.nan, math.nan, ("no pixel has a normal",))
+        return ("no pixel has a normal",)
+    problems = []
+    # degenerate: no slopes, or a staircase
     frontal = float(np.mean(-normals[sound][:, 2] > math.cos(math.radians(FRONTAL_DEG))))
     pairs = np.isfinite(depth[:, 1:]) & np.isfinite(depth[:, :-1])
     flat = float(np.mean((depth[:, 1:] == depth[:, :-1])[pairs])) if pairs.any() else math.nan
-    values = np.unique(depth[np.isfinite(depth)])
-    step = float(np.median(np.diff(values))) if len(values) < depth.size / 50 and len(values) > 1 else 0.0
-    # Rounding to steps is noise of step / sqrt(12); over the window its slope has this share of it left.
-    side = 2 * RADIUS_PX + 1
-    left = step / math.sqrt(12) / math.sqrt(side * sum(k * k for k in range(-RADIUS_PX, RADIUS_PX + 1)))
-    error = math.degrees(math.atan(left * camera.fx / float(np.nanmedian(depth))))
-    turn = _turn_deg(normals)
-    problems = []
     if frontal > FRONTAL_SHARE:
         problems.append(f"degenerate: {100 * frontal:.0f} % of the normals point straight back along the optical axis")
     elif flat > FLAT_SHARE:
         problems.append(f"degenerate: {100 * flat:.0f} % of neighbouring pixels have the same depth, a staircase")
+    # too coarse: its values are quantised, so that they repeat
+    values = np.unique(depth[np.isfinite(depth)])
+    step = float(np.median(np.diff(values))) if len(values) < depth.size / 50 and len(values) > 1 else 0.0
+    # Quantisation is noise of step / sqrt(12); the least-squares slope over the window keeps this share of it.
+    side = 2 * RADIUS_PX + 1
+    left = step / math.sqrt(12) / math.sqrt(side * sum(k * k for k in range(-RADIUS_PX, RADIUS_PX + 1)))
+    error = math.degrees(math.atan(left * camera.fx / float(np.nanmedian(depth))))
     if error > WORST_ERROR_DEG:
         problems.append(f"too coarse for highlights: steps of {step:.3g} mm cost a normal {error:.2g} deg")
-    if turn > WORST_TURN_DEG:
-        problems.append(f"too coarse for highlights: normals turn by {turn:.2g} deg over {side} px")
-    return DepthVerdict(share, frontal, flat, step, error, turn, tuple(problems))
-
-
-def _turn_deg(normals: Array) -> float:
-    """Give the ninth decile of the angle between normals a window apart, deg."""
-    side = 2 * RADIUS_PX + 1
+    # too coarse: the normal turns within its own window
     cosine = np.einsum("hwi,hwi->hw", normals[:, side:], normals[:, :-side])
     cosine = cosine[np.isfinite(cosine)]
-    return float(np.degrees(np.arccos(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else math.nan
+    turn = math.degrees(math.acos(float(np.clip(np.quantile(cosine, 0.1), -1, 1)))) if cosine.size else 0.0
+    if turn > WORST_TURN_DEG:
+        problems.append(f"too coarse for highlights: normals turn by {turn:.2g} deg over {side} px")
+    return tuple(problems)
 
 
-def sample(values: Array, points_px: Array) -> Array:
-    """Give a map's values, shape (H, W, ...), at pixel positions, shape (N, 2), by the four pixels around; or NaN."""
+def interpolate(values: Array, points_px: Array) -> Array:
+    """Interpolate a map, shape (H, W, ...), bilinearly at pixel positions, shape (N, 2); NaN next to unknown pixels."""
     height, width = values.shape[:2]
-    places = np.asarray(points_px, dtype=float).reshape(-1, 2) - PIXEL_CENTRE
-    corner = np.clip(np.floor(places).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
-    fx, fy = np.clip(places - corner, 0, 1).T
+    # Beyond the outermost pixel centres their values go on.
+    positions = np.asarray(points_px, dtype=float).reshape(-1, 2) - PIXEL_CENTRE
+    corner = np.clip(np.floor(positions).astype(int), 0, [max(width - 2, 0), max(height - 2, 0)])
+    fx, fy = np.clip(positions - corner, 0, 1).T
     x, y = corner.T
     x1, y1 = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
     parts = ((x, y, (1 - fx) * (1 - fy)), (x1, y, fx * (1 - fy)), (x, y1, (1 - fx) * fy), (x1, y1, fx * fy))
@@ -266,18 +208,18 @@ def sample(values: Array, points_px: Array) -> Array:
 
 
 def depths_at(
-    given: str, points_px: Sequence[Sequence[float] | None], size: tuple[int, int], scale_mm: float | None
+    option: str, points_px: Sequence[npt.ArrayLike | None], size: tuple[int, int], scale_mm: float | None
 ) -> list[float]:
-    """Give the depth at pixel positions: one number of mm for all, or a depth map's; NaN where there is none."""
+    """Return the depth at pixel positions, mm: one number for all, or that of a depth map; NaN where there is none."""
     try:
-        depth = float(given)
+        depth = float(option)
     except ValueError:
-        values = read_depth(Path(given), scale_mm)
+        values = read_depth(Path(option), scale_mm)
         if values.shape != (size[1], size[0]):
             raise InputError(
-                f"--depth {shown(given)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
+                f"--depth {shown(option)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
             ) from None
-        return [float(sample(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
+        return [float(interpolate(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
     if not (math.isfinite(depth) and depth > 0):
-        raise InputError(f"--depth {given}: must be a positive number of mm, or a depth map")
+        raise InputError(f"--depth {option}: must be a positive number of mm, or a depth map")
     return [depth] * len(points_px)

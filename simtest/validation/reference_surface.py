@@ -1,44 +1,45 @@
-"""Comparison of reconstructed normals with a reference: a registered model, or a depth map."""
+"""Compare reconstructed normals with a reference: a mesh registered to the camera, or a depth map."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.description import (
+    ComparisonRecord,
+    ErrorRecord,
+    ErrorSummary,
+    PictureRecord,
+    ReferenceRecord,
+    SpecularityRecord,
+)
 from simtest.runtime.resources import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
-    DepthVerdict,
     depth_normals,
     depth_points,
-    judge_depth,
+    depth_problems,
+    interpolate,
     read_depth,
 )
-from simtest.validation.depth_maps import sample as sample_map
 
 Array = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
-"""Most that R^T R may differ from the identity, entry by entry: poses are written with a few digits."""
+"""Largest difference of R^T R from the identity, entry by entry: poses are written with a few digits."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A mesh with a tree to cast rays on it.
-
-    Parameters
-    ----------
-    vertices, normals : ndarray, shape (V, 3)
-        Model frame; mm and unit.
-    faces : ndarray of int, shape (F, 3)
-    """
+    """A mesh that rays are cast on: vertices, mm, and unit normals, shape (V, 3); faces, shape (F, 3)."""
 
     vertices: Array
     normals: Array
@@ -54,18 +55,20 @@ class Model:
         return tree, vertices, faces
 
     def cast(self, origin: Array, directions: Array) -> Array:
-        """Give the normals where rays from a point, shape (3,), along (N, 3), meet the mesh first, facing the rays.
+        """Return the normals, facing the rays, where rays from a point, shape (3,), along (N, 3), first meet the mesh.
 
-        NaN where none does, and for directions that are not finite.
+        NaN for rays that miss it, and for directions that are not finite.
         """
+        # The tree takes finite rays alone; others are sent anywhere and marked as misses.
         tree, vertices, faces = self._tree
         known = np.asarray(np.isfinite(directions).all(axis=1))
         rays = np.ascontiguousarray(np.where(known[:, None], directions, 1.0))
         origins = np.ascontiguousarray(np.broadcast_to(origin, rays.shape))
         face, _, weights = tree.intersect_ray_first(vertices, faces, origins, rays)
         hit = known & (face >= 0)
-        # What the tree gives for rays that miss is not set.
+        # For rays that miss, the tree leaves the weights unset.
         u, v = np.where(hit[:, None], np.asarray(weights, dtype=float).reshape(len(rays), -1)[:, -2:], 0.0).T
+        # interpolate the normals of the corners
         corners = self.normals[faces[np.where(hit, face, 0)]]
         normal = np.einsum("nc,nci->ni", np.stack([1 - u - v, u, v], axis=1), corners)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -76,17 +79,7 @@ class Model:
 
 @dataclass(frozen=True)
 class MeshReference:
-    """A model placed in the camera frame.
-
-    Parameters
-    ----------
-    model : Model
-        The mesh.
-    camera_from_model : ndarray, shape (4, 4)
-        Rigid.
-    source : str
-        The file.
-    """
+    """A model with its rigid pose, shape (4, 4), lengths in mm, and the file it came from."""
 
     model: Model
     camera_from_model: Array
@@ -94,38 +87,24 @@ class MeshReference:
     notes: tuple[str, ...] = ()
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Give the model's normals where the sightlines of pixels, shape (N, 2), meet it first; NaN where none does."""
+        """Return the normals where sightlines of pixels, shape (N, 2), first meet the model; NaN where they miss it."""
+        # In the model's frame the camera stands at -R^T t.
         R, t = self.camera_from_model[:3, :3], self.camera_from_model[:3, 3]
         return self.model.cast(-R.T @ t, camera.unproject(pixels) @ R) @ R.T
 
 
 @dataclass(frozen=True)
 class DepthReference:
-    """A depth map's normals.
-
-    Parameters
-    ----------
-    map : ndarray, shape (H, W, 3)
-        Unit normals, camera frame; NaN where there is none.
-    verdict : DepthVerdict
-        Whether they can serve.
-    source : str
-        The file.
-    """
+    """The normals of a depth map: unit, camera frame, shape (H, W, 3), NaN where there is none; and what is wrong."""
 
     map: Array
-    verdict: DepthVerdict
     source: str
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is wrong with it."""
-        return self.verdict.problems
+    notes: tuple[str, ...] = ()
 
     def normals_at(self, pixels: Array, camera: Camera) -> Array:
-        """Give the normals at pixels, shape (N, 2); NaN where there is none."""
+        """Return the normals at pixels, shape (N, 2); NaN where there is none."""
         del camera
-        normal = sample_map(self.map, pixels)
+        normal = interpolate(self.map, pixels)
         return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
@@ -133,23 +112,26 @@ Reference = MeshReference | DepthReference
 
 
 def load_reference(
-    path: Path, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None,
-    depth_kind: Literal["z", "distance"] = "z",
-) -> Reference:  # fmt: skip
-    """Read a reference: a mesh with its pose, or a depth map, which is in the camera frame already.
+    path: Path | None, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None
+) -> Reference | None:
+    """Read a reference: a mesh with its pose, or a depth map in the camera frame; None where no file is named.
 
     Raises
     ------
     InputError
-        If a file is missing or malformed, a mesh has no pose, a depth map has one, or sizes differ.
+        If a file is missing or malformed, a mesh has no pose, a pose no mesh, or sizes differ.
     """
+    if path is None:
+        if pose is not None:
+            raise InputError("--camera-from-model: needs --reference, the mesh that it places")
+        return None
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if pose is not None:
             raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
         depth = read_depth(path, depth_scale_mm)
-        points = depth_points(depth, camera, depth_kind)
+        points = depth_points(depth, camera)
         normals = depth_normals(points)
-        return DepthReference(normals, judge_depth(points[..., 2], normals, camera), str(path))
+        return DepthReference(normals, str(path), depth_problems(points[..., 2], normals, camera))
     if pose is None:
         raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare
@@ -170,7 +152,7 @@ def read_pose(path: Path) -> Array:
     Raises
     ------
     InputError
-        If a key is missing or malformed, or the rotation is none.
+        If a key is missing or malformed, or the 3 x 3 part is no rotation.
     """
     data = read_toml(path)
     where = shown(path)
@@ -189,11 +171,12 @@ def read_pose(path: Path) -> Array:
         pose[:3, :3] = _numbers(data, "rotation", ((3, 3),), where)
         pose[:3, 3] = _numbers(data, "translation_mm", ((3,),), where)
     R = pose[:3, :3]
+    # A pose must be rigid: no scale, no shear, no mirror image.
     off = float(np.abs(R.T @ R - np.eye(3)).max())
     if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         what = "a mirror image" if off <= ROTATION_TOLERANCE else f"R^T R differs from the identity by {off:.2g}"
         raise InputError(f"{where}: the pose's 3 x 3 part is no rotation ({what}); it must be one, lengths in mm")
-    # The digits of the file are a little off; the nearest rotation is meant.
+    # A file's digits are rounded: take the nearest rotation.
     u, _, vt = np.linalg.svd(R)
     pose[:3, :3] = u @ vt
     return pose
@@ -212,63 +195,51 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
     return values
 
 
-def comparison(spots: Sequence[dict[str, Any]], camera: Camera, reference: Reference) -> dict[str, Any]:
-    """Compare the normals of specularities with a reference at their brightest points.
-
-    Each specularity gains ``reference``: the normal, and the angle of each estimator, deg: of the proposed normal, and
-    of the better candidate, as the article chooses by hand.
+def compare(record: PictureRecord, reference: Reference) -> PictureRecord:
+    """Compare the normals of a picture with a reference at their brightest points.
 
     Parameters
     ----------
-    spots : sequence of dict
-        As in normals.json; changed.
-    camera : Camera
-        Calibration.
+    record : PictureRecord
+        What was reconstructed.
     reference : MeshReference or DepthReference
+        What it is compared with.
 
     Returns
     -------
-    dict
-        The file, what is wrong with it, how many sightlines miss it, and by estimator: n, mean_deg, std_deg, and the
-        same of the better candidates.
+    PictureRecord
+        The same with the reference's normal and the errors of the estimators, deg, at each specularity that has a
+        peak: of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and
+        standard deviations by estimator stand in the picture's own ``reference``.
     """
-    placed = [spot for spot in spots if spot["peak_px"] is not None]
-    peaks = np.array([spot["peak_px"] for spot in placed], dtype=float).reshape(-1, 2)
-    normals = reference.normals_at(peaks, camera) if placed else np.empty((0, 3))
-    errors: dict[str, list[tuple[float, float]]] = {}
-    missed = 0
-    for spot, normal in zip(placed, normals, strict=True):
-        if not np.isfinite(normal).all():
-            spot["reference"] = None
-            missed += 1
-            continue
-        own = {}
-        for name, result in spot["estimates"].items():
-            if result["status"] == "ok":
-                angles = [angle_deg(np.array(candidate), normal) for candidate in result["candidates"]]
-                own[name] = {"error_deg": angles[0], "error_oracle_deg": min(angles)}
-                errors.setdefault(name, []).append((angles[0], min(angles)))
-        spot["reference"] = {"normal": normal.tolist(), "errors": own}
-    return {
-        "source": reference.source,
-        "problems": list(reference.notes),
-        "compared": len(placed) - missed,
-        "missed": missed,
-        "estimators": {name: _summary(np.array(pairs)) for name, pairs in errors.items()},
-    }
+    peaks = np.array([spot.peak_px for spot in record.specularities if spot.peak_px is not None], dtype=float)
+    normals = iter(reference.normals_at(peaks, record.camera) if len(peaks) else ())
+    spots = [
+        spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals)))
+        for spot in record.specularities
+    ]
+    # summarise the sightlines that meet the reference
+    met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
+    names = dict.fromkeys(name for errors in met for name in errors)
+    comparison = ComparisonRecord(
+        source=reference.source,
+        problems=list(reference.notes),
+        compared=len(met),
+        missed=len(peaks) - len(met),
+        estimators={name: _summary([errors[name] for errors in met if name in errors]) for name in names},
+    )
+    return replace(record, specularities=spots, reference=comparison)
 
 
-def angle_deg(first: Array, second: Array) -> float:
-    """Give the angle between two unit vectors, deg."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))
+def _errors(spot: SpecularityRecord, normal: Array) -> ReferenceRecord:
+    if not np.isfinite(normal).all():
+        return ReferenceRecord(None, {})
+    angles = {name: angle_deg(estimate.candidates, normal) for name, estimate in spot.normals.items()}
+    errors = {name: ErrorRecord(float(own[0]), float(own.min())) for name, own in angles.items()}
+    return ReferenceRecord(normal, errors)
 
 
-def _summary(pairs: Array) -> dict[str, Any]:
-    spread = pairs.std(axis=0, ddof=1) if len(pairs) > 1 else np.array([None, None])
-    return {
-        "n": len(pairs),
-        "mean_deg": float(pairs[:, 0].mean()),
-        "std_deg": None if spread[0] is None else float(spread[0]),
-        "mean_oracle_deg": float(pairs[:, 1].mean()),
-        "std_oracle_deg": None if spread[1] is None else float(spread[1]),
-    }
+def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:
+    pairs = np.array([(error.error_deg, error.error_oracle_deg) for error in errors])
+    spread = pairs.std(axis=0, ddof=1).tolist() if len(pairs) > 1 else (None, None)
+    return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1])

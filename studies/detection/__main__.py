@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from benchmarks.measuring import Figure, print_figures
 from simtest.conventions import SPECULAR_PEAK_SHARE
-from simtest.reconstruction.colour_pipeline import detect_in_picture
+from simtest.reconstruction import detect_in_picture
 from studies.detection.frames import StudyFrame, study_frames
 from studies.detection.peers import T2_REL, THRESHOLDS, TUNED_T2_REL, arnold, fixed_threshold
 from studies.detection.scores import Scores, score

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from simtest.reconstruction.colour_pipeline import detect_in_picture
+from simtest.reconstruction import detect_in_picture
 from studies.detection.frames import StudyFrame, study_frames
 from studies.detection.truth import specular_truth
 

@@ -6,9 +6,10 @@ from simtest.calibration import Calibration, srgb_encode
 from simtest.detection.blobs import Kind
 from simtest.detection.light_split import fill, split_light
 from simtest.detection.view_mask import find_view
+from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.reconstruction.colour_pipeline import detect_in_picture, reconstruct_colour
+from simtest.reconstruction import detect_in_picture, reconstruct_colour
 from studies.detection.scores import Scores, score
 from studies.detection.truth import SpecularTruth, specular_truth
 
@@ -106,12 +107,17 @@ def test_fill_keeps_what_is_known_and_is_smooth_between():
 def test_normals_of_a_sphere_point_back_along_the_sightlines():
     camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
     made = reconstruct_colour(picture(lobe(90, 70, 5.0) + lobe(230, 160, 6.0, 4.0)), Calibration(camera))
-    assert len(made.specularities) == len(made.highlights) == 2
+    assert len(made.specularities) == len(made.found.highlights) == 2
     for spot in made.specularities:
         estimate = spot.estimates["cone_axis"]
         assert isinstance(estimate, Estimate)
         angle = np.degrees(np.arccos(-estimate.normal @ camera.unproject(spot.patch.peak_px)))
         assert angle < 0.3
+
+
+def test_smoothing_has_the_limits_of_grey_pictures():
+    with pytest.raises(InputError, match=r"smoothing_px = 51: must be a number in \[0, 50\]"):
+        reconstruct_colour(picture(lobe(90, 70, 5.0)), Camera.from_fov(60.0, WIDTH, HEIGHT), smoothing_px=51)
 
 
 def test_small_highlights_are_flagged():

@@ -12,13 +12,12 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import arrays
-from simtest.reconstruction.image_io import is_coloured, read_picture
-from simtest.reconstruction.image_sources import open_source
+from simtest.reconstruction.constraints import Constraints
+from simtest.reconstruction.image_io import is_coloured, open_source, read_picture
+from simtest.reconstruction.picture import Options
 from simtest.reconstruction.sequence import reconstruct_sequence
-from simtest.reconstruction.single import Options
 from simtest.reconstruction.tracking import Tracker
-from simtest.validation.depth_maps import depth_normals, depth_points, depths_at, judge_depth, read_depth
+from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
 from simtest.validation.reference_surface import load_reference, read_pose
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
@@ -52,21 +51,21 @@ def told(run, *fragments):
         assert fragment in message, message
 
 
-def by_fov(path, out, **how):
-    return reconstruct_picture(path, out, fov_deg=FOV, **how)
+def by_fov(path, out, extras=None, **options):
+    return reconstruct_picture(path, out, Options(fov_deg=FOV, **options), extras)
 
 
-def quietly(path, out, **how):
+def quietly(path, out, extras=None, **options):
     with pytest.warns(UserWarning, match="angles depend on the field of view of 60 deg"):
-        return by_fov(path, out, **how)
+        return by_fov(path, out, extras, **options)
 
 
 # A picture --------------------------------------------------------------------------------------------------------
 
 
 def test_a_picture_gives_all_files(shot, tmp_path):
-    count, files = quietly(shot, tmp_path / "out")
-    assert count == 2
+    record, files = quietly(shot, tmp_path / "out")
+    assert len(record.specularities) == 2
     assert [file.name for file in files] == [
         "normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
         "constraints.npz", "index.html",
@@ -89,10 +88,14 @@ def test_a_picture_gives_all_files(shot, tmp_path):
 
 
 def test_constraints_as_arrays(shot, tmp_path):
-    _, files = quietly(shot, tmp_path / "out")
+    record, files = quietly(shot, tmp_path / "out")
     described, stored = json.loads(files[5].read_text()), np.load(files[6], allow_pickle=False)
-    for name, values in arrays(described).items():
+    for name, values in Constraints.of(record.image, record.camera, record.specularities).arrays().items():
         np.testing.assert_array_equal(stored[name], values)
+    assert len(described["constraints"]) == 2
+    for i, constraint in enumerate(described["constraints"]):
+        for name in ("id", "pixel", "sightline", "normal", "basis", "covariance", "candidates", "estimator"):
+            np.testing.assert_array_equal(stored[name][i], constraint[name])
     assert stored["normal"].shape == (2, 3)
     np.testing.assert_allclose(stored["basis"] @ stored["normal"][:, :, None], 0, atol=1e-12)
     np.testing.assert_allclose(stored["sightline"], CAMERA.unproject(stored["pixel"]))
@@ -110,8 +113,8 @@ def test_a_depth_places_the_points(shot, tmp_path):
 def test_grey_pictures_keep_to_peaks(tmp_path, detector):
     values = np.clip(0.05 + 0.9 * lobe(160, 120, 8.0), 0, 1)
     cv2.imwrite(str(tmp_path / "grey.png"), np.rint(65535 * values).astype(np.uint16))
-    count, files = quietly(tmp_path / "grey.png", tmp_path / "out", detector=detector)
-    assert count == 1
+    record, files = quietly(tmp_path / "grey.png", tmp_path / "out", detector=detector)
+    assert len(record.specularities) == 1
     assert json.loads(files[0].read_text())["detector"] == "peaks"
     told(lambda: by_fov(tmp_path / "grey.png", tmp_path / "o", detector="colour"), "the picture is grey")
 
@@ -146,13 +149,13 @@ def test_other_depths_and_channels_are_read(tmp_path):
     assert is_coloured(read_picture(tmp_path / "alpha.png"))
     assert not is_coloured(np.repeat(read_picture(tmp_path / "grey.png")[:, :, None], 3, axis=2))
     for name in ("wide", "alpha"):
-        assert quietly(tmp_path / f"{name}.png", tmp_path / name)[0] == 2
+        assert len(quietly(tmp_path / f"{name}.png", tmp_path / name)[0].specularities) == 2
 
 
 def test_a_camera_of_another_size(shot, tmp_path):
     (tmp_path / "camera.toml").write_text("width = 640\nheight = 480\nfx = 500.0\nfy = 500.0\n")
     told(
-        lambda: reconstruct_picture(shot, tmp_path / "o", tmp_path / "camera.toml"),
+        lambda: reconstruct_picture(shot, tmp_path / "o", Options(tmp_path / "camera.toml")),
         "320 x 240 px: must be 640 x 480, the size of the camera's calibration",
     )
 
@@ -162,14 +165,14 @@ def test_a_camera_of_another_size(shot, tmp_path):
 
 def run(path, out, progress=None, **options):
     with pytest.warns(UserWarning, match="angles depend"):
-        return reconstruct_sequence(path, out, fov_deg=FOV, options=Options(**options), progress=progress)
+        return reconstruct_sequence(path, out, Options(fov_deg=FOV, **options), progress)
 
 
 def noted(path, out):
-    """Give the result and the texts of all warnings."""
+    """Return the result and the texts of all warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        result = reconstruct_sequence(path, out, fov_deg=FOV)
+        result = reconstruct_sequence(path, out, Options(fov_deg=FOV))
     return result, " ".join(str(w.message) for w in caught)
 
 
@@ -205,14 +208,14 @@ def test_a_stopped_run_goes_on(folder, tmp_path):
     kept = tmp_path / "out" / "frames" / "000000.json"
     before = kept.stat().st_mtime_ns
     (tmp_path / "out" / "frames" / "000001.json").write_text("{half a fi")
+    (tmp_path / "out" / "frames" / "000002.json").write_text('{"image": "frame10.png", "size": [320, 240]}')
     run(folder, tmp_path / "out")
     assert kept.stat().st_mtime_ns == before
     run(folder, tmp_path / "whole")
     for name in ("timeline.csv", "tracks.json"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    other = Options(every=True)
-    again = lambda: reconstruct_sequence(folder, tmp_path / "out", fov_deg=FOV, options=other)  # noqa: E731
-    told(again, "holds a run with another every")
+    other = Options(fov_deg=FOV, every=True)
+    told(lambda: reconstruct_sequence(folder, tmp_path / "out", other), "holds a run with another every")
 
 
 def test_a_broken_picture_in_a_folder_is_told_and_passed_over(folder, tmp_path):
@@ -387,15 +390,14 @@ def test_depth_maps_of_all_formats(tmp_path, suffix):
     integers = suffix in ("png", "tiff")
     found = read_depth(path, scale if integers else None)
     np.testing.assert_allclose(found, depth, atol=0.6 * scale if integers else 1e-4)
-    verdict = judge_depth(found, depth_normals(depth_points(found, CAMERA)), CAMERA)
-    assert verdict.problems == ()
+    assert depth_problems(found, depth_normals(depth_points(found, CAMERA)), CAMERA) == ()
     if integers:
         told(lambda: read_depth(path), "--depth-scale must say how many mm one step is")
 
 
 def test_degenerate_and_coarse_maps_are_told():
     def problems(depth):
-        return judge_depth(depth, depth_normals(depth_points(depth, CAMERA)), CAMERA).problems
+        return depth_problems(depth, depth_normals(depth_points(depth, CAMERA)), CAMERA)
 
     assert "degenerate" in problems(np.full((HEIGHT, WIDTH), 50.0))[0]
     slanted = plane_depth(np.array([0.5, 0.0, -0.8]) / np.hypot(0.5, 0.8))

@@ -9,6 +9,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCE
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
+from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 
 SIZE = 160
@@ -102,6 +103,7 @@ def test_the_command_takes_every_peak_where_it_is_asked_to(tmp_path):
     picture = tmp_path / "ridge.png"
     cv2.imwrite(str(picture), np.rint(230 * frame_of(ridge) / frame_of(ridge).max()).astype(np.uint8))
     for every, expected in ((False, 0), (True, 1)):
+        options = Options(fov_deg=50.0, encoding="linear", every=every)
         with pytest.warns(UserWarning, match="no calibration|no specularity"):
-            count, _ = reconstruct_picture(picture, tmp_path / "out", fov_deg=50.0, encoding="linear", every=every)
-        assert count == expected
+            record, _ = reconstruct_picture(picture, tmp_path / "out", options)
+        assert len(record.specularities) == expected

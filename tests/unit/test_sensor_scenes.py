@@ -11,6 +11,7 @@ import pytest
 from simtest.api import reconstruct_picture, render
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
@@ -335,8 +336,9 @@ def test_pictures_read_back_as_the_frame(tmp_path, sensor):
     assert calibration.camera == described.camera.model()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        count, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / "calibration.toml")
-    assert count == 1
+        options = Options(tmp_path / "calibration.toml")
+        record, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", options)
+    assert len(record.specularities) == 1
     (direct,) = reconstruct(frame.image, described.calibration())
     (read,) = json.loads((tmp_path / "normals" / "normals.json").read_text())["specularities"]
     for name, estimate in direct.estimates.items():
@@ -368,9 +370,10 @@ def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
 
     def error(text):
         (tmp_path / "told.toml").write_text(text)
-        count, files = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / "told.toml")
+        options = Options(tmp_path / "told.toml")
+        record, files = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", options)
         document = json.loads(files[0].read_text())
-        assert count == 1
+        assert len(record.specularities) == 1
         assert document["camera"]["view_mask"]["radius"] == 190.0
         made = document["specularities"][0]["estimates"]["cone_axis"]
         assert made["flags"] == []
@@ -404,7 +407,7 @@ def test_known_emission_reads_back(tmp_path):
     assert load_calibration(tmp_path / names[-1]).emission == described.calibration().emission
     errors = {}
     for told in ("calibration.toml", "camera.toml"):
-        _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", tmp_path / told)
+        _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", Options(tmp_path / told))
         (read,) = json.loads(file.read_text())["specularities"]
         normal = np.array(read["estimates"]["cone_axis"]["normal"])
         errors[told] = angle_deg(normal, frame.highlights[0].normal)
@@ -429,7 +432,6 @@ def test_what_is_not_known_is_not_written(tmp_path):
 
 def test_two_encodings_are_refused(tmp_path):
     write_frame(render(scene({"bits": 8}, size=80, focal=80.0)), tmp_path)
+    options = Options(tmp_path / "calibration.toml", encoding="srgb")
     with pytest.raises(InputError, match="--encoding srgb: the calibration states the response"):
-        reconstruct_picture(
-            tmp_path / "frame.png", tmp_path / "normals", tmp_path / "calibration.toml", encoding="srgb"
-        )
+        reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", options)

@@ -1,0 +1,161 @@
+"""What is written of a picture: normals.json, a table, oriented points, arrows, overlay, constraints and the page."""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import Failure, InputError
+from simtest.estimators import Estimate
+from simtest.geometry import Camera, KannalaBrandt
+from simtest.reconstruction.constraints import Constraints
+from simtest.reconstruction.description import Array, PictureRecord, SpecularityRecord
+from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.result_page import write_picture_page
+from simtest.runtime.files import make_folder, write_atomically, write_json
+
+MANY = 10
+"""Above this many specularities normals.json is written on one line, since most of it is outlines."""
+
+ARROW_SIDES = 6
+
+COLUMNS = (
+    "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
+    "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
+    "score",
+)  # fmt: skip
+
+FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
+         "constraints.npz", "index.html")  # fmt: skip
+
+
+def write_outputs(
+    out: Path, record: PictureRecord, picture: npt.NDArray[np.float32], depth_mm: Sequence[float] | None = None
+) -> list[Path]:
+    """Write what was reconstructed in a picture, its overlay and its page; return the files.
+
+    The folder is made if need be; `InputError` is raised where it cannot be written. A specularity's points and arrow
+    stand at its depth, mm, by default at 1.
+    """
+    spots, camera = record.specularities, record.camera
+    depths = [1.0] * len(spots) if depth_mm is None else depth_mm
+    constraints = Constraints.of(record.image, camera, spots)
+    arrays = constraints.arrays()
+
+    def write_text(name: str, content: str) -> None:
+        write_atomically(out / name, lambda part: part.write_text(content, encoding="ascii"))
+
+    make_folder(out)
+    try:
+        write_json(out / "normals.json", record, compact=len(spots) > MANY)
+        write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(spots)))
+        write_text("normals.ply", normals_ply(spots, camera, depths))
+        write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
+        write_text("arrows.ply", arrows_ply(spots, camera, depths))
+        write_json(out / "constraints.json", constraints)
+        write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
+        write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+    return [out / name for name in FILES]
+
+
+def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, ...]]:
+    """Yield a row of `COLUMNS` for each specularity, estimator and candidate; candidate 0 is the proposed normal."""
+    for spot in spots:
+        peak = (None, None) if spot.peak_px is None else spot.peak_px.tolist()
+        for name, result in spot.estimates.items():
+            best = int(name == spot.best)
+            if isinstance(result, Failure):
+                # candidate, normal, look and axis ratio; then margin and covariance
+                nothing = (None,) * 7
+                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *peak, spot.kind, spot.score)
+                continue
+            look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
+            covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
+            seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
+            for k, normal in enumerate(result.candidates.tolist()):
+                yield (spot.id, name, "ok", k, *normal, *seen, *peak, spot.kind, spot.score)
+
+
+def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:
+    """Write rows as CSV; what is None stays empty."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(table)
+
+
+def normals_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: Sequence[float]) -> str:
+    """Return the proposed normals as oriented points on the sightlines that they look along (PLY, ASCII).
+
+    The points are at the depth of their specularity; through a fisheye, which sees sideways and backwards too, at that
+    distance.
+    """
+    # Estimators are numbered by name, so that the file does not depend on the order in which they ran.
+    lines, names = [], sorted({name for spot in spots for name in spot.estimates})
+    for spot, depth in zip(spots, depths_mm, strict=True):
+        for name, result in spot.normals.items():
+            if (point := _surface_point(result, camera, depth)) is not None:
+                values = [*point.tolist(), *result.normal.tolist()]
+                lines.append(" ".join(f"{v:.9g}" for v in values) + f" {spot.id} {names.index(name)}")
+    header = [
+        "ply", "format ascii 1.0", f"comment estimators by number: {json.dumps(names)}", f"element vertex {len(lines)}",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        "property int specularity", "property int estimator", "end_header",
+    ]  # fmt: skip
+    return "\n".join([*header, *lines]) + "\n"
+
+
+def arrows_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: Sequence[float]) -> str:
+    """Return the best normals as arrows of triangles, each a tenth of its distance long (PLY, ASCII)."""
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for spot, depth in zip(spots, depths_mm, strict=True):
+        best = spot.best_estimate
+        if best is not None and (start := _surface_point(best, camera, depth)) is not None:
+            _add_arrow(vertices, faces, start, best.normal, 0.1 * float(np.linalg.norm(start)))
+    header = [
+        "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in "xyz"), f"element face {len(faces)}",
+        "property list uchar int vertex_indices", "end_header",
+    ]  # fmt: skip
+    body = [" ".join(f"{v:.7g}" for v in vertex) for vertex in vertices]
+    return "\n".join([*header, *body, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n"
+
+
+def _surface_point(result: Estimate, camera: Camera, depth_mm: float) -> Array | None:
+    """Return the point at a depth on the sightline of a normal; None where there is no such sightline or depth."""
+    ray = camera.unproject(result.look_px)
+    point = depth_mm * (ray if isinstance(camera.distortion, KannalaBrandt) else ray / ray[2])
+    return np.asarray(point) if np.isfinite(point).all() else None
+
+
+def _add_arrow(
+    vertices: list[list[float]], faces: list[tuple[int, int, int]], start: Array, along: Array, length: float
+) -> None:
+    """Add a shaft and a head: rings of `ARROW_SIDES` points, joined, and a tip."""
+    # two directions across the arrow, the first from the axis that it does not run along
+    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    other = np.cross(along, side)
+    phase = 2 * np.pi * np.arange(ARROW_SIDES) / ARROW_SIDES
+    around = np.cos(phase)[:, None] * side + np.sin(phase)[:, None] * other
+    # The shaft's two rings, the head's, and the tip.
+    first = len(vertices)
+    for at, radius in ((0.0, 0.03), (0.7, 0.03), (0.7, 0.09)):
+        vertices += (start + length * (at * along + radius * around)).tolist()
+    vertices.append((start + length * along).tolist())
+    # Two triangles for each side between neighbouring rings, one from the head to the tip.
+    n = ARROW_SIDES
+    for i in range(n):
+        j = (i + 1) % n
+        for ring in (0, n):
+            a, b, c, d = (first + ring + k for k in (i, j, n + i, n + j))
+            faces += [(a, b, d), (a, d, c)]
+        faces.append((first + 2 * n + i, first + 2 * n + j, first + 3 * n))

@@ -1,0 +1,26 @@
+"""The way of a picture from its file to its page is straight."""
+
+import numpy as np
+import pytest
+from test_imaging import frame, save
+
+from studies.picture_way import layers, trace
+
+
+def test_layers_are_those_of_the_contract():
+    height = layers()
+    assert height["cli"] > height["validation"] > height["reconstruction"] > height["detection"] > height["pages"]
+    assert height["detection"] == height["estimators"]
+
+
+@pytest.mark.parametrize("detector", ["colour", "peaks"])
+def test_a_picture_climbs_three_times_through_five_packages(tmp_path, detector):
+    picture = frame() if detector == "colour" else np.repeat(frame().mean(axis=2)[:, :, None], 3, axis=2)
+    file = save(tmp_path / "shot.png", picture)
+    with pytest.warns(UserWarning, match="angles depend"):
+        way = trace(file, ["--fov", "60", "--detector", detector])
+    assert way.passed == [
+        "reconstruction", "calibration", "reconstruction", "detection", "reconstruction", "estimators",
+        "reconstruction", "pages",
+    ]  # fmt: skip
+    assert way.climbs == 3
