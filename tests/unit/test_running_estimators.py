@@ -8,13 +8,14 @@ import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame
 from simtest.detection import Region
+from simtest.detection.detector import Detection
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimator, load_estimators
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.geometry import Camera, Patch, smooth
-from simtest.reconstruction.pipeline import reconstruct, run_estimators
+from simtest.reconstruction.pipeline import reconstruct, run_pipeline
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
 SIGMA, SMOOTHING_PX = 0.02, 2.0
@@ -177,9 +178,12 @@ def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():
 
 
 def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
-    frame = Frame(picture(), Calibration(CAMERA), SMOOTHING_PX)
-    (spot,) = run_estimators([], {"frame": Peaks(((10.0, 90.0),))}, frame)
-    assert list(spot.estimates) == ["frame"]
+    class Blind:
+        def detect(self, frame, camera, priors):
+            return Detection((), frame)
+
+    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((10.0, 90.0),))}, None, SMOOTHING_PX)
+    assert [list(spot.estimates) for spot in made.specularities] == [["frame"]]
 
 
 # What counts as an estimator ------------------------------------------------------------------------------------------
