@@ -99,7 +99,11 @@ def raw_moves(
 def gram(rows: Rows) -> Array:
     """Return the products of few long rows, shape (K, P), with each other, shape (K, K)."""
     # A copy, because BLAS's routine for a matrix times its own transpose is several times slower on so few rows.
-    products = np.dot(rows, rows.copy().T).astype(float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = np.dot(rows, rows.copy().T).astype(float)
+    if not np.isfinite(products).all():
+        # Noise far above the signal leaves the range of single precision.
+        products = rows.astype(float) @ rows.astype(float).T
     return np.asarray((products + products.T) / 2)
 
 
