@@ -1,7 +1,7 @@
 """A camera with what is known of it, and the correction of its frames: response, vignetting and emission undone."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 
@@ -102,20 +102,12 @@ class Calibration:
     def correct(self, values: Image) -> CorrectedFrame:
         """Undo the response, average the channels, divide by the known falloff; smoothing comes after.
 
-        Parameters
-        ----------
-        values : ndarray of float32, shape (H, W) or (H, W, C)
-            The frame as encoded, finite.
-
-        Returns
-        -------
-        CorrectedFrame
+        The values are those of the frame as encoded, float32, finite, shape (H, W) or (H, W, C).
         """
         # clipped pixels, while the values are as encoded
         saturated = None
         if self.saturation_level is not None:
-            brightest = values if values.ndim == 2 else values.max(axis=2)
-            saturated = np.asarray(brightest >= np.float32(self.saturation_level))
+            saturated = np.asarray(brightest_channel(values) >= np.float32(self.saturation_level))
         # linear light
         if self.response is not None and self.response.kind != "linear":
             values = self.response.decode(values).astype(np.float32)
@@ -131,6 +123,12 @@ class Calibration:
             return CorrectedFrame(linear, linear, None, saturated, np.ones(linear.shape, dtype=bool), channels)
         gain = (1 / np.maximum(falloff, least)).astype(np.float32)
         return CorrectedFrame(linear * gain, linear, gain, saturated, falloff < least, channels)
+
+
+def brightest_channel(values: Image) -> Image:
+    """Return the largest value of each pixel, shape (H, W), of a frame (H, W) or (H, W, C)."""
+    # Several times faster than a maximum along the last axis.
+    return values if values.ndim == 2 else reduce(np.maximum, np.moveaxis(values, -1, 0))
 
 
 def falloff_map(camera: Camera, profile: AngularProfile) -> Array:

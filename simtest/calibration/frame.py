@@ -1,12 +1,11 @@
 """A frame as detectors and frame estimators see it, each step of its correction computed when first asked for."""
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
-import cv2
 import numpy as np
 
-from simtest.calibration.calibration import Calibration, CorrectedFrame
+from simtest.calibration.calibration import Calibration, CorrectedFrame, brightest_channel
 from simtest.calibration.noise_estimate import estimate_noise
 from simtest.calibration.response import Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
@@ -15,9 +14,6 @@ from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.arrays import Image, Mask
 
 Box = tuple[int, int, int, int]
-
-_LEVELS = 2**16
-"""A picture has at most as many values; its response is looked up in a table of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +54,14 @@ class Frame:
 
     @cached_property
     def channels(self) -> Image:
-        """Linear light of each channel, same shape as `encoded`; sRGB is decoded where no response is known.
-
-        Values as encoded must lie in [0, 1], on 16 bits at most, unless the response is linear.
-        """
-        response = self.calibration.response or Response("srgb")
-        if response.kind == "linear":
-            return self.encoded
-        table = response.decode(np.linspace(0, 1, _LEVELS)).astype(np.float32)
-        return np.asarray(table[cv2.multiply(self.encoded, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)])
+        """Linear light of each channel, same shape as `encoded` (`Response.decode_picture`); sRGB is the default."""
+        return (self.calibration.response or Response("srgb")).decode_picture(self.encoded)
 
     @cached_property
     def clipped(self) -> Mask:
         """Where a channel is clipped, shape (H, W); at 1 where the calibration knows no level."""
         level = 1.0 if self.calibration.saturation_level is None else self.calibration.saturation_level
-        planes = [self.encoded] if self.encoded.ndim == 2 else list(np.moveaxis(self.encoded, -1, 0))
-        return np.asarray(reduce(np.maximum, planes) >= np.float32(level))
+        return np.asarray(brightest_channel(self.encoded) >= np.float32(level))
 
     @cached_property
     def corrected(self) -> CorrectedFrame:

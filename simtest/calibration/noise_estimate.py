@@ -19,22 +19,17 @@ MIN_CLEAR = 100
 
 
 def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask | None = None) -> float:
-    """Estimate the standard deviation of white noise, robust against edges and highlights.
+    """Estimate the standard deviation of white noise in a frame before smoothing, robust against edges and highlights.
 
     Parameters
     ----------
     frame : array_like, shape (H, W)
-        Intensities before smoothing.
+        Intensities; frames, or views, under 3 x 3 px have noise 0.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all. Outside it there is more than the sensor's noise.
     clipped : ndarray of bool, shape (H, W), optional
         Pixels at either end of the sensor's range. Their noise is truncated, on a dark ground by half, so pixels near
         them are left out where enough others remain.
-
-    Returns
-    -------
-    float
-        In the frame's units; 0 for frames, or views, under 3 x 3 px.
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if min(image.shape) < 3:

@@ -61,18 +61,9 @@ class NoiseModel:
     def at(self, level: npt.ArrayLike, channels: int = 1) -> Array:
         """Return the standard deviation at a level.
 
-        Parameters
-        ----------
-        level : array_like, shape (...)
-            Linear light without noise, share of full scale.
-        channels : int
-            Number of averaged channels, of that mean level and independent noise.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            sqrt((sigma^2 + level/full_well + (read_noise/full_well)^2 + step^2/12) / channels), where step is the light
-            between neighbouring values.
+        The level, any shape, is linear light without noise, the mean of `channels` of independent noise. The deviation
+        is sqrt((sigma^2 + level/full_well + (read_noise/full_well)^2 + step^2/12) / channels), where step is the light
+        between neighbouring values.
         """
         x = np.asarray(level, dtype=float)
         if self.full_well is None and self.bits is None:

@@ -142,25 +142,9 @@ class _Peak:
 def highlights_of(
     mask: Mask, light: SplitLight, linear: Image, clipped: Mask, seen: Mask | None = None
 ) -> list[Highlight]:
-    """Find and classify the highlights of a frame.
+    """Find and classify the highlights among the pixels of a mask, shape (H, W), the brightest first.
 
-    Parameters
-    ----------
-    mask : ndarray of bool, shape (H, W)
-        Pixels of highlights.
-    light : SplitLight
-        The frame's light.
-    linear : ndarray of float32, shape (H, W, 3)
-        The frame.
-    clipped : ndarray of bool, shape (H, W)
-        Where a channel is clipped.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view; default all.
-
-    Returns
-    -------
-    list of Highlight
-        The brightest first.
+    `linear` is the frame, shape (H, W, 3), `clipped` where a channel is clipped, `seen` the view, both (H, W).
     """
     # peaks of each connected part
     smoothed = smooth(light.specular, SMOOTHING_PX, seen)

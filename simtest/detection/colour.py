@@ -58,15 +58,11 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     Parameters
     ----------
     linear : ndarray of float32, shape (H, W, 3)
-        Linear values, share of full scale; white-balanced: light off the surface is grey.
+        Linear values, share of full scale; white-balanced: light mirrored by the surface is grey.
     clipped : ndarray of bool, shape (H, W)
         Where a channel is clipped.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the view; default all.
-
-    Returns
-    -------
-    ColourDetection
     """
     light = split_light(linear, clipped, seen)
     least = max(LEAST_SPECULAR, NOISE_FACTOR * light.noise)
@@ -94,25 +90,6 @@ def _above_own_peak(above: Mask, specular: Image) -> Mask:
 
 
 @dataclass(frozen=True)
-class ColourFrameDetection(Detection):
-    """The highlights of a colour frame; its `frame` holds the specular light alone.
-
-    Parameters
-    ----------
-    highlights : tuple of Highlight
-        That of each region.
-    view : View
-        The part of the picture that shows tissue.
-    colour : ColourDetection
-        All that was detected.
-    """
-
-    highlights: tuple[Highlight, ...]
-    view: View
-    colour: ColourDetection
-
-
-@dataclass(frozen=True)
 class ColourDetector:
     """Highlights by the tissue's own colour (`detect_colour`).
 
@@ -126,13 +103,14 @@ class ColourDetector:
 
     isolated: bool = True
 
-    def detect(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> ColourFrameDetection:
+    def detect(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> Detection:
         """Find the highlights of a frame of three channels (see `simtest.detection.Detector`)."""
         view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
-        highlights = tuple(found.isolated if self.isolated else found.highlights)
+        taken = tuple(found.isolated if self.isolated else found.highlights)
+        others = tuple(highlight for highlight in found.highlights if self.isolated and not highlight.is_isolated)
         specular = replace(frame, seen=view.seen, light=found.light.specular)
-        return ColourFrameDetection(tuple(h.region for h in highlights), specular, highlights, view, found)
+        return Detection(tuple(highlight.region for highlight in taken), specular, taken, others, view)
 
 
 colour = ColourDetector()

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from simtest.calibration import Frame, Priors
+from simtest.detection.blobs import Highlight
 from simtest.detection.regions import Region
+from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.plugins import PluginGroup
@@ -22,10 +24,17 @@ class Detection:
         The brightest first.
     frame : Frame
         The frame that their patches are cut from: the given one, or one of its specular light.
+    highlights, others : tuple of Highlight
+        How each region was judged, and what was left out; empty where the detector judges none.
+    view : View
+        The part of the picture that shows tissue, where the detector looks for it.
     """
 
     regions: tuple[Region, ...]
     frame: Frame
+    highlights: tuple[Highlight, ...] = ()
+    others: tuple[Highlight, ...] = ()
+    view: View = WHOLE
 
 
 @runtime_checkable

@@ -59,20 +59,9 @@ class SplitLight:
 
 
 def split_light(linear: Image, clipped: Mask, seen: Mask | None = None) -> SplitLight:
-    """Split a frame.
+    """Split a frame of linear values, shape (H, W, 3), shares of full scale.
 
-    Parameters
-    ----------
-    linear : ndarray of float32, shape (H, W, 3)
-        Linear values, share of full scale.
-    clipped : ndarray of bool, shape (H, W)
-        Where a channel is clipped.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view; default all.
-
-    Returns
-    -------
-    SplitLight
+    `clipped`, shape (H, W), is where a channel is clipped, `seen` the pixels inside the view, default all.
     """
     channels = cv2.split(np.ascontiguousarray(linear))
     least = cv2.min(cv2.min(channels[0], channels[1]), channels[2])
@@ -128,19 +117,9 @@ def _median(values: Image, low: float, high: float) -> Image:
 
 
 def fill(values: Image, known: Mask) -> Image:
-    """Fill unknown values smoothly from known ones, by averages over ever coarser pixels.
+    """Fill unknown values, shape (H, W), smoothly from known ones, by averages over ever coarser pixels.
 
-    Parameters
-    ----------
-    values : ndarray of float32, shape (H, W)
-        Values; unknown ones are ignored.
-    known : ndarray of bool, shape (H, W)
-        Which are known; where none is, the result is 0.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W)
-        Known values are unchanged.
+    Known values are unchanged; where none is known the result is 0.
     """
     weight = known.astype(np.float32)
     # down: sums of known values over ever coarser pixels

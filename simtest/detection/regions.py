@@ -127,20 +127,9 @@ def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tup
 
 
 def half_height_component(image: Image, row: int, column: int, seen: Mask | None = None) -> Component | None:
-    """Return the connected pixels above half of a peak's value, or None where they hold a higher peak.
+    """Return the connected pixels above half of the value of the peak at (row, column) of a smoothed image.
 
-    Parameters
-    ----------
-    image : ndarray of float32, shape (H, W)
-        Smoothed intensities.
-    row, column : int
-        The peak's pixel.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the camera's view mask; default all.
-
-    Returns
-    -------
-    Component or None
+    None where they hold a higher peak. `seen` holds the pixels inside the camera's view mask.
     """
     peak = float(image[row, column])
     rows, columns = image.shape
@@ -163,23 +152,10 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
 
 
 def contrast(image: Image, component: Component, peak: float, seen: Mask | None = None) -> float:
-    """Return a peak's height above the median of its surroundings: the region of interest outside the component.
+    """Return a peak's height above the median of its surroundings, in the units of a smoothed image.
 
-    Parameters
-    ----------
-    image : ndarray of float32, shape (H, W)
-        Smoothed intensities.
-    component : Component
-        The highlight at half height.
-    peak : float
-        The peak's value.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the camera's view mask; default all.
-
-    Returns
-    -------
-    float
-        In the image's units; above the frame's least value where the component fills its region.
+    The surroundings are the region of interest outside the component at half height, inside the view mask `seen`. Where
+    the component fills its region, they are the image's least value.
     """
     left, top, width, height = _expanded_box(component, image.shape)
     inside = np.zeros((height, width), dtype=bool)

@@ -77,12 +77,10 @@ class PeakShape:
 
 
 def flat_pixels(frame: npt.NDArray[np.floating]) -> Mask | None:
-    """Find clipped pixels of a frame, shape (H, W) or (H, W, C), without a calibration.
+    """Find the clipped pixels of a frame, shape (H, W) or (H, W, C), without a calibration.
 
-    Returns
-    -------
-    ndarray of bool, shape (H, W), or None
-        Where a channel has the frame's largest value; None where these are so few that they may be an accident.
+    They are those where a channel has the frame's largest value; None where these are so few that they may be an
+    accident.
     """
     largest = frame >= frame.max()
     mask = np.asarray(largest if largest.ndim == 2 else largest.any(axis=2))
@@ -90,7 +88,7 @@ def flat_pixels(frame: npt.NDArray[np.floating]) -> Mask | None:
 
 
 def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None = None) -> PeakShape | Failure:
-    """Measure a peak's shape.
+    """Measure a peak's shape; a Failure where an isophote does not close or no ellipse fits.
 
     Parameters
     ----------
@@ -102,11 +100,6 @@ def peak_shape(patch: Patch, region: Region, noise: float, clipped: Mask | None 
         Standard deviation of the smoothed frame's noise at the peak, in the patch's units.
     clipped : ndarray of bool, shape (H, W), optional
         Where the frame is clipped (see `flat_pixels`), besides the patch's own mask.
-
-    Returns
-    -------
-    PeakShape or Failure
-        A Failure where an isophote does not close or no ellipse fits.
     """
     # ellipses of three isophotes
     clean, left = _at_own_scale(patch)

@@ -58,18 +58,10 @@ WHOLE = View(None)
 
 
 def find_view(picture: npt.NDArray[np.floating]) -> View:
-    """Find the border of the view.
+    """Find the border of the view in a picture, shape (H, W) or (H, W, 3), of values as encoded in [0, 1].
 
-    Parameters
-    ----------
-    picture : ndarray, shape (H, W) or (H, W, 3)
-        Values as encoded, in [0, 1].
-
-    Returns
-    -------
-    View
-        The whole picture where fewer than two of its corners are dark, or the dark part's border is neither round nor a
-        polygon of few corners: an organ before a dark background has no such border.
+    The view is the whole picture where fewer than two of its corners are dark, or the border of the dark part is
+    neither round nor a polygon of few corners: an organ before a dark background has no such border.
     """
     # candidates: the lit part of a small picture, and its border
     height, width = picture.shape[:2]

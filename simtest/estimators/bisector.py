@@ -7,7 +7,6 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Distribution, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import isophote_flags
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.protocol import Estimate
@@ -47,7 +46,7 @@ class Bisector:
         family = fit_isophote_family(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
-        lights, distance, flags = priors.lights, priors.distance_mm, isophote_flags(family)
+        lights, distance, flags = priors.lights, priors.distance_mm, family.flags
         own = light_of_highlight(family, priors)
         order = [*lights] if own is None else [lights[own]]
         if own is None:

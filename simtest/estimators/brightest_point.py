@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import isophote_flags
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate
@@ -34,7 +33,7 @@ def _flags(patch: Patch, camera: Camera) -> tuple[str, ...]:
     family = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
     if isinstance(family, Failure):
         return ("partial_arc",) if family.reason == Reason.NO_CLOSED_ISOPHOTE else ()
-    return isophote_flags(family)
+    return family.flags
 
 
 brightest_point = BrightestPoint()

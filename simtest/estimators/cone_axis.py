@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.flags import isophote_flags
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate
@@ -43,7 +42,7 @@ class ConeAxis:
             axis_ratio=family.axis_ratio,
             isophotes=family.isophotes,
             covariance=family.axis_covariance,
-            flags=isophote_flags(family),
+            flags=family.flags,
         )
         return add_light_offset_uncertainty(estimate, priors)
 

@@ -8,8 +8,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.flags import STREAK_RATIO, isophote_flags
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, Patch
@@ -65,7 +64,7 @@ class Curved:
             axis_ratio=curvature.axis_ratio,
             isophotes=family.isophotes,
             covariance=covariance,
-            flags=(*isophote_flags(family), "round") if is_round else isophote_flags(family),
+            flags=(*family.flags, "round") if is_round else family.flags,
             curvature=curvature,
         )
         return add_light_offset_uncertainty(estimate, priors)

@@ -31,14 +31,10 @@ class FrameResults:
 
 
 def run(estimator: Estimator, patch: Patch | Failure, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-    """Run an estimator on a patch.
+    """Run an estimator on a patch; a patch that is a Failure is passed on.
 
-    Returns
-    -------
-    Estimate or Failure
-        A patch that is a Failure is passed on. What the estimator raises, or returns in another form than `Estimate`
-        describes, is a Failure ``estimator_error`` (one highlight must not end a run of thousands); values that are
-        not finite are a Failure ``not_finite``.
+    What the estimator raises, or returns in another form than `Estimate` describes, is a Failure ``estimator_error``
+    (one highlight must not end a run of thousands); values that are not finite are a Failure ``not_finite``.
     """
     if isinstance(patch, Failure):
         return patch

@@ -19,7 +19,7 @@ def weights_at_zero(levels: Array) -> Array:
 
 
 def weights_of_axes(conics: Array, isovalues: Array, px2: Array, smoothing_px: float) -> Array:
-    """Return the weights of the cones' axes in the axis of the peak before smoothing.
+    """Return the weights of the cones' axes in the axis of the peak before smoothing, shape (K,); their sum is 1.
 
     The axis moves linearly with the isophote's area: without a base that is as with -ln t, but it also holds where the
     lobe stands on a base. Let log I have terms of third order in w. Smoothing by s then moves the peak as far as the
@@ -34,14 +34,9 @@ def weights_of_axes(conics: Array, isovalues: Array, px2: Array, smoothing_px: f
     isovalues : ndarray, shape (K,)
         t of each.
     px2 : ndarray, shape (2, 2)
-        What 1 px^2 is in squared tangents.
+        1 px^2 in squared tangents.
     smoothing_px : float
         s, px.
-
-    Returns
-    -------
-    ndarray, shape (K,)
-        Their sum is 1.
     """
     a, b, c = conics.T[:3]
     smoothing = smoothing_px**2 + LINEAR_INTERPOLATION_PX2

@@ -79,10 +79,10 @@ class FamilyCrossings:
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
 
     def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, PeakValue] | None = None) -> Rows:
-        """Return how far one standard deviation of noise in each raw pixel moves quantities; the noise must be known.
+        """Return how far one standard deviation of noise in each raw pixel moves Q quantities, shape (Q, P).
 
         A crossing depends on three pixels, the two beside it and the peak's; the ellipse and what follows from it
-        depend on its crossings. All is summed by smoothed pixel, then carried to the raw ones.
+        depend on its crossings. All is summed by smoothed pixel, then carried to the raw ones. The noise must be known.
 
         Parameters
         ----------
@@ -91,10 +91,6 @@ class FamilyCrossings:
         by_level : tuple of ndarray, shape (Q,), and PeakValue, optional
             Their derivatives by a common shift of all -ln t, and the peak value that t is relative to: it moves the
             levels one way, the peak's pixel the other.
-
-        Returns
-        -------
-        ndarray of float32, shape (Q, P)
         """
         noise, moved = self.patch.noise, self._sensitivities
         assert noise is not None

@@ -28,21 +28,7 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
     """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
 
     A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
-
-    Parameters
-    ----------
-    fitted : LobeFit
-        The fit.
-    observed : ndarray, shape (m,)
-        Intensities.
-    clipped : ndarray of bool, shape (m,), optional
-        Pixels to leave out.
-    noise : float, or ndarray, shape (m,)
-        Standard deviation of each pixel's noise.
-
-    Returns
-    -------
-    bool
+    Pixels have intensities `observed`, shape (m,), and noise of standard deviation `noise`; clipped ones are left out.
     """
     model, _ = fitted.model.evaluate()
     e, f = fitted.model.frame[:2]
@@ -70,19 +56,7 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
 def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
     """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
 
-    Parameters
-    ----------
-    fitted : LobeFit
-        The fit of all pixels.
-    observed : ndarray, shape (m,)
-        Intensities.
-    clipped : ndarray of bool, shape (m,), optional
-        As of `fit_lobe`.
-
-    Returns
-    -------
-    float
-        0 where the inner pixels alone do not determine a fit.
+    It is 0 where these pixels alone do not determine a fit.
     """
     model, _ = fitted.model.evaluate()
     near = model > INNER * model.max()

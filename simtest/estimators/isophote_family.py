@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
-from simtest.errors import Failure
+from simtest.errors import Failure, Reason
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_crossings import FamilyCrossings
 from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
@@ -39,6 +39,9 @@ PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
 """Variance of the axis at the peak over the squared drift, and a constant added to it, px^2, where there is a drift:
 terms of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE were fitted to 614 highlights
 of the generated colon, on viewpoints that no published figure uses."""
+
+STREAK_RATIO = 0.1
+"""An isophote with a smaller axis ratio is a streak."""
 
 NOISE_FACTOR = 2.0
 """Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
@@ -270,6 +273,24 @@ class IsophoteFamily:
         isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
         return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Warnings about the isophotes.
+
+        ``missing_isovalues``: some isovalues have no ellipse. ``partial_arc``: some isophotes run into the border of
+        the region, the frame or the view, so the highlight may be cut there; they are left out, or fitted to what is
+        seen. ``streak``: ten times as long as wide or more, so that the centre is hardly determined along it.
+        ``not_elliptic``: an isophote is no ellipse, as where two highlights touch or the curvature changes under one.
+        """
+        missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in self.failures)
+        conditions = {
+            "missing_isovalues": bool(self.failures),
+            "partial_arc": missing or any(isophote.cut for isophote in self.isophotes),
+            "streak": self.axis_ratio < STREAK_RATIO,
+            "not_elliptic": self.is_bent,
+        }
+        return tuple(flag for flag, holds in conditions.items() if holds)
 
     @property
     def _by_linear(self) -> Array:

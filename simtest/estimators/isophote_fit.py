@@ -66,15 +66,13 @@ class FittedIsophote:
         return camera.project(self.rays())
 
 
-def fit_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophote | Failure:
-    """Trace the isophote at t in (0, 1) and fit its ellipse [MB, section 2.3, steps 1 to 3]."""
-    return _fit([isovalue], [patch.crossings(isovalue)], camera)[0]
-
-
 def fit_isophotes(
     patch: Patch, camera: Camera, isovalues: Sequence[float]
 ) -> tuple[list[FittedIsophote], list[Failure]]:
-    """Fit several isophotes (see `fit_isophote`); return those that succeeded and the failures of the others."""
+    """Trace isophotes at t in (0, 1) and fit their ellipses [MB, section 2.3, steps 1 to 3].
+
+    Returns those that succeeded and the failures of the others.
+    """
     results = _fit(isovalues, patch.crossings_of(isovalues), camera)
     fitted = [result for result in results if isinstance(result, FittedIsophote)]
     return fitted, [result for result in results if isinstance(result, Failure)]
@@ -83,7 +81,7 @@ def fit_isophotes(
 def fit_isophote_of_each(
     patches: Sequence[Patch | Failure], camera: Camera, isovalue: float
 ) -> list[FittedIsophote | Failure]:
-    """Fit the isophote at the same value of several patches (see `fit_isophote`)."""
+    """Fit the isophote at the same value of several patches."""
     contours = [patch if isinstance(patch, Failure) else patch.crossings(isovalue) for patch in patches]
     return _fit([isovalue] * len(patches), contours, camera)
 

@@ -18,19 +18,8 @@ def light_of_highlight(family: IsophoteFamily, priors: Priors) -> int | None:
 
     The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
     turns by half the light's angle, the normal turns against the sightline by M. M is the root of the lobe's H up to a
-    factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature.
-
-    Parameters
-    ----------
-    family : IsophoteFamily
-        The highlight; of the frame's others, which its patch names, the nearest are used, one for each other light.
-    priors : Priors
-        For the lights.
-
-    Returns
-    -------
-    int or None
-        Index of the light.
+    factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature. Of the
+    frame's other highlights, which the patch names, the nearest are used, one for each other light.
     """
     if len(priors.lights_mm) == 1:
         return 0
@@ -50,19 +39,9 @@ def light_of_highlight(family: IsophoteFamily, priors: Priors) -> int | None:
 
 
 def _misfit(seen: Array, offsets: Array) -> float:
-    """Compute how badly the other peaks fit the other lights' offsets, with any positive factor between them.
+    """Return how badly other peaks, shape (K, 2), fit the other lights' offsets, shape (L - 1, 2), up to a factor > 0.
 
-    Parameters
-    ----------
-    seen : ndarray, shape (K, 2)
-        Offsets of the other peaks.
-    offsets : ndarray, shape (L - 1, 2)
-        Offsets of the other lights.
-
-    Returns
-    -------
-    float
-        RMS of the residual over RMS of the offsets; 0 is a perfect fit.
+    The misfit is the RMS of the residual over that of the offsets; 0 is a perfect fit.
     """
     best = np.inf
     # Each pairing of the first peak sets the factor; the other peaks then take the nearest light.

@@ -23,19 +23,10 @@ NEGLIGIBLE = 0.1
 def add_light_offset_uncertainty(estimate: Estimate, priors: Priors) -> Estimate:
     """Inflate the covariance for the bias of assuming a co-located light.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Its normal is the reverse of the highlight's sightline.
-    priors : Priors
-        For lights and distance.
-
-    Returns
-    -------
-    Estimate
-        Unchanged where no light is known, or all are at the camera. Else with the flag ``light_offset``. Where the
-        distance is known, the mean square over the lights of half their angle at the surface point is added to the
-        covariance; where it is not, the covariance is None, since the error may be anything.
+    The estimate's normal is the reverse of the highlight's sightline. It is unchanged where no light is known, or all
+    are at the camera. Else it gets the flag ``light_offset``. Where the distance is known, the mean square over the
+    lights of half their angle at the surface point is added to the covariance; where it is not, the covariance is None,
+    since the error may be anything.
     """
     if not priors.lights_mm:
         return estimate

@@ -8,7 +8,6 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.flags import isophote_flags
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.isophote_fit import FittedIsophote
@@ -86,7 +85,7 @@ class Photometric:
         e, f, s = fitted.model.frame
         covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
         # beyond noise: a misfit, or a drift of the isophotes' axis
-        flags, excess = isophote_flags(family), family.drift_excess
+        flags, excess = family.flags, family.drift_excess
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
             flags = (*flags, "misfit")

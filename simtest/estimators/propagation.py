@@ -33,8 +33,7 @@ def conics_by_crossings(
 
     Returns
     -------
-    by_moment : ndarray, shape (K, 5, 5)
-    moments : ndarray, shape (5, N)
+    by_moment, moments : ndarray, shapes (K, 5, 5) and (5, N)
         Conic k moves by by_moment[k] @ moments[:, parts[k]] as its points move.
     """
     (x, y), (by_x, by_y) = tangents, gradient
@@ -62,19 +61,11 @@ def raw_moves(
     Parameters
     ----------
     pixels : ndarray of int, shape (N,)
-        Indices in the flattened patch; each may occur several times.
+        Indices in the flattened patch, whose rows are `width` long; each may occur several times.
     moves : ndarray, shape (K, N)
         Change of each quantity per unit of intensity there.
-    width : int
-        Of the patch, px.
     noise : float, or ndarray of float32, shape (h, w)
-        Standard deviation before smoothing.
-    smoothing_px : float
-        Standard deviation of the Gaussian smoothing, px.
-
-    Returns
-    -------
-    ndarray of float32, shape (K, P)
+        Standard deviation before smoothing by a Gaussian of `smoothing_px`.
     """
     # box around the pixels, with a margin of the kernel's half-width
     rows = pixels // width
@@ -99,7 +90,11 @@ def raw_moves(
 def gram(rows: Rows) -> Array:
     """Return the products of few long rows, shape (K, P), with each other, shape (K, K)."""
     # A copy, because BLAS's routine for a matrix times its own transpose is several times slower on so few rows.
-    products = np.dot(rows, rows.copy().T).astype(float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = np.dot(rows, rows.copy().T).astype(float)
+    if not np.isfinite(products).all():
+        # Noise far above the signal leaves the range of single precision.
+        products = rows.astype(float) @ rows.astype(float).T
     return np.asarray((products + products.T) / 2)
 
 

@@ -53,18 +53,10 @@ class AngularProfile:
         return self.power == 0 and not self.angles
 
     def at(self, cosine: npt.ArrayLike, sine: npt.ArrayLike | None = None) -> Array:
-        """Return the factor at an angle from the axis, named by its cosine.
+        """Return the factor at an angle from the axis, named by its cosine, any shape.
 
-        Parameters
-        ----------
-        cosine : array_like, shape (...)
-        sine : array_like, shape (...), optional
-            Of the same angle, >= 0. Near the axis it keeps the digits that the cosine has lost; only tables use it.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            cos^k is 0 at angles of 90 deg and more, unless k is 0.
+        With the sine >= 0 of the same angle a table keeps the digits that the cosine has lost near the axis. cos^k is 0
+        at angles of 90 deg and more, unless k is 0.
         """
         c = np.clip(np.asarray(cosine, dtype=float), -1.0, 1.0)
         if self.angles:

@@ -80,10 +80,9 @@ def cone_axes(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> 
 
     Returns
     -------
-    values : ndarray, shape (..., 3)
-        l1, l2, l3; the sign of each matrix is chosen so that det C' < 0.
-    vectors : ndarray, shape (..., 3, 3)
-        Columns e1, e2, e3, right-handed, e3 on the sightline's side (the cone's axis, pointing into the scene).
+    values, vectors : ndarray, shapes (..., 3) and (..., 3, 3)
+        l1, l2, l3, the sign of each matrix chosen so that det C' < 0, and columns e1, e2, e3, right-handed, e3 on the
+        sightline's side (the cone's axis, pointing into the scene).
     """
     values, vectors = _ordered(np.asarray(cones, dtype=float), sightlines)
     hand = np.sign(np.linalg.det(vectors))[..., None]

@@ -33,20 +33,9 @@ def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -
 
 
 def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None, count: int = 73) -> Array:
-    """Return directions along the cone of an ellipse, to draw it through any lens.
+    """Return directions along the cone C' of an ellipse, shape (count, 3), the first repeated at the end: for drawing.
 
-    Parameters
-    ----------
-    cone : array_like, shape (3, 3)
-        C', camera frame.
-    sightline : array_like, shape (3,), optional
-        Any direction on the wanted side of the cone; default forward.
-    count : int
-        Number of directions; the first is repeated at the end.
-
-    Returns
-    -------
-    ndarray, shape (count, 3)
+    The sightline is any direction on the wanted side of the cone; default forward.
     """
     (l1, l2, l3), vectors = cone_axes(cone, sightline)
     phase = np.linspace(0, 2 * np.pi, count)

@@ -138,17 +138,7 @@ def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
 
 
 def fit_ellipses(contours: Sequence[npt.ArrayLike]) -> FittedConics:
-    """Fit an ellipse to each of several contours (see `fit_ellipse`).
-
-    Parameters
-    ----------
-    contours : sequence of array_like, shape (N_i, 2)
-        Pixels.
-
-    Returns
-    -------
-    FittedConics
-        In the order of the contours.
+    """Fit an ellipse to each of several contours, array_like of shape (N_i, 2), px (see `fit_ellipse`).
 
     Raises
     ------

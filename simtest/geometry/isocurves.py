@@ -63,27 +63,15 @@ def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
 
 
 def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2].
+    """Return the radii r- and r+ of the endoscopic isocurve's two circles [MB, section 2.2], in the unit of V_Z.
 
     r+- = abs(V_Z) sqrt((2-kappa)/kappa +- sqrt(((2-kappa)/kappa)^2 - 1)). The isophote is r-; r+ is the branch
     cos(beta) = -tau; r+ r- = V_Z^2. Computed in the form r- = abs(V_Z) tan(acos(tau)/2), which does not cancel.
 
-    Parameters
-    ----------
-    kappa_value : array_like
-        kappa in (0, 1).
-    height : array_like
-        V_Z, not 0.
-
-    Returns
-    -------
-    inner, outer : ndarray
-        r- and r+, in the unit of V_Z.
-
     Raises
     ------
     InputError
-        If kappa is outside (0, 1) or V_Z is 0.
+        If kappa is outside (0, 1) or the height V_Z is 0.
     """
     k, z = np.asarray(kappa_value, dtype=float), np.abs(np.asarray(height, dtype=float))
     if not (np.all(k > 0) and np.all(k < 1)):

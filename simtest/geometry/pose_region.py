@@ -39,17 +39,9 @@ class PoseRegion:
     covariance: Array
 
     def statistic(self, normals: npt.ArrayLike) -> Array:
-        """Compute the squared Mahalanobis distance of the cone from the cones of circles perpendicular to some normals.
+        """Compute the squared Mahalanobis distance of the cone from the cones of circles perpendicular to normals.
 
-        Parameters
-        ----------
-        normals : array_like, shape (..., 3)
-            Unit, camera frame.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            0 at N+ and N-.
+        The normals, shape (..., 3), are unit, camera frame; the distance, shape (...), is 0 at N+ and N-.
         """
         # g = G (a, b, c, d, e, -1) in the basis of each normal
         N = np.asarray(normals, dtype=float)

@@ -32,17 +32,9 @@ def basis_across(normal: Array) -> Array:
 
 
 def tangent_coordinates(normal: Array, other: Array) -> Array:
-    """Return the rotation from one unit vector to another as a vector of the first one's tangent basis, rad.
+    """Return the rotation from one unit vector, shape (3,), to another in the first one's tangent basis.
 
-    Parameters
-    ----------
-    normal, other : ndarray, shape (3,)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray, shape (2,)
-        Its length is the angle between the two.
+    Its shape is (2,), its length the angle between the two, rad.
     """
     first, second = basis_across(normal)
     across = np.array([first @ other, second @ other])

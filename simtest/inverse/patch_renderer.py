@@ -54,8 +54,11 @@ class PatchRenderer:
 
     def __init__(self, rays: Array, path_depth: int = 2, samples: int = 16, variant: str | None = None) -> None:
         mi = backend.load(variant)
+        # The backend must be loaded first: it chooses the library that Dr.Jit compiles with.
+        import drjit
+
         plugin = phong.register(mi, str(mi.variant()))
-        self.mi, self.count, self.depth = mi, len(rays), path_depth
+        self.mi, self.dr, self.count, self.depth = mi, drjit, len(rays), path_depth
         self.samples = samples
         self._rays = np.ascontiguousarray(rays, dtype=np.float32)
         # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
@@ -64,19 +67,9 @@ class PatchRenderer:
         )
 
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
-        """Compute intensities and their derivatives by the parameters that are kept.
+        """Compute intensities, shape (m,), and their derivatives by the p parameters that are kept, shape (m, p).
 
-        Parameters
-        ----------
-        patch : RenderedQuadric
-            The patch at the current parameters.
-        kept : list of bool
-            For each of the eight: s (2), stretch (3), log scale, log n, base.
-
-        Returns
-        -------
-        intensity : ndarray, shape (m,)
-        derivatives : ndarray, shape (m, p)
+        `kept` holds a bool for each of the eight parameters: s (2), stretch (3), log scale, log n, base.
         """
         mi, columns, lanes = self.mi, int(sum(kept)), len(self._rays)
         # lanes: a copy of all pixels for each parameter
@@ -112,9 +105,7 @@ class PatchRenderer:
 
     def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
         """Return the eight parameters; each kept one has gradient 1 in its own copy of the pixels."""
-        import drjit as dr
-
-        mi, made, lane = self.mi, [], 0
+        mi, dr, made, lane = self.mi, self.dr, [], 0
         values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.log_exponent, patch.base]
         for value, is_kept in zip(values, kept, strict=True):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
@@ -127,31 +118,24 @@ class PatchRenderer:
 
     def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
         """Return the values of all lanes and their derivatives by the parameter that varies in each."""
-        import drjit as dr
-
+        dr = self.dr
         slope = dr.forward_to(radiance) if dr.grad_enabled(radiance) else dr.zeros(type(radiance), dr.width(radiance))
         dr.eval(radiance, slope)
         return np.array(radiance, dtype=np.float64), np.array(slope, dtype=np.float64)
 
     def _lanes(self, width: int) -> Any:
         """Return the lane numbers."""
-        import drjit as dr
-
-        return dr.arange(self.mi.UInt32, width)
+        return self.dr.arange(self.mi.UInt32, width)
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
-        import drjit as dr
-
         held = (kind or self.mi.Float)(value)
-        dr.make_opaque(held)
+        self.dr.make_opaque(held)
         return held
 
     def _bounced(self, surface: "_Surface", rays: Any) -> Any:
         """Return the radiance along rays from the camera after more than one bounce."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, dr = self.mi, self.dr
         si = surface.first_hit(rays)
         radiance, weight = mi.Float(0), mi.Float(1)
         for bounce in range(self.depth - 2):
@@ -166,8 +150,6 @@ class PatchRenderer:
 
     def _numbers(self, bounce: int, width: int) -> tuple[Any, Any]:
         """Return the random numbers of a bounce: different for each path, the same at every evaluation."""
-        import drjit as dr
-
         mi, lane, samples = self.mi, self._lanes(width), self._opaque(self.samples, self.mi.UInt32)
         number = mi.Float(lane % samples)
         # Each pixel shifts the sequence by its own amount.
@@ -175,17 +157,16 @@ class PatchRenderer:
         shift = [mi.Float(mi.sample_tea_32(pixel, 3 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
         u, v = (number * step + offset for step, offset in zip(GOLDEN, shift[:2], strict=True))
         w = (number + shift[2]) / self._opaque(float(self.samples))
-        return w - dr.floor(w), mi.Point2f(u - dr.floor(u), v - dr.floor(v))
+        floor = self.dr.floor
+        return w - floor(w), mi.Point2f(u - floor(u), v - floor(v))
 
 
 class _Surface:
     """The patch as the kernel sees it: everything that depends on its parameters."""
 
     def __init__(self, renderer: PatchRenderer, patch: "RenderedQuadric", parameters: list[Any]) -> None:
-        import drjit as dr
-
-        mi, opaque = renderer.mi, renderer._opaque
-        self.mi = mi
+        mi, dr, opaque = renderer.mi, renderer.dr, renderer._opaque
+        self.mi, self.dr = mi, dr
         by_first, by_second, first, both, second, self.log_scale, log_exponent, self.base = parameters
         shrink = dr.exp(-log_exponent / 2)
         self.K = (first * shrink - 1, both * shrink, second * shrink - 1)
@@ -216,15 +197,12 @@ class _Surface:
 
     def radiance(self, rays: Any) -> Any:
         """Return the radiance along rays from the camera that comes straight from the lights."""
-        import drjit as dr
-
-        return self.direct(self.first_hit(rays)) * dr.exp(self.log_scale)
+        return self.direct(self.first_hit(rays)) * self.dr.exp(self.log_scale)
 
     def local(self, vector: Any) -> tuple[Any, Any, Any]:
         """Return a vector's components along e, f and N."""
-        import drjit as dr
-
-        return dr.dot(self.e, vector), dr.dot(self.f, vector), dr.dot(self.normal, vector)
+        dot = self.dr.dot
+        return dot(self.e, vector), dot(self.f, vector), dot(self.normal, vector)
 
     def bent(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return K (x, y)^T / d."""
@@ -233,8 +211,6 @@ class _Surface:
 
     def first_hit(self, direction: Any) -> Any:
         """Return the first surface points on rays from the camera."""
-        import drjit as dr
-
         # (x, y, z) = t r - p solves z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0.
         rx, ry, rz = self.local(direction)
         px, py, pz = self.local(self.foot)
@@ -244,19 +220,19 @@ class _Surface:
         a, b = (rx * bx + ry * by + q * rz * rz) / 2, rz - (px * bx + py * by + q * pz * rz)
         c = (px * cx + py * cy + q * pz * pz) / 2 - pz
         # Where a ray misses the quadric, its closest approach is used.
+        dr = self.dr
         root = dr.sqrt(dr.maximum(b * b - 4 * a * c, PASSING * b * b))
         t = 2 * c / (root - b)
         return self.interaction(direction, t * direction, t)
 
     def next_hit(self, si: Any, direction: Any) -> tuple[Any, Any]:
         """Return the next surface points on rays from surface points, and whether there are any, facing the ray."""
-        import drjit as dr
-
         x, y, z = self.local(si.p - self.foot)
         wx, wy, wz = self.local(direction)
         bx, by = self.bent(wx, wy)
         a, b = (wx * bx + wy * by + self.bulge * wz * wz) / 2, wz + x * bx + y * by + self.bulge * z * wz
         # One root is the starting point, the other the next hit.
+        dr = self.dr
         found = (a * b < 0) & (dr.abs(a) > 1e-9)
         t = dr.select(found, -b / dr.select(found, a, 1), 1)
         hit = self.interaction(direction, si.p + t * direction, t)
@@ -265,9 +241,7 @@ class _Surface:
 
     def interaction(self, direction: Any, position: Any, reach: Any) -> Any:
         """Return Mitsuba's surface interaction at surface points."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, dr = self.mi, self.dr
         x, y, z = self.local(position - self.foot)
         kx, ky = self.bent(x, y)
         normal = dr.normalize((1 + self.bulge * z) * self.normal + kx * self.e + ky * self.f)
@@ -279,9 +253,7 @@ class _Surface:
 
     def direct(self, si: Any, lit: Any = True) -> Any:
         """Return the radiance of surface points lit straight by the lights, per unit of their power."""
-        import drjit as dr
-
-        mi, radiance = self.mi, self.mi.Float(0)
+        mi, dr, radiance = self.mi, self.dr, self.mi.Float(0)
         for light in self.lights:
             towards = light - si.p
             squared = dr.squared_norm(towards)
@@ -291,24 +263,19 @@ class _Surface:
 
     def reflected(self, si: Any, local: Any) -> Any:
         """Return f cos(theta) of lobe and base together."""
-        import drjit as dr
-
         lobe, base = self.material.parts(self.mi, si, local, self.mi.Bool(True))
-        return dr.mean(lobe) + self.base * dr.mean(base)
+        return self.dr.mean(lobe) + self.base * self.dr.mean(base)
 
     def sample(self, si: Any, first: Any, second: Any) -> tuple[Any, Any]:
         """Draw directions, local and not differentiated, with their densities."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, dr = self.mi, self.dr
         with dr.suspend_grad():
             bs, _ = self.material.bsdf.sample(mi.BSDFContext(), si, first, second, mi.Bool(True))
             return mi.Vector3f(dr.detach(bs.wo)), mi.Float(dr.detach(bs.pdf))
 
     def is_seen(self, si: Any) -> Any:
         """Return whether the first light reaches surface points past the patch itself."""
-        import drjit as dr
-
+        dr = self.dr
         with dr.suspend_grad():
             reach = dr.norm(si.p)
             first = self.first_hit(si.p / reach)

@@ -565,15 +565,20 @@ def test_the_scale_of_a_frame_does_not_matter(scale):
 
 
 def test_an_estimator_that_fails_is_a_value():
-    def broken(patch, camera):
-        raise ZeroDivisionError("float division by zero")
+    class Broken:
+        def estimate(self, patch, camera, priors):
+            raise ZeroDivisionError("float division by zero")
 
-    (found,) = reconstruct(SPOT, EYE, {"broken": broken, "silent": lambda patch, camera: None, "number": 5})
+    class Silent:
+        def estimate(self, patch, camera, priors):
+            return None
+
+    (found,) = reconstruct(SPOT, EYE, {"broken": Broken(), "silent": Silent()})
     details = {name: result.detail for name, result in found.estimates.items()}
     assert {result.reason for result in found.estimates.values()} == {Reason.ESTIMATOR_ERROR}
     assert details["broken"] == "ZeroDivisionError: float division by zero"
     assert details["silent"] == "gave a NoneType; must be an Estimate or a Failure"
-    assert "not callable" in details["number"]
+    refused(lambda: reconstruct(SPOT, EYE, {"number": 5}), "estimator 'number'", "not callable")
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e300])

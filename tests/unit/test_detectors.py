@@ -75,7 +75,8 @@ def test_colour_is_that_of_the_pipeline(name, isolated):
     assert len(made.specularities) == 2
     same_patches(found, made.specularities)
     assert [h.kind for h in found.highlights] == [h.kind for h in made.highlights]
-    np.testing.assert_array_equal(found.colour.mask, made.found.detection.mask)
+    assert len(found.highlights) + len(found.others) == len(made.found.detection.highlights)
+    assert found.view.seen is made.found.view.seen is None or (found.view.seen == made.found.view.seen).all()
 
 
 def test_the_same_box_gives_the_same_patch_again():

@@ -9,7 +9,7 @@ import pytest
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.isophote_fit import fit_isophote, fit_isophote_of_each
+from simtest.estimators.isophote_fit import fit_isophote_of_each
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
@@ -63,7 +63,7 @@ def test_a_circular_cone_is_found_through_a_lens(lens, angle):
     camera, u = LENSES[lens], np.radians(angle)
     axis = np.array([np.sin(u) * 0.6, np.sin(u) * 0.8, np.cos(u)])
     ring = Ring(camera, axis, np.radians(6))
-    fitted = fit_isophote(ring, camera, 0.5)
+    fitted = fit_isophote_of_each([ring], camera, 0.5)[0]
     assert fitted.conic is None
     pose = fitted.pose()
     np.testing.assert_allclose(pose.axis, axis, atol=1e-10)
@@ -77,19 +77,19 @@ def test_a_circular_cone_is_found_through_a_lens(lens, angle):
     np.testing.assert_allclose(back @ axis, np.cos(np.radians(6)), atol=1e-9)
     # Negative control: the same contour read as a pinhole's gives another axis.
     plain = dataclasses.replace(camera, distortion=None, view_mask=None)
-    wrong = fit_isophote(ring, plain, 0.5).pose()
+    wrong = fit_isophote_of_each([ring], plain, 0.5)[0].pose()
     assert angle_deg(wrong.axis, axis) > (0.02 if angle == 5 else 0.5)
 
 
 def test_an_isophote_as_wide_as_a_half_space_is_no_ellipse():
     ring = Ring(LENSES["fisheye"], np.array([0.0, 0.0, 1.0]), np.radians(5))
     ring.points[3] = LENSES["fisheye"].project([1.0, 0.0, -0.2])
-    result = fit_isophote(ring, LENSES["fisheye"], 0.5)
+    result = fit_isophote_of_each([ring], LENSES["fisheye"], 0.5)[0]
     assert isinstance(result, Failure)
     assert result.reason == Reason.NOT_AN_ELLIPSE
     # And one that leaves what the lens images.
     ring.points[3] = 5000.0
-    assert fit_isophote(ring, LENSES["fisheye"], 0.5).reason == Reason.NOT_FINITE
+    assert fit_isophote_of_each([ring], LENSES["fisheye"], 0.5)[0].reason == Reason.NOT_FINITE
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -105,7 +105,7 @@ def test_isophotes_fitted_together_are_those_fitted_alone(lens):
     assert together[1] is missing
     assert [together[i].reason for i in (2, 3)] == [Reason.NOT_FINITE, Reason.TOO_FEW_POINTS]
     for i, ring in ((0, rings[0]), (4, rings[2]), (5, rings[3])):
-        alone = fit_isophote(ring, camera, 0.5)
+        alone = fit_isophote_of_each([ring], camera, 0.5)[0]
         np.testing.assert_allclose(together[i].cone, alone.cone, rtol=0, atol=1e-13)
         np.testing.assert_allclose(together[i].sightline, alone.sightline, rtol=0, atol=1e-15)
         np.testing.assert_array_equal(together[i].points, ring.points[:-1])
