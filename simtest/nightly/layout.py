@@ -32,20 +32,20 @@ class Reports:
 
     @property
     def history(self) -> Path:
-        """Figures of all nights, a file each; never changed."""
+        """Figures of all runs, a file each; never changed."""
         return self.root / "history"
 
     @property
     def work(self) -> Path:
-        """Scratch of nights in progress, a folder each."""
+        """Scratch of runs in progress, a folder each."""
         return self.root / "work"
 
     def baseline(self, profile: str) -> Path:
-        """Give the folder of a profile's accepted numbers."""
+        """Return the folder of a profile's accepted numbers."""
         return self.root / "baseline" / profile
 
-    def tonight(self, profile: str) -> Path:
-        """Give the folder of a profile's last night: numbers, page and outputs for machines."""
+    def latest(self, profile: str) -> Path:
+        """Return the folder of a profile's last run: numbers, page and outputs for machines."""
         return self.root / "nightly" / profile
 
     def make(self) -> None:
@@ -59,16 +59,16 @@ class Reports:
 
 
 def new_run_id(now: datetime) -> str:
-    """Give a name for a night that no other has, whatever the clock says."""
+    """Return a name that no other run has, whatever the clock says."""
     return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 @contextlib.contextmanager
 def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
-    """Give a night its scratch folder, locked while the night lives and removed when it ends."""
+    """Make a run's scratch folder, locked while the run lives and removed when it ends."""
     folder = reports.work / run_id
     with contextlib.ExitStack() as stack:
-        # Together with the lock, or another night would take the folder for a dead one's.
+        # Together with the lock, or another run would take the folder for a dead one's.
         with _locked(reports.work / _ENTRY):
             folder.mkdir()
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -77,11 +77,11 @@ def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
 
 
 def remove_dead(reports: Reports) -> list[str]:
-    """Remove what nights left that were killed; gives their names. Those that live hold a lock, and are left alone."""
+    """Remove the leftovers of killed runs and return their names; living runs hold a lock and are left alone."""
     dead, alive = [], set()
     with _locked(reports.work / _ENTRY):
         for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
-            if _held(folder / LOCK):
+            if _is_held(folder / LOCK):
                 alive.add(folder.name)
             else:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -92,8 +92,7 @@ def remove_dead(reports: Reports) -> list[str]:
     return dead
 
 
-def _held(lock: Path) -> bool:
-    """Whether a living process holds a lock."""
+def _is_held(lock: Path) -> bool:
     try:
         with lock.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -113,8 +112,8 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def turn(folder: Path) -> Iterator[None]:
-    """Have a folder that several nights replace to oneself; what a kill left in the middle is put back first."""
+def exclusive_replacement(folder: Path) -> Iterator[None]:
+    """Lock the folder for replacement; first roll back an interrupted swap."""
     with _locked(folder.parent / f".{folder.name}.{LOCK}"):
         old = _old(folder)
         if old.is_dir():
@@ -126,14 +125,14 @@ def turn(folder: Path) -> Iterator[None]:
 
 
 def replace_folder(new: Path, folder: Path) -> None:
-    """Put a finished folder in another's place, under `turn`: one of the two is always there, under a name it knows.
+    """Replace a folder by a finished one, under `exclusive_replacement`: one of the two exists at any moment.
 
     Parameters
     ----------
     new : Path
         Whose files are on disk; on the same file system.
     folder : Path
-        Its place.
+        The folder that is replaced; may be missing.
     """
     old = _old(folder)
     if folder.exists():

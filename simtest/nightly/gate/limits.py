@@ -1,4 +1,4 @@
-"""What the gate lets pass: its level, and the differences that do no harm."""
+"""The gate's level, and the differences that do no harm."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ class Limits:
     Parameters
     ----------
     alpha : float
-        Family-wise level: chance that a night without a regression is called one, at most.
+        Family-wise level: the chance that a run without a regression is called one, at most.
     relative : float
         Share of the baseline by which errors and the axis ratio's deviation may rise.
     absolute_deg : float
@@ -26,8 +26,7 @@ class Limits:
     memory : float
         Share by which peak memory may rise.
     pooled_weight : float
-        Share of alpha that the comparisons over many settings have together, in [0, 1); the rest is that of the single
-        settings.
+        Share of alpha of the comparisons over many settings together, in [0, 1); the rest is for single settings.
     medians_deg : float
         Medians of errors that differ by no more are equal, on another processor too.
     """
