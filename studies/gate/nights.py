@@ -35,7 +35,7 @@ class Source:
 
     @classmethod
     def of(cls, rows: pl.DataFrame) -> "Source":
-        """Number the units of some rows."""
+        """Return rows with numbers of their units."""
         units = rows.select(*SETTING, "realisation").unique(maintain_order=True).with_row_index("unit")
         settings = units.select(SETTING).unique(maintain_order=True).with_row_index("number")
         numbers = units.join(settings, on=SETTING, maintain_order="left")["number"].to_numpy().astype(np.int64)

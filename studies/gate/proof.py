@@ -176,7 +176,7 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
 
 
 def proof_experiments(realisations: int = 2 * N) -> list[Experiment]:
-    """Return the experiments that faults are planted into: kinds of surface, a light beside the camera, the protocol."""
+    """Return the experiments that faults are planted into: surfaces of all kinds, a light offset, the protocol."""
     plain = {"camera.width": 320, "camera.height": 320}
     groups = [
         {"scene": "plane", "label": "plane", "isolated": False, "set": plain},
