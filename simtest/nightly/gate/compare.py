@@ -11,14 +11,13 @@ from simtest.nightly.gate.holm import holm
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.missing_results import digests, lost_highlights, missing_cells
 from simtest.nightly.gate.notes import large_and_undecided, notes_on, redefined
-from simtest.nightly.gate.pairing import Numbered, pairing, pairs, unpaired_values
+from simtest.nightly.gate.pairing import pairing, pairs
 from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
-from simtest.nightly.gate.quantities import WHERE_MIXED, Quantity, quantities
+from simtest.nightly.gate.quantities import PENALISED, WHERE_MIXED, Quantity, harms, quantities
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict
 
 DEFAULTS = Limits()
-PENALISED = "mean_penalised_deg"
 
 _WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
 """Columns of comparisons before `_judged`: `better` is the p-value of the mirror image, `within` as in `Outcomes`; an
@@ -91,16 +90,15 @@ def _tested(
         return [], 0, 0
     # Pair the rows
     cells = differing.with_row_index("cell").with_columns(pl.col("cell").cast(pl.Int64))
-    before, after = (Numbered.of(run.rows, cells) for run in (baseline, tonight))
+    before, after = (harms(run.rows, cells) for run in (baseline, tonight))
     matched = pairing(before, after)
     comparable = _comparable(baseline.record, tonight.record, cells)
-    found = matched.cells & comparable
-    # Choose the quantities; where all are answered, the penalised mean is the mean and would be tested twice
-    wanted = (pl.col("quantity") != PENALISED) | pl.col("cell").is_in(_with_unanswered(before, after))
-    for name in WHERE_MIXED:
-        wanted &= (pl.col("quantity") != name) | pl.col("cell").is_in(_mixed(name, before, after))
-    of_pairs = paired_sums(pairs(before, after, found).filter(wanted))
-    of_each = [sums(unpaired_values(run, found).filter(wanted)) for run in (before, after)]
+    in_pairs = pl.col("cell").is_in(list(matched.cells & comparable))
+    # Choose the quantities and add up
+    without = _not_tested(pl.concat([before, after]))
+    chosen = [run.join(without, on=("cell", "quantity"), how="anti", maintain_order="left") for run in (before, after)]
+    of_pairs = paired_sums(pairs(*(run.filter(in_pairs) for run in chosen)))
+    of_each = [sums(run.filter(~in_pairs)) for run in chosen]
     # Test
     made = [lost_highlights(matched.lost, cells, comparable)]
     for name, quantity in quantities(limits).items():
@@ -128,15 +126,16 @@ def _comparable(baseline: RunRecord, tonight: RunRecord, cells: pl.DataFrame) ->
     return frozenset(cells.filter(~pl.col("experiment").is_in(moved))["cell"].to_list())
 
 
-def _with_unanswered(*runs: Numbered) -> list[int]:
-    """Return the cells where a highlight went unanswered in one of the runs."""
-    return sorted({cell for run in runs for cell in run.rows.filter(pl.col("unanswered") > 0)["cell"]})
+def _not_tested(harms: pl.DataFrame) -> pl.DataFrame:
+    """Return the cells and quantities of two runs' harms that are not tested.
 
-
-def _mixed(name: str, *runs: Numbered) -> list[int]:
-    """Return the cells where the indicator takes both values across the two runs."""
-    both = pl.concat([run.rows.select("cell", name) for run in runs]).drop_nulls()
-    return both.group_by("cell").agg(pl.col(name).n_unique()).filter(pl.col(name) > 1)["cell"].to_list()
+    Where all highlights are answered the penalised mean is the mean, and would be tested twice; an indicator of
+    `WHERE_MIXED` is tested in the cells where it takes both values across the two runs.
+    """
+    found = harms.group_by("cell", "quantity").agg(kinds=pl.col("value").n_unique(), most=pl.col("value").max())
+    answered = found.filter(pl.col("quantity") == "unanswered", pl.col("most") == 0)
+    alike = found.filter(pl.col("quantity").is_in(WHERE_MIXED), pl.col("kinds") == 1)
+    return pl.concat([answered.select("cell", quantity=pl.lit(PENALISED)), alike.select("cell", "quantity")])
 
 
 def _shared(first: pl.DataFrame, second: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -183,11 +182,13 @@ def _pooled(
 
 
 def _untested(
-    cells: pl.DataFrame, name: str, quantity: Quantity, before: Numbered, after: Numbered
+    cells: pl.DataFrame, name: str, quantity: Quantity, before: pl.DataFrame, after: pl.DataFrame
 ) -> pl.DataFrame:  # fmt: skip
     """Compare the cells where one run alone knows a quantity, or both but for no pair: without a test."""
-    tables = [run.frames if name == "false" else run.rows for run in (before, after)]
-    means = [table.drop_nulls(name).group_by("cell").agg(pl.col(name).mean()) for table in tables]
+    means = [
+        run.filter(pl.col("quantity") == name).group_by("cell").agg(pl.col("value").mean().alias(name))
+        for run in (before, after)
+    ]
     both = means[0].join(means[1], on="cell", how="full", coalesce=True, suffix="_2")
     first, second = pl.col(name), pl.col(f"{name}_2")
     shown = (1 - first, 1 - second) if quantity.falls else (first, second)

@@ -104,11 +104,10 @@ def _numbers(baseline: NightlyRun, tonight: NightlyRun, limits: Limits) -> list[
             f"{both.height} cells; they differ by {float(apart.to_numpy().max()):.2g} deg at most."
         )
     # Status by highlight: isophotes that opened, highlights that are no longer found
-    key = (*KEY, "seed")
     first, second = (
-        rows.filter(IS_TRUE).select(*key, "status", answered=ANSWERED).unique(key, keep="first") for rows in tables
+        rows.filter(IS_TRUE).select(*KEY, "status", answered=ANSWERED).unique(KEY, keep="first") for rows in tables
     )
-    both = first.join(second, on=key, suffix="_2")
+    both = first.join(second, on=KEY, suffix="_2")
     before, after = pl.col("answered"), pl.col("answered_2")
     other = pl.col("status").ne_missing(pl.col("status_2"))
     status, lost, gained = both.select(status=other, lost=before & ~after, gained=after & ~before).sum().row(0)

@@ -1,39 +1,17 @@
 """Which rows of two runs are pairs."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import polars as pl
 
 from simtest.nightly.gate.pairing_units import UNIT
-from simtest.nightly.gate.quantities import HARMS, harms_of_frames, harms_of_rows
-from simtest.nightly.records import CELL
+from simtest.nightly.gate.quantities import PENALISED
+
+_FALSE = pl.col("quantity") == "false"
 
 
-@dataclass(frozen=True)
-class Numbered:
-    """One run's rows of the shared cells.
-
-    Parameters
-    ----------
-    rows, frames : polars.DataFrame
-        See `harms_of_rows` and `harms_of_frames`, with the number of the cell, `cell`.
-    """
-
-    rows: pl.DataFrame
-    frames: pl.DataFrame
-
-    @classmethod
-    def of(cls, rows: pl.DataFrame, cells: pl.DataFrame) -> "Numbered":
-        """Return the rows of some cells with their numbers; those of others are left out."""
-        own = rows.join(cells, on=CELL, how="inner", maintain_order="left")
-        return cls(
-            *(made.join(cells, on=CELL, maintain_order="left") for made in (harms_of_rows(own), harms_of_frames(own)))
-        )
-
-
-@dataclass(frozen=True)
-class Pairing:
-    """Which cells of two runs are pairs.
+class Pairing(NamedTuple):
+    """Cells whose rows of two runs are pairs, and what other cells have lost.
 
     Parameters
     ----------
@@ -49,10 +27,14 @@ class Pairing:
     lost: pl.DataFrame
 
 
-def pairing(before: Numbered, after: Numbered) -> Pairing:
-    """Find the cells that are pairs, and those that have lost highlights."""
+def pairing(before: pl.DataFrame, after: pl.DataFrame) -> Pairing:
+    """Find the cells that are pairs, and those that have lost highlights, in the `harms` of two runs."""
+    # Count each true highlight in both runs; each has one row of this quantity.
     key = ("cell", "realisation", "true_id", "seed")
-    counted = [run.rows.group_by(key).agg(pl.len().alias(name)) for run, name in ((before, "first"), (after, "second"))]
+    counted = [
+        run.filter(pl.col("quantity") == PENALISED).group_by(key).agg(pl.len().alias(name))
+        for run, name in ((before, "first"), (after, "second"))
+    ]
     first, second = pl.col("first"), pl.col("second")
     counts = (
         counted[0]
@@ -64,47 +46,28 @@ def pairing(before: Numbered, after: Numbered) -> Pairing:
             repeated=((first > 1) | (second > 1)).any(),
         )
     )  # fmt: skip
-    # A frame without a highlight has rows only where something was found in it.
-    frames = before.frames.join(after.frames, on=("cell", "realisation"), suffix="_2")
-    moved = set(frames.filter(pl.col("seed").ne_missing(pl.col("seed_2")))["cell"].to_list())
+    # Compare the frames' seeds. A frame without a highlight has rows only where something was found in it.
+    frames = [run.filter(_FALSE).select("cell", "realisation", "seed") for run in (before, after)]
+    both = frames[0].join(frames[1], on=("cell", "realisation"), suffix="_2")
+    moved = set(both.filter(pl.col("seed").ne_missing(pl.col("seed_2")))["cell"].to_list())
     # Realisations of other numbers are other realisations: nothing of them is lost.
     fewer = pl.col("kept") < pl.col("before")
-    lost = fewer & pl.col("cell").is_in(list(set(frames["cell"].to_list()) - moved))
+    lost = fewer & pl.col("cell").is_in(list(set(both["cell"].to_list()) - moved))
     unequal = counts.filter((pl.col("gained") > 0) | pl.col("repeated") | (fewer & ~lost))
-    every = set(before.frames["cell"].to_list()) & set(after.frames["cell"].to_list())
+    every = set(frames[0]["cell"].to_list()) & set(frames[1]["cell"].to_list())
     return Pairing(
         frozenset(every - set(unequal["cell"].to_list()) - moved), counts.filter(lost).select("cell", "before", "kept")
     )
 
 
-def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataFrame:
-    """Return the pairs of all quantities: `UNIT`, `baseline`, `tonight`; a row where both runs have a value."""
-    kept = pl.col("cell").is_in(list(paired))
-    rows = _long(before.rows.filter(kept), "baseline").join(
-        _long(after.rows.filter(kept), "tonight"), on=(*UNIT, "true_id"), maintain_order="left"
-    )
-    # A frame that had highlights and has no row at all tonight is lost: it is not one without false detections.
+def pairs(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    """Join the `harms` of two runs to pairs: `UNIT`, `baseline`, `tonight`; a row where both runs have a value."""
+    first, second = before.rename({"value": "baseline"}), after.rename({"value": "tonight"})
+    rows = first.filter(~_FALSE).join(second.filter(~_FALSE), on=(*UNIT, "true_id"), maintain_order="left")
+    # A frame with highlights that has no row at all tonight is lost: it is not one without false detections.
     frame = ("cell", "realisation")
-    unseen = before.rows.join(after.frames, on=frame, how="anti")
-    first = _frames(before.frames.filter(kept).join(unseen, on=frame, how="anti", maintain_order="left"), "baseline")
-    second = _frames(after.frames.filter(kept), "tonight")
-    frames = first.join(second, on=UNIT, how="full", coalesce=True, maintain_order="left_right").with_columns(
-        pl.col("baseline", "tonight").fill_null(0.0)
-    )
+    lost = before.filter(~_FALSE).join(after, on=frame, how="anti")
+    frames = first.filter(_FALSE).join(lost, on=frame, how="anti", maintain_order="left")
+    frames = frames.join(second.filter(_FALSE), on=UNIT, how="full", coalesce=True, maintain_order="left_right")
+    frames = frames.with_columns(pl.col("baseline", "tonight").fill_null(0.0))
     return pl.concat([table.select(*UNIT, "baseline", "tonight") for table in (rows, frames)])
-
-
-def unpaired_values(run: Numbered, paired: frozenset[int]) -> pl.DataFrame:
-    """Return one run's values of all quantities in the cells that are not paired: `UNIT`, `value`."""
-    kept = ~pl.col("cell").is_in(list(paired))
-    tables = (_long(run.rows.filter(kept), "value"), _frames(run.frames.filter(kept), "value"))
-    return pl.concat([table.select(*UNIT, "value") for table in tables])
-
-
-def _long(rows: pl.DataFrame, name: str) -> pl.DataFrame:
-    index = ["cell", "realisation", "true_id"]
-    return rows.unpivot(list(HARMS), index=index, variable_name="quantity", value_name=name).drop_nulls(name)
-
-
-def _frames(frames: pl.DataFrame, name: str) -> pl.DataFrame:
-    return frames.select("cell", "realisation", quantity=pl.lit("false"), **{name: pl.col("false")})

@@ -20,6 +20,9 @@ RESULT_COLUMNS = (
 )  # fmt: skip
 """Columns that `compare` reads, beside those that name a row: cell and realisation."""
 
+PENALISED = "mean_penalised_deg"
+"""Mean error with `PENALTY_DEG` for unanswered highlights: every true highlight has a value."""
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -57,7 +60,7 @@ def quantities(limits: Limits) -> dict[str, Quantity]:
     error = Quantity("deg", limits.relative, limits.absolute_deg)
     return {
         "mean_deg": error,
-        "mean_penalised_deg": Quantity("deg", limits.relative, limits.absolute_deg, span=PENALTY_DEG),
+        PENALISED: Quantity("deg", limits.relative, limits.absolute_deg, span=PENALTY_DEG),
         "axis_ratio": Quantity("", limits.relative, limits.absolute_ratio),
         "unanswered": Quantity("", 0.0, limits.rate, span=1.0),
         "false": Quantity("a frame", 0.0, limits.rate, span=1.0),
@@ -85,7 +88,7 @@ RATIO_OFF = (
 
 HARMS: dict[str, pl.Expr] = {
     "mean_deg": pl.when(ANSWERED).then(pl.col("error_deg")),
-    "mean_penalised_deg": pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
+    PENALISED: pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
     "axis_ratio": RATIO_OFF,
     "unanswered": pl.when(IS_TRUE).then((~ANSWERED).cast(pl.Float64)),
     # Outside too: a distance that is no number or infinite, as in `simtest.validation.statistics.figures`.
@@ -100,16 +103,22 @@ HARMS: dict[str, pl.Expr] = {
 WHERE_MIXED = ("no_region", "no_axis_ratio")
 """Quantities that count what results leave unstated: compared where some results state it, and some do not."""
 
-KEY = (*CELL, "realisation", "true_id")
+KEY = (*CELL, "realisation", "true_id", "seed")
 """Columns that name the row of a true highlight in two runs."""
 
 
-def harms_of_rows(rows: pl.DataFrame) -> pl.DataFrame:
-    """Compute the harms of the rows of true highlights: `KEY`, `seed`, and a column a quantity."""
-    return rows.filter(IS_TRUE).select(*KEY, "seed", *(harm.alias(name) for name, harm in HARMS.items()))
+def harms(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
+    """Compute the harms in some cells: `cell`, `realisation`, `true_id`, `seed`, `quantity`, `value`.
 
-
-def harms_of_frames(rows: pl.DataFrame) -> pl.DataFrame:
-    """Count the false detections by frame: `CELL`, `realisation`, `seed`, `false`."""
-    count = pl.col("true_id").is_null().sum().cast(pl.Float64).alias("false")
-    return rows.group_by(*CELL, "realisation", "seed", maintain_order=True).agg(count)
+    A row for each true highlight and quantity, and one for each frame's false detections, with a null `true_id`.
+    `cells` numbers the names of the cells as `cell`; rows of others are left out.
+    """
+    own = rows.join(cells, on=CELL, how="inner", maintain_order="left")
+    index = ["cell", "realisation", "true_id", "seed"]
+    true = own.filter(IS_TRUE).select(*index, **HARMS)
+    true = true.unpivot(list(HARMS), index=index, variable_name="quantity").drop_nulls("value")
+    count = pl.col("true_id").is_null().sum().cast(pl.Float64)
+    false = own.group_by("cell", "realisation", "seed", maintain_order=True).agg(
+        pl.lit(None, own.schema["true_id"]).alias("true_id"), quantity=pl.lit("false"), value=count
+    )
+    return pl.concat([true, false.select(true.columns)])
