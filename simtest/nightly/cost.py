@@ -80,14 +80,7 @@ def _frame_pieces(variant: str | None) -> dict[str, Piece]:
 
 
 def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
-    """Time the pieces.
-
-    Parameters
-    ----------
-    variant : str, optional
-        Mitsuba variant.
-    rounds : int
-        How many times each is timed.
+    """Time the pieces, each in so many rounds.
 
     Returns
     -------

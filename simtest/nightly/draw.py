@@ -12,23 +12,10 @@ from simtest.validation.worst import save_worst, worst_cases
 
 
 def draw(judged: JudgedRun, profile: Profile, folder: Path, variant: str | None = None) -> JudgedRun:
-    """Write the page of a run and all that lies beside it.
+    """Write the page of a run and all that lies beside it into a folder, which is made.
 
-    Parameters
-    ----------
-    judged : JudgedRun
-        The run.
-    profile : Profile
-        What was run, for the worst cases.
-    folder : Path
-        Where; made. The worst cases' gallery items go into ``worst`` beside it.
-    variant : str, optional
-        Mitsuba variant.
-
-    Returns
-    -------
-    JudgedRun
-        The run with its gallery, and a note where there is none.
+    The worst cases' gallery items go into ``worst`` beside the folder. Returns the run with its gallery, and a note
+    where the worst cases could not be rendered.
     """
     judged = _with_worst_cases(judged, profile, folder.with_name("worst"), variant)
     folder.mkdir()

@@ -61,20 +61,7 @@ def versions_hash(versions: Mapping[str, str]) -> str:
 
 
 def append(folder: Path, rows: pl.DataFrame) -> Path:
-    """Write a run's rows into the history.
-
-    Parameters
-    ----------
-    folder : Path
-        The history; made if need be.
-    rows : polars.DataFrame
-        See `history_rows`.
-
-    Returns
-    -------
-    Path
-        The file: whole on disk, or not there at all.
-    """
+    """Write a run's rows (see `history_rows`) into the history; the file is whole on disk, or not there at all."""
     run_id, started, commit = rows.select("run_id", "started", "commit").row(0)
     partition = folder / f"date={started:%Y-%m-%d}" / f"commit={short_commit(commit)}"
     partition.mkdir(parents=True, exist_ok=True)

@@ -11,17 +11,7 @@ from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 
 
 def judge(run: NightlyRun, baseline: NightlyRun | None, reports: Reports) -> JudgedRun:
-    """Compare a run with its baseline, and read the history that it belongs to.
-
-    Parameters
-    ----------
-    run : NightlyRun
-        What was measured.
-    baseline : NightlyRun or None
-        The profile's, if there is one.
-    reports : Reports
-        The history's folder; nothing is written.
-    """
+    """Compare a run with its profile's baseline, if there is one, and read the history that it belongs to."""
     verdict = verdict_on(run, baseline)
     history, skipped = read_history(reports.history, run.record.profile, TREND_COLUMNS, TRENDS)
     late = clock_note(history, run.record.start)

@@ -8,12 +8,7 @@ from simtest.validation.error_ladder import RUNGS, error_ladder
 
 
 def ladder_figures(seed: int = 0) -> pl.DataFrame:
-    """Compute the error ladder (`simtest.validation.error_ladder`): seconds.
-
-    Parameters
-    ----------
-    seed : int
-        Of the noisy frames.
+    """Compute the error ladder (`simtest.validation.error_ladder`): seconds. The seed is that of the noisy frames.
 
     Returns
     -------
@@ -31,18 +26,7 @@ def ladder_figures(seed: int = 0) -> pl.DataFrame:
 
 
 def ladder_canary(figures: pl.DataFrame) -> pl.DataFrame:
-    """Return the canary that counts rungs without a result: of a closed form, every rung has one.
-
-    Parameters
-    ----------
-    figures : polars.DataFrame
-        See `ladder_figures`.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns `FIGURES`, kind "canary".
-    """
+    """Return the canary that counts rungs without a result: of a closed form, every rung has one."""
     without = figures.filter(pl.col("value").is_null())
     named = "; ".join(", ".join(names) for names in without.select("setting", "estimator", "quantity").iter_rows())
     about = f"rungs without an answer: {named}" if named else "each rung of a closed form has an answer"

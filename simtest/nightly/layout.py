@@ -20,13 +20,7 @@ _ENTRY, _OLD = ".lock", ".old"
 
 @dataclass(frozen=True)
 class Reports:
-    """Folders under ``--reports``.
-
-    Parameters
-    ----------
-    root : Path
-        Made if need be.
-    """
+    """Folders under ``--reports``, the `root`, which is made if need be."""
 
     root: Path
 
@@ -125,14 +119,9 @@ def exclusive_replacement(folder: Path) -> Iterator[None]:
 
 
 def replace_folder(new: Path, folder: Path) -> None:
-    """Replace a folder by a finished one, under `exclusive_replacement`: one of the two exists at any moment.
+    """Replace a folder, if any, by a finished one, under `exclusive_replacement`: at any moment one of them exists.
 
-    Parameters
-    ----------
-    new : Path
-        Whose files are on disk; on the same file system.
-    folder : Path
-        The folder that is replaced; may be missing.
+    Both are on the same file system, the new one's files on disk.
     """
     old = _old(folder)
     if folder.exists():

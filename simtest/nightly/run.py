@@ -17,17 +17,7 @@ from simtest.spec import Profile
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run that was measured, judged and published.
-
-    Parameters
-    ----------
-    judged : JudgedRun
-        The run.
-    folder : Path
-        Holds the page and the outputs for machines.
-    history_file : Path
-        The run's file in the history.
-    """
+    """A run that was measured, judged and published: page and outputs in `folder`, its file in the history."""
 
     judged: JudgedRun
     folder: Path

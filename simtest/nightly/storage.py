@@ -25,19 +25,10 @@ _OF_THE_DISK = {
 
 @contextlib.contextmanager
 def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
-    """Turn an error of the file system, also one that polars hands on, into a message of one line.
+    """Raise `SimtestError`, of one line, in place of an error of the disk, also one that polars hands on.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of the reports.
-    what, left : str
-        What could not be done, and what is left as it was.
-
-    Raises
-    ------
-    SimtestError
-        In place of an error of the disk; any other error is a fault, and stays what it is.
+    The line names the reports' `root`, what could not be done, and what is left as it was. Any other error is a fault,
+    and stays what it is.
     """
     try:
         yield
@@ -51,19 +42,7 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
 
 
 def save_run(folder: Path, run: NightlyRun, rows_file: str, columns: Sequence[str] | None = None) -> None:
-    """Write a run.
-
-    Parameters
-    ----------
-    folder : Path
-        Exists.
-    run : NightlyRun
-        The run.
-    rows_file : str
-        Name of the file of rows.
-    columns : sequence of str, optional
-        The rows' columns that are kept; default all.
-    """
+    """Write a run into an existing folder: run.json, the figures, and the rows, or some of their columns."""
     rows = run.rows if columns is None else run.rows.select(name for name in columns if name in run.rows.columns)
     tables = {rows_file: rows, FIGURES_FILE: run.figures}
     for name, table in tables.items():

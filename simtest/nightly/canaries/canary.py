@@ -11,22 +11,10 @@ from simtest.nightly.records import Cell, Figure, figure_table
 def canary(
     name: str, quantity: str, unit: str, value: float, high: float, low: float = 0.0, n: int = 1, about: str = ""
 ) -> Figure:
-    """Compare a measured value with its bounds.
+    """Compare a measured value with its bounds; NaN, where there was nothing to measure, does not pass.
 
-    Parameters
-    ----------
-    name, quantity : str
-        What is watched, and what of it was measured.
-    unit : str
-        Of the value.
-    value : float
-        NaN, where there was nothing to measure, does not pass.
-    high, low : float
-        The bounds.
-    n : int
-        How many numbers the value was made of.
-    about : str
-        What is right, and why the tolerance is what it is.
+    `name` is what is watched, `quantity` what of it was measured, `n` how many numbers the value was made of, and
+    `about` what is right, and why the tolerance is what it is.
     """
     return Figure(
         "canary", Cell(name), quantity, unit, value, low, high, n, passed=bool(low <= value <= high), about=about

@@ -27,15 +27,7 @@ SIGMA = 0.05
 
 
 def noises(variant: str | None = None, seed: int = 0) -> list[Figure]:
-    """Check the noise of some realisations' frames, rendered and of the published protocol.
-
-    Parameters
-    ----------
-    variant : str, optional
-        Mitsuba variant.
-    seed : int
-        Of the run.
-    """
+    """Check the noise of some realisations' frames, rendered and of the published protocol."""
     small = {"camera.width": 64, "camera.height": 64, "camera.fx": 100.0, "camera.fy": 100.0}
     groups = [
         {"scene": "plane", "isolated": False, "set": {**small, "sensor.noise_sigma": SIGMA}, "label": "rendered"},

@@ -88,15 +88,7 @@ def _margins(quantity: Quantity) -> list[tuple[float, float]]:
 
 
 def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
-    """Test pairs.
-
-    Parameters
-    ----------
-    sums : polars.DataFrame
-        See `simtest.nightly.gate.pairing_units.paired_sums`; of one quantity.
-    quantity : Quantity
-        Which.
-    """
+    """Test pairs, by their sums of one quantity; see `simtest.nightly.gate.pairing_units.paired_sums`."""
     s = {name: sums[name].to_numpy().astype(float) for name in sums.columns if name not in ("cell", "quantity")}
     units, rows = s["units"], s["rows"]
     baseline, difference = s["x"] / rows, s["d"] / rows
@@ -141,17 +133,8 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
 def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> Outcomes:
     """Test two runs of different seeds, versions or numbers of units by Welch's statistic.
 
-    Parameters
-    ----------
-    before, after : polars.DataFrame
-        See `simtest.nightly.gate.pairing_units.sums`; of one quantity, the same cells in the same order.
-    quantity : Quantity
-        Which.
-
-    Returns
-    -------
-    Outcomes
-        `within` is false: there are no pairs.
+    `before` and `after` are `simtest.nightly.gate.pairing_units.sums` of one quantity, of the same cells in the same
+    order. `within` of the outcomes is false: there are no pairs.
     """
     x, y = (_Arm.of(table, quantity.span) for table in (before, after))
     margin = margin_of(quantity, x.shown)

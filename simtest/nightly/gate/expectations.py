@@ -10,18 +10,7 @@ _VALUE, _BEFORE = pl.col("value"), pl.col("value_before")
 
 
 def canaries(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> pl.DataFrame:
-    """Compare canaries: worse where one is out of bounds, or missing tonight.
-
-    Parameters
-    ----------
-    tonight, baseline : polars.DataFrame
-        Figures of two runs; no baseline where there is none.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `COMPARISONS`; `low`, `high` are the canary's bounds.
-    """
+    """Compare canaries, with `low` and `high` as their bounds: worse where one is out of bounds, or missing tonight."""
     sound = pl.when(_VALUE == _BEFORE).then(pl.lit("same")).when(_BEFORE.is_not_null()).then(pl.lit("equivalent"))
     passed = pl.when("passed").then(sound.otherwise(pl.lit("new"))).otherwise(pl.lit("worse"))
     return _both(tonight, baseline, "canary").select(*_compared(), pl.col("low", "high"), outcome=passed)
@@ -32,19 +21,8 @@ def costs(
 ) -> pl.DataFrame:
     """Compare costs: worse where tonight's whole interval lies beyond the baseline's and the margin.
 
-    Parameters
-    ----------
-    tonight, baseline : polars.DataFrame
-        Figures of two runs; no baseline where there is none. A figure without an interval is its own interval.
-    limits : Limits
-        `memory` is the margin of quantities whose name holds "memory", `run_time` that of all others.
-    same_machine : bool
-        Whether both runs were made on the same processor; costs of different ones are shown and not judged.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `COMPARISONS`.
+    A figure without an interval is its own interval. Quantities whose name holds "memory" have the margin `memory` of
+    the limits, all others `run_time`. Costs of different processors are shown and not judged.
     """
     of_memory = pl.col("quantity").str.contains("memory", literal=True)
     share = pl.when(of_memory).then(pl.lit(limits.memory)).otherwise(pl.lit(limits.run_time))

@@ -101,18 +101,10 @@ def _share_interval(count: int, n: int) -> tuple[float, float]:
 
 
 def digest(rows: pl.DataFrame) -> str:
-    """Hash the results of a cell: equal for two runs exactly where all their numbers are the same bytes.
+    """Hash a cell's results, rows in any order: equal for two runs exactly where all numbers are the same bytes.
 
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        Of one cell, in any order.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal, over the rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the
-        numbers as float64, little-endian, and the status. A column that is absent counts as null.
+    SHA-256, hexadecimal, over the rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the numbers
+    as float64, little-endian, and the status. A column that is absent counts as null.
     """
     ordered = rows.sort(*DIGEST_KEYS, nulls_last=True)
     found = hashlib.sha256(f"{ordered.height} {DIGEST_KEYS} {DIGEST_NUMBERS}".encode())

@@ -13,18 +13,7 @@ def digests(figures: pl.DataFrame) -> pl.DataFrame:
 
 
 def missing_cells(baseline: pl.DataFrame, tonight: pl.DataFrame) -> pl.DataFrame:
-    """Compare the cells that one of two runs lacks, by `n`: worse where tonight lacks them, else new.
-
-    Parameters
-    ----------
-    baseline, tonight : polars.DataFrame
-        See `digests`.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `COMPARISONS`.
-    """
+    """Compare the cells that one of two runs lacks, by `n`: worse where tonight lacks them, else new; see `digests`."""
     zero, count = pl.lit(0.0), pl.col("highlights")
     gone = _only_in(baseline, tonight).select(
         *CELL, baseline=count, tonight=zero, difference=-count, margin=zero, outcome=pl.lit("worse")
@@ -40,21 +29,10 @@ def _only_in(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
 
 
 def lost_highlights(lost: pl.DataFrame, cells: pl.DataFrame, comparable: frozenset[int]) -> pl.DataFrame:
-    """Compare the cells that have lost highlights of the baseline, by `n`.
+    """Compare the cells that have lost highlights of the baseline, by `n`; see `simtest.nightly.gate.pairing.Pairing`.
 
-    Parameters
-    ----------
-    lost : polars.DataFrame
-        See `simtest.nightly.gate.pairing.Pairing`.
-    cells : polars.DataFrame
-        Names of the cells by their number, `cell`.
-    comparable : frozenset of int
-        Cells whose seeds mean the same in both runs; in others a loss is reported, and not judged.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `COMPARISONS`.
+    `cells` names the cells by their number. In `comparable` ones seeds mean the same in both runs; in others a loss is
+    reported, and not judged.
     """
     before, kept = pl.col("before").cast(pl.Float64), pl.col("kept").cast(pl.Float64)
     judged = pl.col("cell").is_in(list(comparable))

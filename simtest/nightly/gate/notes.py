@@ -17,13 +17,7 @@ def redefined(baseline: RunRecord, tonight: RunRecord) -> list[str]:
 
 
 def large_and_undecided(comparisons: pl.DataFrame) -> tuple[str, ...]:
-    """Report rises of single realisations that a reader must look at, though one number decides nothing.
-
-    Parameters
-    ----------
-    comparisons : polars.DataFrame
-        Columns `COMPARISONS`.
-    """
+    """Report rises of single realisations that a reader must look at, though one number decides nothing."""
     errors = pl.col("quantity").is_in(["mean_deg", "mean_penalised_deg"]) & (pl.col("setting") != POOLED)
     far = (pl.col("difference") > _FAR * pl.col("margin")) & (pl.col("difference") > _FAR_DEG)
     found = comparisons.filter(errors & far, pl.col("n") == 1, pl.col("outcome") == "undecided")
@@ -39,25 +33,10 @@ def large_and_undecided(comparisons: pl.DataFrame) -> tuple[str, ...]:
 def notes_on(
     baseline: NightlyRun, tonight: NightlyRun, bit_equal: bool, unmatched: int, short: int, limits: Limits
 ) -> tuple[str, ...]:
-    """Report in what two runs differ beside their numbers.
+    """Report in what two runs differ beside their numbers, in plain sentences.
 
-    Parameters
-    ----------
-    baseline, tonight : NightlyRun
-        The runs.
-    bit_equal : bool
-        Whether all results are the same bytes.
-    unmatched : int
-        Cells whose results differ and whose rows are no exact pairs.
-    short : int
-        Cells that have lost highlights of the baseline.
-    limits : Limits
-        `medians_deg`.
-
-    Returns
-    -------
-    tuple of str
-        Plain sentences.
+    `unmatched` counts the cells whose results differ and whose rows are no exact pairs, `short` those that have lost
+    highlights of the baseline.
     """
     before, after = baseline.record, tonight.record
     first, second = before.versions, after.versions

@@ -30,18 +30,7 @@ def paired_sums(values: pl.DataFrame) -> pl.DataFrame:
 
 
 def sums(values: pl.DataFrame) -> pl.DataFrame:
-    """Add up one run's values by unit, then over units.
-
-    Parameters
-    ----------
-    values : polars.DataFrame
-        `UNIT`, `value`.
-
-    Returns
-    -------
-    polars.DataFrame
-        As `paired_sums`, without d and with the largest value.
-    """
+    """Add up one run's values (`UNIT`, `value`) as `paired_sums` does, without d; `largest` is the largest value."""
     return _sums(values, (pl.col("value").alias("x"),), pl.col("value"))
 
 

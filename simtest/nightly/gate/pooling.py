@@ -22,13 +22,6 @@ MOST_SHARE = 2.0
 def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
     """Test many cells at once.
 
-    Parameters
-    ----------
-    found : Outcomes
-        Of the cells.
-    quantity : Quantity
-        Which.
-
     Returns
     -------
     Outcomes

@@ -113,9 +113,9 @@ def canaries(run: NightlyRun) -> Table:
 
 
 def results(run: NightlyRun, apart: bool = False) -> Table:
-    """Count results, failures, missed and false ones, and how often the 95 % region held the truth.
+    """Count results, failures, missed and false ones, and how often the 95 % region held the truth, by estimator.
 
-    A row for each estimator, in the report's order; `apart`, of each experiment.
+    Experiments are counted together, or `apart`.
     """
     true, ok, missed = pl.col("true_id").is_not_null(), pl.col("status") == "ok", pl.col("status") == "missed"
     # Enumerations sort in the order of their names.
