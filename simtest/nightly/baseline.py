@@ -51,16 +51,7 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
 
 
 def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
-    """Make a profile's last run its baseline.
-
-    Parameters
-    ----------
-    reports : Reports
-        The folders.
-    profile : str
-        Its name.
-    reason : str
-        Why its numbers are right, for those who read them later.
+    """Make a profile's last run its baseline, and store the reason why its numbers are right.
 
     Returns
     -------
@@ -84,6 +75,7 @@ def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
 def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
     reports.make()
+    # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
         if not source.is_dir():
             raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")

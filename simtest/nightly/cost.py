@@ -99,11 +99,13 @@ def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
         times = times_in_turns({"reference": reference_kernel(), **pieces}, rounds, time.process_time)
     finally:
         cv2.setNumThreads(threads)
+    # Ratios to the reference kernel, round by round
     reference = np.array(times["reference"])
     made = []
     for name in pieces:
         cell = _cell(name, HIGHLIGHT if name in of_highlight else FRAME)
         if name in idle:
+            # It would look fast.
             made.append(Figure("cost", cell, "run_time", "x", None, n=0, about=f"no answer: {idle[name]}"))
             continue
         low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))

@@ -67,6 +67,7 @@ def append(folder: Path, rows: pl.DataFrame) -> Path:
     partition.mkdir(parents=True, exist_ok=True)
     file = partition / f"{run_id}.parquet"
     write_atomically(file, lambda part: rows.write_parquet(part, compression="zstd"))
+    # The new names outlast a loss of power.
     for made in (partition, partition.parent, folder):
         sync_folder(made)
     return file
@@ -102,6 +103,7 @@ def read_history(
     # Reading waits for the disk more than it works.
     with ThreadPoolExecutor(4) as pool:
         read = list(pool.map(lambda file: _read(file, columns, quantities), files))
+    # Skip what cannot be used, and copies
     runs: dict[str, pl.DataFrame] = {}
     skipped = []
     for file, found in zip(files, read, strict=True):
@@ -144,6 +146,7 @@ def _read(file: Path, columns: Sequence[str], quantities: Sequence[str] | None) 
         found = pl.read_parquet(file, columns=wanted, hive_partitioning=False, memory_map=False)
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         return f"not a readable Parquet file: {_first_line(error)}"
+    # Columns that a later version added are null.
     try:
         found = found.select(
             (pl.col(name) if name in wanted else pl.lit(None)).cast(HISTORY[name]).alias(name) for name in columns

@@ -80,6 +80,7 @@ def remove_dead(reports: Reports) -> list[str]:
             else:
                 shutil.rmtree(folder, ignore_errors=True)
                 dead.append(folder.name)
+        # Half-written files of the history bear the name of their run.
         for part in reports.history.glob("date=*/commit=*/.*.part.parquet"):
             if not any(part.name.startswith(f".{name}.") for name in alive):
                 part.unlink(missing_ok=True)
@@ -110,6 +111,7 @@ def exclusive_replacement(folder: Path) -> Iterator[None]:
     """Lock the folder for replacement; first roll back an interrupted swap."""
     with _locked(folder.parent / f".{folder.name}.{LOCK}"):
         old = _old(folder)
+        # A kill between the two renames of `replace_folder` left the old folder aside.
         if old.is_dir():
             if folder.is_dir():
                 shutil.rmtree(old)
@@ -123,6 +125,7 @@ def replace_folder(new: Path, folder: Path) -> None:
 
     Both are on the same file system, the new one's files on disk.
     """
+    # Move the old folder aside, the new one in, then delete
     old = _old(folder)
     if folder.exists():
         folder.rename(old)

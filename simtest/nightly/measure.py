@@ -72,10 +72,6 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
     options : RunOptions
         How.
 
-    Returns
-    -------
-    NightlyRun
-
     Raises
     ------
     SimtestError

@@ -31,9 +31,6 @@ MEANINGS = {
 _ACCEPT = "simtest nightly accept --reason TEXT"
 
 
-# Names ----------------------------------------------------------------------------------------------------------------
-
-
 def cell_name(row: Mapping[str, str | None]) -> str:
     """Return the name of a cell: setting and estimator; the setting begins with its label."""
     return joined(row["setting"] or row["label"] or row["surface"], row["estimator"])
@@ -53,9 +50,6 @@ def short_commit(commit: str | None) -> str:
 def when(started: str) -> str:
     """Return a time as date and minute, UTC."""
     return f"{datetime.fromisoformat(started).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
-
-
-# Numbers --------------------------------------------------------------------------------------------------------------
 
 
 def plain(value: float | None, unit: str | None = None) -> str:
@@ -91,9 +85,6 @@ def bounds(low: float | None, high: float | None) -> str:
     if number(high) == "–":
         return "–" if number(low) == "–" else f"at least {number(low)}"
     return f"at most {number(high)}" if number(low) == "–" else interval(low, high)
-
-
-# Sentences ------------------------------------------------------------------------------------------------------------
 
 
 def headline(verdict: Verdict) -> str:

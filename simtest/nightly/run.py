@@ -27,24 +27,11 @@ class Outcome:
 def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAULTS) -> Outcome:
     """Run a profile, compare it with the baseline, keep it in the history and publish its page.
 
-    Parameters
-    ----------
-    profile : Profile
-        What to run.
-    reports : Reports
-        Folders of history, baseline and page; made if need be.
-    options : RunOptions
-        How.
-
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
     SimtestError
-        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What
-        was written by earlier runs is as it was.
+        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What was
+        written by earlier runs is as it was.
     """
     left = "what earlier nights wrote is as it was"
     with disk_errors_in_one_line(reports.root, "the night could not be written", left):

@@ -44,6 +44,7 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
 def save_run(folder: Path, run: NightlyRun, rows_file: str, columns: Sequence[str] | None = None) -> None:
     """Write a run into an existing folder: run.json, the figures, and the rows, or some of their columns."""
     rows = run.rows if columns is None else run.rows.select(name for name in columns if name in run.rows.columns)
+    # The record comes last: it holds the hashes of the tables.
     tables = {rows_file: rows, FIGURES_FILE: run.figures}
     for name, table in tables.items():
         write_atomically(folder / name, lambda part, table=table: _write(table, part))  # type: ignore[misc]
@@ -65,6 +66,7 @@ def load_run(folder: Path, rows_file: str) -> NightlyRun:
         If a file is missing, damaged, or not the one that was written; the message names it.
     """
     record, hashes = _record(folder / RUN_FILE)
+    # A table of another run has another hash.
     rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))
     check_columns(folder / FIGURES_FILE, figures, FIGURES)
     return NightlyRun(record, rows, figures.select(*FIGURES))

@@ -4,7 +4,7 @@
 written down anew that they compare with.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, partial
 
 import polars as pl
@@ -15,7 +15,6 @@ from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries.canary import or_failed_canary
 from simtest.nightly.records import Figure, figure_table
 from simtest.rendering import Session
-from simtest.spec import Experiment
 
 __all__ = ["run_canaries"]
 
@@ -23,28 +22,14 @@ ALONE = (geometry.sightlines, geometry.conditioning, geometry.pose, geometry.iso
 IN_SESSION = (rendered.photometry, rendered.truth, rendered.plane_errors, rendered.curved_errors, rendered.rotated)
 
 
-def run_canaries(
-    rows: pl.DataFrame | None = None, variant: str | None = None, seed: int = 0,
-    experiments: Sequence[Experiment] | None = None,
-) -> pl.DataFrame:  # fmt: skip
-    """Measure all canaries.
-
-    Parameters
-    ----------
-    rows : polars.DataFrame, optional
-        Results of the run's experiments, whose noise is checked too.
-    variant : str, optional
-        Mitsuba variant.
-    seed : int
-        Of the noise.
-    experiments : sequence of Experiment, optional
-        What the rows are of, and so whether they must be noisy.
+def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None) -> pl.DataFrame:
+    """Measure all canaries, of the noise of some results too, where there are any.
 
     Returns
     -------
     polars.DataFrame
-        Columns `simtest.nightly.records.FIGURES`, kind "canary". One that cannot be measured for an error has no
-        value, and has not passed; its `about` holds the error.
+        Columns `FIGURES`, kind "canary". One that an error stops has no value, and has not passed; its `about` holds
+        the error.
 
     Raises
     ------
@@ -58,9 +43,9 @@ def run_canaries(
 
     measured: dict[str, Callable[[], list[Figure]]] = {measure.__name__: measure for measure in ALONE}
     measured |= {measure.__name__: partial(_in, session, measure) for measure in IN_SESSION}
-    measured["noises"] = partial(noise.noises, variant, seed)
+    measured["noises"] = partial(noise.noises, variant)
     if rows is not None:
-        measured["noises_of"] = partial(noise.noises_of, rows, experiments)
+        measured["noises_of"] = partial(noise.noises_of, rows)
     # Without a backend there is no run; any other error fails its canary.
     return pl.concat(or_failed_canary(name, partial(_table, own), (BackendError,)) for name, own in measured.items())
 

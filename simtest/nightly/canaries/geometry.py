@@ -52,6 +52,7 @@ def conditioning() -> list[Figure]:
 def pose() -> list[Figure]:
     """Project a circle in space point by point, and compare its plane and its cone's axis with the true ones."""
     camera = Camera(640, 480, FX, FY, CX, CY)
+    # A circle of radius 1.5 mm about a point 12 mm away, and its picture
     normal = np.array([0.3, -0.5, -0.8]) / np.sqrt(0.98)
     first = np.array([0.8, 0.0, 0.3]) / np.sqrt(0.73)
     second = np.cross(normal, first)
@@ -59,13 +60,14 @@ def pose() -> list[Figure]:
     points = np.array([-1.5, 1.0, 12.0]) + 1.5 * (np.outer(np.cos(phase), first) + np.outer(np.sin(phase), second))
     x, y, z = points.T
     fitted = fit_ellipse(np.stack([FX * x / z + CX, FY * y / z + CY], axis=1))
+    # Its plane, and the axis of its cone, from the fitted conic
     off, outside = np.nan, np.nan
     if not isinstance(fitted, Failure):
         cone = backproject_conic(fitted, camera)
         found = circle_pose(cone)
         if not isinstance(found, Failure):
             off = min(_angle_deg(candidate, normal) for candidate in found.normals)
-        # The axis is an eigenvector of the cone that lies inside of it.
+        # The axis is the eigenvector of the cone that lies inside of it.
         axis = cone_axes(cone)[1][:, 2]
         along = float(axis @ cone @ axis)
         outside = float(np.abs(cone @ axis - along * axis).max())
@@ -87,6 +89,7 @@ def isophotes() -> list[Figure]:
     patch = Patch.cut(spot, (0, 0, 100, 90))
     radii, centres = [float("nan")], [float("nan")]
     if not isinstance(patch, Failure):
+        # The peak, then a contour at each isovalue
         centres = [float(np.abs(patch.peak_px - CENTRE_PX).max())]
         radii = []
         for isovalue in (0.3, 0.5, 0.7):

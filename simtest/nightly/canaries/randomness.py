@@ -39,9 +39,11 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Figure]:
     scene = scene_from_dict(case.data, "canary")
     seen = view(Session(scene, variant), scene)
     frames = [seen.frame(case.noise_seed(experiment, number)) for number in case.numbers()]
+    # The published protocol
     pipeline = Pipeline(PaperSetting(size=64, sigma=SIGMA), {})
     generators = [from_integer(published.noise_seed(experiment, number)) for number in published.numbers()]
     pictures = [pipeline.stages(rng).noisy for rng in generators]
+    # The noise that the rendered frames have beside their light
     clean = seen.light / np.float32(seen.full_scale)
     left = np.std([frame - clean for frame in frames])
     count = len(frames) * clean.size
@@ -88,10 +90,11 @@ def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = Non
     lost = _without_noise(rows, experiments)
     setting = ("experiment", "setting")
     noisy = rows.filter(pl.col("noise_sigma") > 0)
+    # Repeated seeds
     frames = noisy.select(*setting, "realisation", "seed").unique()
     seeds = frames.group_by(setting).agg(repeated=pl.len() - pl.col("seed").n_unique())["repeated"].sum()
+    # Repeated results: three numbers of white noise are not equal by chance, it is the same noise.
     results = noisy.filter(pl.col("status") == "ok", pl.col("true_id").is_not_null(), pl.col("specularity") == 0)
-    # Three numbers of white noise are not equal by chance: it is the same noise.
     normals = pl.struct("normal_x", "normal_y", "normal_z")
     same = results.group_by(*setting, "estimator").agg(repeated=pl.len() - normals.n_unique())["repeated"].sum()
     # Without results there are no repeated ones, which proves nothing.

@@ -72,6 +72,7 @@ def truth(session: Session) -> list[Figure]:
     turned = by_hand.angle_deg(maps.normal[maps.mask], normal).max()
     points = by_hand.plane_points(normal, DISTANCE_MM)
     moved = np.abs(maps.position[maps.mask] - points[maps.mask]).max()
+    # Its one highlight
     (highlight,) = session.highlights(session.radiance()) or (None,)
     expected = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
     gap = np.nan if highlight is None else float(np.abs(highlight.position - expected).max())
@@ -89,6 +90,7 @@ def plane_errors(session: Session) -> list[Figure]:
     made = _realised(session, described(PLANE))
     normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     canaries = _errors("plane", made, normal)
+    # The light beside the camera
     offset = _realised(session, described(PLANE, LIGHT_MM))
     point = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
     half = float(by_hand.angle_deg(-point, np.array(LIGHT_MM) - point)) / 2
@@ -110,6 +112,7 @@ def curved_errors(session: Session) -> list[Figure]:
     turned = float(by_hand.angle_deg(normal, -point))
     about = "the true normal at the highlight against the reversed sightline"
     canaries.append(canary("cylinder", "truth_off", "deg", turned, 1e-5, about=about))
+    # Isophotes of a cylinder as wide as it is far are ellipses of axis ratio 1/2.
     estimate = _estimate(made, "cone_axis")
     ratio = np.nan if estimate is None or estimate.axis_ratio is None else estimate.axis_ratio / 0.5
     about = "abs(1 + d k) of 1 and 2 make 0.5; smoothing, falloff and finite isovalues leave 1 %"

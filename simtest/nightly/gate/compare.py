@@ -25,19 +25,10 @@ outcome that is set already stands."""
 
 
 def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = DEFAULTS) -> Verdict:
-    """Compare a run with the baseline.
+    """Compare a run with the baseline, if there is one; canaries are judged all the same.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
     are the same, with all tests as one family (docs/gate.md).
-
-    Parameters
-    ----------
-    tonight : NightlyRun
-        The run.
-    baseline : NightlyRun or None
-        What it is compared with; None where there is none: canaries are judged all the same.
-    limits : Limits
-        Level and margins.
 
     Returns
     -------

@@ -182,6 +182,7 @@ class _Arm:
             x, xx, nn, xn = x + most, xx + most**2, nn + 2 * size**2, xn + most * size
             rows, units = rows + 2 * size, units + 2
         mean = x / rows
+        # Of the units' residuals about the mean
         with np.errstate(divide="ignore", invalid="ignore"):
             squares = np.maximum(xx - 2 * mean * xn + mean**2 * nn, 0.0)
             # A constant's squares cancel to rounding.

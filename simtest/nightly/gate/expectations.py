@@ -11,6 +11,7 @@ _VALUE, _BEFORE = pl.col("value"), pl.col("value_before")
 
 def canaries(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> pl.DataFrame:
     """Compare canaries, with `low` and `high` as their bounds: worse where one is out of bounds, or missing tonight."""
+    # A passed canary is compared with the baseline's value.
     sound = pl.when(_VALUE == _BEFORE).then(pl.lit("same")).when(_BEFORE.is_not_null()).then(pl.lit("equivalent"))
     passed = pl.when("passed").then(sound.otherwise(pl.lit("new"))).otherwise(pl.lit("worse"))
     return _both(tonight, baseline, "canary").select(*_compared(), pl.col("low", "high"), outcome=passed)
@@ -24,10 +25,12 @@ def costs(
     A figure without an interval is its own interval. Quantities whose name holds "memory" have the margin `memory` of
     the limits, all others `run_time`. Costs of different processors are shown and not judged.
     """
+    # Margins and intervals
     of_memory = pl.col("quantity").str.contains("memory", literal=True)
     share = pl.when(of_memory).then(pl.lit(limits.memory)).otherwise(pl.lit(limits.run_time))
     low, high = pl.coalesce("low", "value"), pl.coalesce("high", "value")
     low_before, high_before = pl.coalesce("low_before", _BEFORE), pl.coalesce("high_before", _BEFORE)
+    # The first that holds
     outcome = (
         pl.when(_BEFORE.is_null()).then(pl.lit("new"))
         .when(_VALUE.is_null()).then(pl.lit("gone"))

@@ -15,6 +15,7 @@ def digests(figures: pl.DataFrame) -> pl.DataFrame:
 def missing_cells(baseline: pl.DataFrame, tonight: pl.DataFrame) -> pl.DataFrame:
     """Compare the cells that one of two runs lacks, by `n`: worse where tonight lacks them, else new; see `digests`."""
     zero, count = pl.lit(0.0), pl.col("highlights")
+    # What vanishes is a regression until it is accepted; what is new is not.
     gone = _only_in(baseline, tonight).select(
         *CELL, baseline=count, tonight=zero, difference=-count, margin=zero, outcome=pl.lit("worse")
     )

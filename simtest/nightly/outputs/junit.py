@@ -29,6 +29,7 @@ def junit(judged: JudgedRun) -> str:
     A cell fails where one of its figures is worse, and is skipped where there is nothing to compare it with.
     """
     record = judged.run.record
+    # A suite an experiment, then the canaries
     suites: dict[str, list[_Case]] = {}
     for case in (*_cells(judged), *_canaries(judged)):
         suites.setdefault(f"{record.profile}.{case.suite}", []).append(case)
@@ -60,6 +61,7 @@ def _suite(name: str, cases: list[_Case], started: str) -> ET.Element:
 
 def _cells(judged: JudgedRun) -> Iterator[_Case]:
     """Yield a case for each cell, costs included: those that were measured, then those of the baseline alone."""
+    # Cells by name; those that the baseline alone has are among the compared ones only.
     measured = judged.run.figures.filter(pl.col("kind") != "canary").select(CELL)
     compared = dict(iter(judged.comparisons.group_by(CELL, maintain_order=True)))
     for cell in dict.fromkeys((*measured.iter_rows(), *compared)):

@@ -32,6 +32,7 @@ def summary(judged: JudgedRun) -> str:
         f"{_safe(record.processor)}; run `{_safe(record.id)}`",
     ]
     text = "\n\n".join(parts) + "\n"
+    # A cut table is still readable, a comment that GitHub refuses is not.
     if len(text) > MAX_CHARACTERS:
         end = "\n\n(cut; the page has the rest)\n"
         text = text[: MAX_CHARACTERS - len(end)] + end

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
@@ -21,12 +20,12 @@ from simtest.runtime.files import write_atomically
 
 
 def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = ()) -> Path:
-    """Write the page of a run.
+    """Write the page of a run into a folder, which is made if need be.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Made if need be.
+        Gets index.html, and the worst cases as ``figures/*.png``; those of an earlier page go.
     judged : JudgedRun
         The run. Its history may hold runs of any profile, and lack the run's own.
     files : sequence of str
@@ -35,7 +34,7 @@ def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = (
     Returns
     -------
     pathlib.Path
-        ``folder/index.html``. Beside it, ``folder/figures/*.png`` hold the worst cases, those of an earlier page go.
+        The page.
     """
     folder = Path(folder)
     figures = folder / "figures"
@@ -74,7 +73,9 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         counts=phrases.counts(verdict),
         compared=tables.comparisons(verdict),
         canaries=tables.canaries(run),
-        trends=None if past is None else _trends_section(past, verdict, colours),
+        trends=past,
+        trend_data=None if past is None else Markup(_trend_script(past, verdict, colours)),
+        newest=NEWEST,
         groups=groups,
         ladder=steps,
         ladder_marks=[] if steps is None else marks_of(steps),
@@ -104,20 +105,13 @@ def _estimators(judged: JudgedRun, items: Iterable[GalleryItem], past: Trends | 
     return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
 
 
-def _trends_section(past: Trends, verdict: Verdict, colours: dict[str, str]) -> dict[str, Any]:
-    """Return what the template and the page's script need of the trends."""
-    from markupsafe import Markup
-
-    # The trends open with the first regression, if there is one.
+def _trend_script(past: Trends, verdict: Verdict, colours: dict[str, str]) -> str:
+    """Return what the page's script needs of the trends, as JSON; they open with the first regression, if any."""
     names = ("experiment", "quantity", "setting")
-    start = next(verdict.regressions.select(names).iter_rows(named=True), dict.fromkeys(names))
     data = past.data | {
         "colours": [colours[name] for name in past.data["names"]["estimator"]],
-        "start": start,
+        "start": next(verdict.regressions.select(names).iter_rows(named=True), dict.fromkeys(names)),
         "baseline": None if verdict.baseline is None else verdict.baseline.started,
         "median": MEDIAN,
     }
-    return {
-        "nights": past.nights, "points": past.points, "thinned": past.nights > past.points, "newest": NEWEST,
-        "left_out": past.left_out, "data": Markup(script_json(data)),
-    }  # fmt: skip
+    return script_json(data)

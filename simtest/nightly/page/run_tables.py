@@ -57,6 +57,7 @@ class Comparisons(NamedTuple):
 
 def comparisons(verdict: Verdict, most: int = MOST_ROWS) -> Comparisons:
     """Return the table of a verdict's comparisons, of so many rows at most."""
+    # By outcome, then by size in margins
     rank = pl.col("outcome").replace_strict({name: i for i, name in enumerate(MEANINGS)}, default=-1)
     size = (pl.col("difference").abs() / pl.col("margin")).fill_nan(None)
     names = pl.col("experiment", "setting", "estimator", "quantity", "method").replace("", None).fill_null("–")
@@ -122,6 +123,7 @@ def results(run: NightlyRun, apart: bool = False) -> Table:
     by = [pl.col("estimator").cast(pl.Enum(estimator_order(run.rows["estimator"])))]
     if apart:
         by.insert(0, pl.col("experiment").cast(pl.Enum(run.rows["experiment"].unique(maintain_order=True))))
+    # Squared Mahalanobis distances of stated regions
     held = pl.col("mahalanobis2").filter(ok & true).drop_nulls()
     counts = run.rows.group_by(by).agg(
         true=true.sum(), ok=(ok & true).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
@@ -178,6 +180,7 @@ def provenance(judged: JudgedRun) -> Table:
     records = {"=tonight": judged.run.record, "=baseline": judged.verdict.baseline}
     texts = {head: flattened(record.to_json()) for head, record in records.items() if record is not None}
     entries = []
+    # In the order of tonight's record, then of what the baseline's has beside it
     for name in dict.fromkeys(name for own in texts.values() for name in own):
         values = [own.get(name, "–") for own in texts.values()]
         mark = "≠ " if len(set(values)) > 1 else ""
