@@ -32,26 +32,12 @@ _LOOK_S = 0.5
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is made.
+    """How a run is made; its rows depend neither on the engine nor on the workers."""
 
-    Parameters
-    ----------
-    command : str
-        How the run was called, for its record.
-    variant : str, optional
-        Mitsuba variant.
-    engine : Engine, optional
-        Who does the work; default `workers` processes of this machine.
-    workers : int
-        How many work at once. The rows depend neither on them nor on the engine.
-    progress : callable, optional
-        See `simtest.validation.runner.Progress`.
-    """
-
-    command: str = ""
-    variant: str | None = None
-    engine: Engine | None = None
-    workers: int = 1
+    command: str = ""  # how it was called, for its record
+    variant: str | None = None  # of Mitsuba
+    engine: Engine | None = None  # does the work; default `workers` processes of this machine
+    workers: int = 1  # how many work at once
     progress: Progress | None = None
 
 

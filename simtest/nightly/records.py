@@ -131,21 +131,11 @@ class RunRecord(BaseModel):
 
 @dataclass(frozen=True)
 class NightlyRun:
-    """What one run of a profile measured.
+    """What one run of a profile measured."""
 
-    Parameters
-    ----------
-    record : RunRecord
-        When and where it was made.
-    rows : polars.DataFrame
-        Results of all experiments, the columns of `simtest.validation.metrics.SCHEMA`.
-    figures : polars.DataFrame
-        Columns `FIGURES`.
-    """
-
-    record: RunRecord
-    rows: pl.DataFrame
-    figures: pl.DataFrame
+    record: RunRecord  # when, where and of what it was made
+    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.metrics.SCHEMA`
+    figures: pl.DataFrame  # columns `FIGURES`
 
     def figures_of(self, kind: str) -> pl.DataFrame:
         """Return the figures of a kind."""
@@ -159,26 +149,12 @@ class NightlyRun:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the gate says of a run.
+    """What the gate says of a run."""
 
-    Parameters
-    ----------
-    state : str
-        "fine", "regression" or "no baseline".
-    bit_equal : bool or None
-        Whether all rows of run and baseline are the same bytes; None without a baseline.
-    comparisons : polars.DataFrame
-        Columns `COMPARISONS`.
-    notes : tuple of str
-        What a reader must know: versions that differ, pairs that are missing, contours that changed topology.
-    baseline : RunRecord or None
-        The baseline's record.
-    """
-
-    state: str
-    bit_equal: bool | None
-    comparisons: pl.DataFrame
-    notes: tuple[str, ...]
+    state: str  # "fine", "regression" or "no baseline"
+    bit_equal: bool | None  # whether all rows of run and baseline are the same bytes; None without a baseline
+    comparisons: pl.DataFrame  # columns `COMPARISONS`
+    notes: tuple[str, ...]  # versions that differ, pairs that are missing, contours that changed topology
     baseline: RunRecord | None
 
     @property
@@ -199,24 +175,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class JudgedRun:
-    """A run with its verdict and history: all that page and outputs are made of.
-
-    Parameters
-    ----------
-    run : NightlyRun
-        What was measured.
-    verdict : Verdict
-        What the gate says of it.
-    history : polars.DataFrame
-        Columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them.
-    gallery : tuple of Path
-        Gallery items (.npz) of the worst cases, the worst first (see `simtest.validation.worst`).
-    """
+    """A run with its verdict and history: all that page and outputs are made of."""
 
     run: NightlyRun
     verdict: Verdict
-    history: pl.DataFrame
-    gallery: tuple[Path, ...] = ()
+    history: pl.DataFrame  # columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them
+    gallery: tuple[Path, ...] = ()  # items of the worst cases, the worst first (see `simtest.validation.worst`)
 
     @property
     def comparisons(self) -> pl.DataFrame:

@@ -30,8 +30,8 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
     Raises
     ------
     SimtestError
-        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What was
-        written by earlier runs is as it was.
+        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What
+        earlier runs wrote is as it was.
     """
     left = "what earlier nights wrote is as it was"
     with disk_errors_in_one_line(reports.root, "the night could not be written", left):

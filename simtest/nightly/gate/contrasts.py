@@ -20,38 +20,20 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Results of the tests of one quantity in N cells, in its harm; NaN where a test cannot be made.
+    """Results of the tests of one quantity in N cells, in its harm, shape (N,); NaN where a test cannot be made."""
 
-    Parameters
-    ----------
-    n : ndarray of int, shape (N,)
-        Units; of the smaller run where they are not paired.
-    baseline, tonight : ndarray, shape (N,)
-        Means.
-    difference, low, high : ndarray, shape (N,)
-        Tonight less the baseline, and its 95 % interval.
-    margin : ndarray, shape (N,)
-        Harmless size of the difference.
-    worse, better : ndarray, shape (N,)
-        p-values of "no worse than by the margin" and of "no better".
-    within : ndarray of bool, shape (N,)
-        Whether no pair differs by more than the margin.
-    deviation, freedom : ndarray, shape (N,)
-        Standard error of the difference and its degrees of freedom, 0 where there is none.
-    """
-
-    n: npt.NDArray[np.int64]
-    baseline: Array
+    n: npt.NDArray[np.int64]  # units; of the smaller run where they are not paired
+    baseline: Array  # mean
     tonight: Array
-    difference: Array
-    low: Array
+    difference: Array  # tonight less the baseline
+    low: Array  # its 95 % interval
     high: Array
-    margin: Array
-    worse: Array
-    better: Array
-    within: npt.NDArray[np.bool_]
-    deviation: Array
-    freedom: Array
+    margin: Array  # its harmless size
+    worse: Array  # p-value of "no worse than by the margin"
+    better: Array  # p-value of "no better than by the margin"
+    within: npt.NDArray[np.bool_]  # whether no pair differs by more than the margin
+    deviation: Array  # standard error of the difference
+    freedom: Array  # its degrees of freedom; 0 where there is no standard error
 
     def __getitem__(self, cells: slice | list[int]) -> "Outcomes":
         return Outcomes(**{name: values[cells] for name, values in vars(self).items()})

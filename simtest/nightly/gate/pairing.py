@@ -11,20 +11,10 @@ _FALSE = pl.col("quantity") == "false"
 
 
 class Pairing(NamedTuple):
-    """Cells whose rows of two runs are pairs, and what other cells have lost.
+    """Cells whose frames have the same seeds in two runs."""
 
-    Parameters
-    ----------
-    cells : frozenset of int
-        Cells whose frames have the same seeds, and all of whose true highlights tonight are in the baseline, once: the
-        rows of both runs are compared pair by pair.
-    lost : polars.DataFrame
-        `cell`, `before` (true highlights of the baseline), `kept` (those of them that tonight has): cells whose frames
-        have the same seeds, and that lack some of the baseline's true highlights tonight.
-    """
-
-    cells: frozenset[int]
-    lost: pl.DataFrame
+    cells: frozenset[int]  # all true highlights tonight are in the baseline, once: rows are compared pair by pair
+    lost: pl.DataFrame  # `cell`, `before` (true highlights of the baseline), `kept`: where tonight lacks some of them
 
 
 def pairing(before: pl.DataFrame, after: pl.DataFrame) -> Pairing:

@@ -28,26 +28,15 @@ PENALISED = "mean_penalised_deg"
 class Quantity:
     """A compared quantity.
 
-    Parameters
-    ----------
-    unit : str
-        Of the figure.
-    relative : float
-        Margin as a share of the baseline.
-    absolute : float
-        Margin in the unit; the larger of the two counts.
-    span : float
-        Most less least harm of a row, where most rows have one of both: two invented units then keep small samples,
-        which may all be alike by chance, from showing no variance. 0 where rows differ by nature.
-    falls : bool
-        Whether the figure shown is 1 less the harm: coverage is worse where it falls.
+    `span` is the most less the least harm of a row, where most rows have one of both: two invented units then keep
+    small samples, which may all be alike by chance, from showing no variance. It is 0 where rows differ by nature.
     """
 
     unit: str
-    relative: float
-    absolute: float
+    relative: float  # margin as a share of the baseline
+    absolute: float  # margin in the unit; the larger of the two counts
     span: float = 0.0
-    falls: bool = False
+    falls: bool = False  # whether the figure shown is 1 less the harm: coverage is worse where it falls
 
     @property
     def scale_floor(self) -> float:

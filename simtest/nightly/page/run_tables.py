@@ -15,28 +15,13 @@ MOST_ROWS = 800
 
 
 class Entry(NamedTuple):
-    """An entry of a table.
-
-    Parameters
-    ----------
-    text : str or int
-        What is shown.
-    css : str
-        Classes: "text" is aligned left, "wrap" and "wrap-short" may be broken, "code" is monospaced, "trend" a link to
-        its trend, "estimator" has its colour.
-    value : float, optional
-        Sorts the entry in the place of its text.
-    head : bool
-        Whether it names its row.
-    sign : str
-        Outcome whose sign and colour the text has.
-    """
+    """An entry of a table."""
 
     text: str | int
-    css: str = ""
-    value: float | None = None
-    head: bool = False
-    sign: str = ""
+    css: str = ""  # "text": aligned left; "wrap": may be broken; "trend": a link to it; "estimator": with its colour
+    value: float | None = None  # sorts the entry in the place of its text
+    head: bool = False  # whether it names its row
+    sign: str = ""  # outcome whose sign and colour the text has
 
 
 class Table(NamedTuple):
