@@ -20,11 +20,11 @@ MARKS = {"fine": "✓", "regression": "✗", "no baseline": "○"}
 MEANINGS = {
     "worse": "beyond the margin, at the corrected level: a regression",
     "better": "beyond the margin the other way",
-    "gone": "the baseline has it, tonight has not",
-    "new": "tonight has it, the baseline has not",
-    "undecided": "neither a change nor its absence is shown",
+    "gone": "in the baseline, but not tonight",
+    "new": "tonight, but not in the baseline",
+    "undecided": "neither a change nor equivalence is shown",
     "equivalent": "the interval lies within the margin",
-    "same": "the same bytes",
+    "same": "identical bytes",
 }
 """Meanings of the outcomes, those first that a reader looks for first."""
 
@@ -122,7 +122,7 @@ def verdict_lines(judged: JudgedRun) -> list[tuple[str, str]]:
     """Return the verdict's further lines as (name, text)."""
     equal = {
         None: "not known without a baseline",
-        True: "yes: all rows are the same bytes as the baseline's",
+        True: "yes: all rows are identical to the baseline's, byte by byte",
         False: "no: some rows differ from the baseline's",
     }[judged.verdict.bit_equal]
     made = [("Bit-equal", equal), ("Baseline", _baseline(judged.verdict.baseline))]
@@ -134,7 +134,7 @@ def verdict_lines(judged: JudgedRun) -> list[tuple[str, str]]:
 
 def _baseline(record: RunRecord | None) -> str:
     if record is None:
-        return f"none; `{_ACCEPT}` makes this night the baseline"
+        return f"none; `{_ACCEPT}` makes this run the baseline"
     text = f"{when(record.started)}, commit {short_commit(record.commit)}"
     return f"{text}: {record.reason}" if record.reason else text
 

@@ -190,7 +190,7 @@ def test_without_exact_pairs_the_test_is_unpaired(cause):
     verdict = compare(night(other, **run), night(table))
     assert set(verdict.comparisons["method"]) == {"unpaired"}
     assert verdict.state == "fine"
-    told = "Versions changed from numpy 2.4 to numpy 2.5" if cause == "versions" else "of 1 cells are not those"
+    told = "Versions changed from numpy 2.4 to numpy 2.5" if cause == "versions" else "of 1 cells differ from"
     assert told in verdict.notes[0]
     worse = compare(night(raised(other, 3.0), **run), night(table))
     assert one(worse, "mean_deg")["outcome"] == "worse"
@@ -213,7 +213,7 @@ def test_another_definition_of_an_experiment_unpairs_its_cells():
         verdict.comparisons.filter(quantity="mean_deg", label="l").select("experiment", "method").iter_rows()
     )
     assert methods == {"e": "unpaired", "f": "paired"}
-    assert verdict.notes[0] == "The definition changed of e: their cells were compared unpaired."
+    assert verdict.notes[0] == "The definition of e changed: their cells were compared unpaired."
     # The same bytes all the same: it is said.
     same = compare(night(table, definitions=other), night(table, definitions=known))
     assert (same.bit_equal, len(same.notes)) == (True, 1)

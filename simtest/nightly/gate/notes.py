@@ -51,11 +51,10 @@ def notes_on(
         if getattr(before, key) and getattr(after, key):
             made.append(_changed(f"The {key}", getattr(before, key), getattr(after, key)))
     if names := redefined(before, after):
-        made.append(f"The definition changed of {', '.join(names)}: their cells were compared unpaired.")
+        made.append(f"The definition of {', '.join(names)} changed: their cells were compared unpaired.")
     if unmatched:
         made.append(
-            f"Seeds, or the rows, of {unmatched} cells are not those of the baseline: these cells were compared "
-            "unpaired."
+            f"Seeds or rows of {unmatched} cells differ from the baseline's: these cells were compared unpaired."
         )
     if short:
         made.append(f"In {short} cells highlights of the baseline are missing tonight, in frames of the same seeds.")
