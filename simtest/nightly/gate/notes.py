@@ -53,9 +53,7 @@ def notes_on(
     if names := redefined(before, after):
         made.append(f"The definition of {', '.join(names)} changed: their cells were compared unpaired.")
     if unmatched:
-        made.append(
-            f"Seeds or rows of {unmatched} cells differ from the baseline's: these cells were compared unpaired."
-        )
+        made.append(f"Seeds or rows of {unmatched} cells differ from the baseline's: these were compared unpaired.")
     if short:
         made.append(f"In {short} cells highlights of the baseline are missing tonight, in frames of the same seeds.")
     if not bit_equal:
