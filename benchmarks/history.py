@@ -1,13 +1,12 @@
-"""The nightly's page over a history of 1,000 nights, generated from a real night with noise; some 2 minutes.
+"""The nightly's page over a history of 1,000 nights, generated from a real run with noise; some 2 minutes.
 
 `python -m benchmarks.history DIR [PROFILE]` writes such reports to look at.
 """
 
-import shutil
 import sys
 import tempfile
 import time
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +14,20 @@ import polars as pl
 
 from benchmarks.measuring import Figure
 from simtest.nightly.baseline import accept
-from simtest.nightly.gate.records import PLACE, Night, Verdict
 from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
+from simtest.nightly.judge import verdict_on
 from simtest.nightly.layout import Reports
-from simtest.nightly.run import judge, publish, run_nightly
-from simtest.spec import load_profile
+from simtest.nightly.measure import RunOptions
+from simtest.nightly.page import write_nightly_page
+from simtest.nightly.records import COMPARISONS, JudgedRun, NightlyRun, Verdict
+from simtest.nightly.run import run_nightly
+from simtest.spec import Profile, load_profile
 
 NIGHTS = 1000
 LIMIT_S = 20.0
 
 NOISE = 0.03
-"""Relative standard deviation of a figure from night to night."""
+"""Relative standard deviation of a figure from run to run."""
 
 STEP, STEPS = 0.05, 6
 """Relative standard deviation of lasting changes of one estimator's figures, and about how many there are."""
@@ -35,19 +37,15 @@ def figures() -> list[Figure]:
     """Generate, and time reading the history and writing the page."""
     with tempfile.TemporaryDirectory() as scratch:
         reports = Reports(Path(scratch))
-        outcome = run_nightly(load_profile("quick"), reports, workers=2)
-        accept(reports, "quick", "first night")
-        generate(reports, outcome.night, NIGHTS)
+        run = _with_history(reports, load_profile("quick"))
         start = time.perf_counter()
         history, _ = read_history(reports.history, "quick", TREND_COLUMNS, TRENDS)
         read_s = time.perf_counter() - start
-        verdict = judge(outcome.night, outcome.night)
-        folder = reports.work / "page"
-        folder.mkdir()
+        judged = JudgedRun(run, verdict_on(run, run), history)
         start = time.perf_counter()
-        target = publish(reports, folder, outcome.night, verdict, history)
+        page = write_nightly_page(reports.work / "page", judged)
         page_s = time.perf_counter() - start
-        size = (target / "index.html").stat().st_size / 1e6
+        size = page.stat().st_size / 1e6
     about = f"{history.height} figures of {history['run_id'].n_unique()} nights"
     return [
         Figure(f"reading a history of {NIGHTS} nights", read_s, unit="s", about=about),
@@ -56,23 +54,30 @@ def figures() -> list[Figure]:
     ]
 
 
-def generate(reports: Reports, night: Night, nights: int = NIGHTS, seed: int = 0) -> None:
-    """Write a history of nights before a real one, a night a day, its figures disturbed.
+def _with_history(reports: Reports, profile: Profile) -> NightlyRun:
+    """Make a run, accept it, and put a history before it."""
+    run = run_nightly(profile, reports, RunOptions(workers=2)).judged.run
+    accept(reports, profile.name, "first night")
+    generate(reports, run)
+    return run
+
+
+def generate(reports: Reports, run: NightlyRun, nights: int = NIGHTS, seed: int = 0) -> None:
+    """Write a history before a real run, a run a night, its figures disturbed.
 
     Parameters
     ----------
     reports : Reports
-        Where the history lies.
-    night : Night
-        The real night.
+        Folders of the reports.
+    run : NightlyRun
+        The real run.
     nights : int
         How many.
     seed : int
         Of the noise.
     """
     rng = np.random.default_rng(seed)
-    last = datetime.fromisoformat(night.run["started"]).astimezone(UTC)
-    estimators = night.figures["estimator"].unique().drop_nulls().sort().to_list()
+    estimators = run.figures["estimator"].unique().drop_nulls().sort().to_list()
     level = dict.fromkeys(estimators, 1.0)
     commit = f"{rng.integers(2**48):012x}"
     for number in range(nights):
@@ -82,34 +87,28 @@ def generate(reports: Reports, night: Night, nights: int = NIGHTS, seed: int = 0
         worse = changed and rng.random() < STEPS / (0.3 * nights)
         if worse:
             level[str(rng.choice(estimators))] *= float(np.exp(rng.normal(0, STEP)))
-        started = last - timedelta(days=nights - number, minutes=float(rng.uniform(0, 30)))
-        run = night.run | {
+        started = run.record.start - timedelta(days=nights - number, minutes=float(rng.uniform(0, 30)))
+        values = {
             "id": f"{started:%Y%m%dT%H%M%SZ}-{number}-{rng.integers(2**32):08x}",
             "started": started.isoformat(timespec="seconds"),
             "commit": commit,
-            "duration_s": float(night.run["duration_s"] * rng.lognormal(0, 0.1)),
+            "duration_s": float((run.record.duration_s or 0.0) * rng.lognormal(0, 0.1)),
         }
-        factors = rng.lognormal(0, NOISE, night.figures.height)
-        noisy = night.figures.with_columns(
+        factors = rng.lognormal(0, NOISE, run.figures.height)
+        noisy = run.figures.with_columns(
             pl.col("value", "low", "high") * pl.Series(factors) * pl.col("estimator").replace_strict(level, default=1.0)
         )
-        empty = pl.DataFrame(schema=dict.fromkeys(PLACE, pl.String()))
-        verdict = Verdict("regression" if worse else "fine", not changed, empty, (), None)
-        append(reports.history, history_rows(Night(run, night.rows, noisy), verdict))
+        verdict = Verdict("regression" if worse else "fine", not changed, pl.DataFrame(schema=COMPARISONS), (), None)
+        disturbed = NightlyRun(run.record.model_copy(update=values), run.rows, noisy)
+        append(reports.history, history_rows(disturbed, verdict))
 
 
 def _main(folder: str, profile: str = "quick") -> None:
-    """Run a night in a folder and put a history before it, then the page again."""
+    """Make a run with a history in a folder, then its page again."""
     reports, described = Reports(Path(folder)), load_profile(profile)
-    outcome = run_nightly(described, reports, workers=2)
-    accept(reports, described.name, "first night")
-    generate(reports, outcome.night)
+    run = _with_history(reports, described)
     history, _ = read_history(reports.history, described.name, TREND_COLUMNS, TRENDS)
-    scratch = reports.work / "page"
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    verdict = judge(outcome.night, outcome.night)
-    print(publish(reports, scratch, outcome.night, verdict, history) / "index.html")
+    print(write_nightly_page(reports.latest(described.name), JudgedRun(run, verdict_on(run, run), history)))
 
 
 if __name__ == "__main__":

@@ -4,16 +4,17 @@ import os
 import shutil
 import tempfile
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import polars as pl
 
 from benchmarks.measuring import Figure
-from benchmarks.nights import history_of, night_of, verdict_of
-from simtest.nightly.gate.records import Night, Verdict
+from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.ladder import ladder_figures
-from simtest.nightly.page import Extras, write_nightly_page
+from simtest.nightly.page import write_nightly_page
+from simtest.nightly.records import JudgedRun
 from simtest.spec import load_experiment
 from simtest.validation.runner import run_experiment
 from simtest.validation.worst import save_worst, worst_cases
@@ -41,15 +42,14 @@ FILTERED = """
 
 
 def figures() -> list[Figure]:
-    """Make the page of a night with a long history, and open it."""
+    """Make the page of a run with a long history, and open it."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        night, verdict, extras = _night(folder)
-        history = history_of(night, NIGHTS)
+        judged = _judged(folder)
         wall, processor = time.monotonic(), time.process_time()
-        page = write_nightly_page(folder / "page", night, verdict, history, extras)
+        page = write_nightly_page(folder / "page", judged)
         wall, processor = time.monotonic() - wall, time.process_time() - processor
-        about = f"{NIGHTS} nights of {night.figures.height} figures, {len(extras.gallery)} worst cases"
+        about = f"{NIGHTS} nights of {judged.run.figures.height} figures, {len(judged.gallery)} worst cases"
         made = [
             Figure("nightly page: size", page.stat().st_size / MB, 8.0, unit="MB", about=about),
             Figure("nightly page: time to make", wall, 20.0, unit="s", about=f"{processor:.1f} s of processor"),
@@ -57,21 +57,21 @@ def figures() -> list[Figure]:
         return made + _opened(page)
 
 
-def _night(folder: Path) -> tuple[Night, Verdict, Extras]:
-    """Run a small experiment, and give it as a whole night with its verdict and worst cases."""
+def _judged(folder: Path) -> JudgedRun:
+    """Run a small experiment, and return it as a whole nightly run with its verdict, history and worst cases."""
     experiment = load_experiment("overview", {"realisations": 1})
     rows = run_experiment(experiment, folder / "run").results
     gallery = save_worst(worst_cases(rows), [experiment], folder / "worst")
     copies = 1
-    night = night_of(rows, STARTED)
-    while night.figures.height < FIGURES_A_NIGHT:
+    run = run_of(rows, STARTED)
+    while run.figures.height < FIGURES_A_NIGHT:
         copies += 1
         named = [
             rows.with_columns(pl.format("{} {}", "experiment", pl.lit(i)).alias("experiment")) for i in range(copies)
         ]
-        night = night_of(pl.concat(named), STARTED)
-    night = Night(night.run, night.rows, pl.concat([night.figures, ladder_figures()]))
-    return night, verdict_of(night), Extras(gallery=gallery)
+        run = run_of(pl.concat(named), STARTED)
+    run = replace(run, figures=pl.concat([run.figures, ladder_figures()]))
+    return JudgedRun(run, verdict_of(run), history_of(run, NIGHTS), tuple(gallery))
 
 
 def _opened(page: Path) -> list[Figure]:

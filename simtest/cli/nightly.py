@@ -41,7 +41,7 @@ def run(
         nothing = "nothing of this night is kept; history, baseline and the last page are as they were"
         raise KeyboardInterrupt(str(stop) or nothing) from None
     _print(outcome)
-    return outcome.exit_code
+    return outcome.judged.verdict.exit_code
 
 
 def _run(
@@ -52,6 +52,7 @@ def _run(
 
     from simtest.cli.progress import progress_bar
     from simtest.nightly.layout import Reports
+    from simtest.nightly.measure import RunOptions
     from simtest.nightly.run import run_nightly
     from simtest.rendering.backend import requested_variant
     from simtest.runtime.engines import make_engine
@@ -62,7 +63,7 @@ def _run(
     count = _cores() if workers is None else workers
     chosen = make_engine(engine, count, address, gpu=requested_variant(variant).startswith("cuda"))
     with progress_bar("writing the page") as progress:
-        return run_nightly(described, Reports(reports), command, variant, chosen, count, progress)
+        return run_nightly(described, Reports(reports), RunOptions(command, variant, chosen, count, progress))
 
 
 @nightly.command
@@ -78,7 +79,7 @@ def accept(
     from simtest.spec import load_profile
 
     accepted = accept_night(Reports(reports), load_profile(profile).name, reason)
-    print(f"{accepted['id']} is the baseline of {accepted['profile']}: {accepted['reason']}")
+    print(f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}")
 
 
 def _cores() -> int:
@@ -92,31 +93,23 @@ def _print(outcome: "Outcome") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from simtest.nightly.gate.records import OUTCOMES
-    from simtest.nightly.overview import (
-        by_experiment,
-        failed_canaries,
-        headline,
-        number,
-        ordered,
-        place_name,
-        without_canaries,
-    )
+    from simtest.nightly.phrases import cell_name, headline, plain
+    from simtest.nightly.records import OUTCOMES
 
-    night, verdict = outcome.night, outcome.verdict
+    judged, verdict = outcome.judged, outcome.judged.verdict
     counts = OUTCOMES if verdict.baseline is not None else ()
-    keys = ("experiment", "rows", "answered", "missed", "false", *counts)
-    table = Table(*keys, title=f"{night.run['profile']}: {headline(verdict)}", title_justify="left")
-    for row in by_experiment(night, verdict):
-        table.add_row(*("" if row[key] is None else str(row[key]) for key in keys))
+    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
+    table = Table(*columns, title=f"{judged.run.record.profile}: {headline(verdict)}", title_justify="left")
+    for values in judged.by_experiment().select(columns).iter_rows():
+        table.add_row(*("" if value is None else str(value) for value in values))
     console = Console(width=TABLE_WIDTH)
     console.print(table)
-    for row in ordered(without_canaries(night, verdict), "worse").iter_rows(named=True):
+    for row in judged.with_outcome("worse").iter_rows(named=True):
         print(
-            f"worse: {row['experiment']}, {place_name(row)}, {row['quantity']}: {number(row['tonight'], row['unit'])}, "
-            f"baseline {number(row['baseline'], row['unit'])}"
+            f"worse: {row['experiment']}, {cell_name(row)}, {row['quantity']}: {plain(row['tonight'], row['unit'])}, "
+            f"baseline {plain(row['baseline'], row['unit'])}"
         )
-    for row in failed_canaries(night).iter_rows(named=True):
-        print(f"canary failed: {row['experiment']}, {row['quantity']} = {number(row['value'], row['unit'])}")
+    for row in judged.run.failed_canaries.iter_rows(named=True):
+        print(f"canary failed: {row['experiment']}, {row['quantity']} = {plain(row['value'], row['unit'])}")
     print(*verdict.notes, sep="\n", end="\n" * bool(verdict.notes))
     print(outcome.folder / "index.html")

@@ -1,1 +1,10 @@
-"""A night: runs a profile's experiments and canaries, keeps the history, asks the gate, writes the page."""
+"""The nightly: a profile's experiments are measured, judged and drawn, night after night.
+
+`run` calls the three stages, each of which hands one record of `records` to the next:
+
+    run = measure_run(...)      # measure: experiments, canaries/, ladder, cost -> NightlyRun
+    judged = judge(run, ...)    # judge: gate/ against the baseline, history -> JudgedRun
+    draw(judged, ...)           # draw: page/, outputs/ (JSON, JUnit, Markdown, badge)
+
+`storage` writes a run, `baseline` accepts one, `history` keeps the figures of all, `layout` names the folders.
+"""

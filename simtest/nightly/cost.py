@@ -1,8 +1,7 @@
-"""What the code costs: run time of fixed pieces of work over a reference kernel timed beside them, and memory."""
+"""Costs of the code: run time of fixed pieces of work over a reference kernel timed beside them, and memory."""
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,8 +14,8 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, Patch, smooth
-from simtest.nightly.canaries.record import Canary, as_figures
-from simtest.nightly.gate.records import FIGURES
+from simtest.nightly.canaries.canary import canary
+from simtest.nightly.records import Cell, Figure, figure_table
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.measuring import times_in_turns
@@ -33,7 +32,7 @@ Piece = Callable[[], object]
 
 
 def highlight() -> tuple[Patch, Camera]:
-    """Give a noisy highlight of 100 x 100 px, always the same, and its camera."""
+    """Return a noisy highlight of 100 x 100 px, always the same, and its camera."""
     y, x = np.mgrid[:SIDE, :SIDE] + 0.5
     lobe = np.exp(-((x - 50.3) ** 2 + 1.3 * (y - 49.6) ** 2) / WIDTH_PX**2)
     frame = (lobe + SIGMA * np.random.default_rng(0).standard_normal(lobe.shape)).astype(np.float32)
@@ -44,8 +43,8 @@ def highlight() -> tuple[Patch, Camera]:
     return patch, Camera(SIDE, SIDE, 406.0, 406.0, SIDE / 2, SIDE / 2)
 
 
-def anew(patch: Patch) -> Patch:
-    """Give the same patch without the isophotes that it has traced."""
+def untraced(patch: Patch) -> Patch:
+    """Return the same patch without the isophotes that it has traced."""
     return Patch(
         patch.values, patch.origin_px, patch.peak_px, patch.peak_value, patch.peak_pixel, raw=patch.raw,
         noise=patch.noise, smoothing_px=patch.smoothing_px,
@@ -53,25 +52,25 @@ def anew(patch: Patch) -> Patch:
 
 
 def reference_kernel() -> Piece:
-    """Give the work that run times are held against: a wide blur of a frame, on one core."""
+    """Return the work that run times are ratios to: a wide blur of a frame, on one core."""
     frame = np.random.default_rng(1).standard_normal((FRAME_PX, FRAME_PX), dtype=np.float32)
     return lambda: cv2.GaussianBlur(frame, (0, 0), 8.0)
 
 
 def estimator_pieces() -> dict[str, Piece]:
-    """Give estimators at work on one highlight."""
+    """Return estimators at work on one highlight."""
     patch, camera = highlight()
     priors = Priors(lobe_curvature=exactly(200.0))
     return {
-        "circle_pose": lambda: circle_pose.estimate(anew(patch), camera),
-        "cone_axis": lambda: cone_axis.estimate(anew(patch), camera),
-        "curved": lambda: curved.estimate(anew(patch), camera, priors),
-        "photometric": lambda: photometric.estimate(anew(patch), camera),
+        "circle_pose": lambda: circle_pose.estimate(untraced(patch), camera),
+        "cone_axis": lambda: cone_axis.estimate(untraced(patch), camera),
+        "curved": lambda: curved.estimate(untraced(patch), camera, priors),
+        "photometric": lambda: photometric.estimate(untraced(patch), camera),
     }
 
 
 def _frame_pieces(variant: str | None) -> dict[str, Piece]:
-    """Give the work on a whole frame: its radiance, and detection with the default estimators."""
+    """Return the work on a whole frame: its radiance, and detection with the default estimators."""
     scene = load_scene("cylinder")
     session = Session(scene, variant)
     light = session.radiance().total
@@ -81,49 +80,44 @@ def _frame_pieces(variant: str | None) -> dict[str, Piece]:
 
 
 def run_times(variant: str | None = None, rounds: int = ROUNDS) -> pl.DataFrame:
-    """Time the pieces.
-
-    Parameters
-    ----------
-    variant : str, optional
-        Mitsuba variant.
-    rounds : int
-        How many times each is timed.
+    """Time the pieces, each in so many rounds.
 
     Returns
     -------
     polars.DataFrame
         Columns `FIGURES`, kind "cost", `estimator` the piece's name, quantity "run_time": the median of the rounds'
-        ratios to the reference kernel's time; `low`, `high` are their quartiles. A piece that gives no answer has no
-        value, for it stops early and would look fast; a row of kind "canary" counts these.
+        ratios to the reference kernel's time; `low`, `high` are their quartiles. A piece without a result has no value,
+        for it stops early and would look fast; a row of kind "canary" counts these.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         of_highlight = estimator_pieces()
         pieces = {**of_highlight, **_frame_pieces(variant)}
-        idle = {name: why for name, piece in pieces.items() if (why := _no_answer(piece()))}
-        # The processor's time, of all threads: what else runs on the machine tells less on it than on the clock's.
+        idle = {name: why for name, piece in pieces.items() if (why := _no_result(piece()))}
+        # The processor's time, of all threads: other work on the machine changes it less than the clock's.
         times = times_in_turns({"reference": reference_kernel(), **pieces}, rounds, time.process_time)
     finally:
         cv2.setNumThreads(threads)
+    # Ratios to the reference kernel, round by round
     reference = np.array(times["reference"])
     made = []
     for name in pieces:
-        setting = HIGHLIGHT if name in of_highlight else FRAME
+        cell = _cell(name, HIGHLIGHT if name in of_highlight else FRAME)
         if name in idle:
-            made.append(_figure(name, setting, "run_time", "x", None, None, None, 0, f"no answer: {idle[name]}"))
+            # It would look fast.
+            made.append(Figure("cost", cell, "run_time", "x", None, n=0, about=f"no answer: {idle[name]}"))
             continue
         low, middle, high = (float(value) for value in np.percentile(times[name] / reference, (25, 50, 75)))
         about = f"{1e3 * np.median(times[name]):.3g} ms over {1e3 * np.median(reference):.3g} ms of processor time"
-        made.append(_figure(name, setting, "run_time", "x", middle, low, high, rounds, about))
+        made.append(Figure("cost", cell, "run_time", "x", middle, low, high, rounds, about=about))
     about = "; ".join(f"{name}: {why}" for name, why in idle.items()) or "each piece that is timed has an answer"
-    canary = Canary("costs", "unanswered", "", len(idle), 0.0, n=len(pieces), about=about)
-    return pl.concat([pl.DataFrame(made, schema=FIGURES), as_figures([canary])])
+    made.append(canary("costs", "unanswered", "", len(idle), 0.0, n=len(pieces), about=about))
+    return figure_table(made)
 
 
-def _no_answer(result: object) -> str:
-    """Say why a piece of work has no answer; nothing where it has one."""
+def _no_result(result: object) -> str:
+    """Return the reason where a piece of work has no result; nothing where it has one."""
     if isinstance(result, Failure):
         return str(result)
     if isinstance(result, list):
@@ -134,20 +128,13 @@ def _no_answer(result: object) -> str:
 
 
 def memory(peak_mib: float | None, workers: int) -> pl.DataFrame:
-    """Give the figure of the night's peak memory; nothing where the system does not tell it."""
-    made = []
-    if peak_mib is not None:
-        about = "all processes together, shared pages once"
-        setting = f"{workers} worker{'s' * (workers > 1)}"
-        made.append(_figure("night", setting, "peak_memory", "MiB", peak_mib, None, None, 1, about))
-    return pl.DataFrame(made, schema=FIGURES)
+    """Return the figure of the run's peak memory; no row where the system does not tell it."""
+    cell = _cell("night", f"{workers} worker{'s' * (workers > 1)}")
+    about = "all processes together, shared pages once"
+    return figure_table(
+        [] if peak_mib is None else [Figure("cost", cell, "peak_memory", "MiB", peak_mib, n=1, about=about)]
+    )
 
 
-def _figure(
-    name: str, setting: str, quantity: str, unit: str, value: float | None, low: float | None, high: float | None,
-    n: int, about: str,
-) -> dict[str, Any]:  # fmt: skip
-    return {
-        "kind": "cost", "experiment": "cost", "label": "", "surface": "", "setting": setting, "estimator": name,
-        "quantity": quantity, "unit": unit, "value": value, "low": low, "high": high, "n": n, "about": about,
-    }  # fmt: skip
+def _cell(piece: str, setting: str) -> Cell:
+    return Cell("cost", setting=setting, estimator=piece)

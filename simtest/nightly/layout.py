@@ -20,32 +20,26 @@ _ENTRY, _OLD = ".lock", ".old"
 
 @dataclass(frozen=True)
 class Reports:
-    """Folders under ``--reports``.
-
-    Parameters
-    ----------
-    root : Path
-        Made if need be.
-    """
+    """Folders under ``--reports``, the `root`, which is made if need be."""
 
     root: Path
 
     @property
     def history(self) -> Path:
-        """Figures of all nights, a file each; never changed."""
+        """Figures of all runs, a file each; never changed."""
         return self.root / "history"
 
     @property
     def work(self) -> Path:
-        """Scratch of nights in progress, a folder each."""
+        """Scratch of runs in progress, a folder each."""
         return self.root / "work"
 
     def baseline(self, profile: str) -> Path:
-        """Give the folder of a profile's accepted numbers."""
+        """Return the folder of a profile's accepted numbers."""
         return self.root / "baseline" / profile
 
-    def tonight(self, profile: str) -> Path:
-        """Give the folder of a profile's last night: numbers, page and outputs for machines."""
+    def latest(self, profile: str) -> Path:
+        """Return the folder of a profile's last run: numbers, page and outputs for machines."""
         return self.root / "nightly" / profile
 
     def make(self) -> None:
@@ -59,16 +53,16 @@ class Reports:
 
 
 def new_run_id(now: datetime) -> str:
-    """Give a name for a night that no other has, whatever the clock says."""
+    """Return a name that no other run has, whatever the clock says."""
     return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 @contextlib.contextmanager
 def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
-    """Give a night its scratch folder, locked while the night lives and removed when it ends."""
+    """Make a run's scratch folder, locked while the run lives and removed when it ends."""
     folder = reports.work / run_id
     with contextlib.ExitStack() as stack:
-        # Together with the lock, or another night would take the folder for a dead one's.
+        # Together with the lock, or another run would take the folder for a dead one's.
         with _locked(reports.work / _ENTRY):
             folder.mkdir()
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -77,23 +71,23 @@ def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
 
 
 def remove_dead(reports: Reports) -> list[str]:
-    """Remove what nights left that were killed; gives their names. Those that live hold a lock, and are left alone."""
+    """Remove the leftovers of killed runs and return their names; living runs hold a lock and are left alone."""
     dead, alive = [], set()
     with _locked(reports.work / _ENTRY):
         for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
-            if _held(folder / LOCK):
+            if _is_held(folder / LOCK):
                 alive.add(folder.name)
             else:
                 shutil.rmtree(folder, ignore_errors=True)
                 dead.append(folder.name)
+        # Half-written files of the history bear the name of their run.
         for part in reports.history.glob("date=*/commit=*/.*.part.parquet"):
             if not any(part.name.startswith(f".{name}.") for name in alive):
                 part.unlink(missing_ok=True)
     return dead
 
 
-def _held(lock: Path) -> bool:
-    """Whether a living process holds a lock."""
+def _is_held(lock: Path) -> bool:
     try:
         with lock.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -113,10 +107,11 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def turn(folder: Path) -> Iterator[None]:
-    """Have a folder that several nights replace to oneself; what a kill left in the middle is put back first."""
+def exclusive_replacement(folder: Path) -> Iterator[None]:
+    """Lock the folder for replacement; first roll back an interrupted swap."""
     with _locked(folder.parent / f".{folder.name}.{LOCK}"):
         old = _old(folder)
+        # A kill between the two renames of `replace_folder` left the old folder aside.
         if old.is_dir():
             if folder.is_dir():
                 shutil.rmtree(old)
@@ -126,15 +121,11 @@ def turn(folder: Path) -> Iterator[None]:
 
 
 def replace_folder(new: Path, folder: Path) -> None:
-    """Put a finished folder in another's place, under `turn`: one of the two is always there, under a name it knows.
+    """Replace a folder, if any, by a finished one, under `exclusive_replacement`: at any moment one of them exists.
 
-    Parameters
-    ----------
-    new : Path
-        Whose files are on disk; on the same file system.
-    folder : Path
-        Its place.
+    Both are on the same file system, the new one's files on disk.
     """
+    # Move the old folder aside, the new one in, then delete
     old = _old(folder)
     if folder.exists():
         folder.rename(old)

@@ -1,8 +1,9 @@
-"""Runs a profile: its experiments, the canaries, and what they cost."""
+"""Measures a profile: its experiments, the canaries, and what they cost."""
 
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,12 +11,12 @@ import polars as pl
 
 from simtest.estimators import load_estimators
 from simtest.nightly import cost
-from simtest.nightly.canaries import Canary, run_canaries
 from simtest.nightly.canaries import randomness as noise
-from simtest.nightly.canaries.record import as_figures
+from simtest.nightly.canaries import run_canaries
+from simtest.nightly.canaries.canary import or_failed_canary
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.records import FIGURES, Night
 from simtest.nightly.ladder import ladder_canary, ladder_figures
+from simtest.nightly.records import FIGURES, NightlyRun, RunRecord, figure_table
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import make_engine
@@ -29,16 +30,21 @@ _LOOK_S = 0.5
 """Time between two looks at the memory: each takes some milliseconds of a big process."""
 
 
-def measure_night(
-    profile: Profile,
-    folder: Path,
-    run_id: str,
-    command: str = "",
-    variant: str | None = None,
-    engine: Engine | None = None,
-    workers: int = 1,
-    progress: Progress | None = None,
-) -> Night:
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is made; its rows depend neither on the engine nor on the workers."""
+
+    command: str = ""  # how it was called, for its record
+    variant: str | None = None  # of Mitsuba
+    engine: Engine | None = None  # does the work; default `workers` processes of this machine
+    workers: int = 1  # how many work at once
+    progress: Progress | None = None
+
+
+DEFAULTS = RunOptions()
+
+
+def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions = DEFAULTS) -> NightlyRun:
     """Run a profile.
 
     Parameters
@@ -47,21 +53,10 @@ def measure_night(
         What to run.
     folder : Path
         Scratch: each experiment's run stands in a folder of its name afterwards.
-    run_id, command : str
-        For the night's record.
-    variant : str, optional
-        Mitsuba variant.
-    engine : Engine, optional
-        Who does the work; default `workers` processes of this machine.
-    workers : int
-        How many work at once.
-    progress : callable, optional
-        See `simtest.validation.runner.Progress`.
-
-    Returns
-    -------
-    Night
-        The rows do not depend on engine and workers.
+    run_id : str
+        For the run's record.
+    options : RunOptions
+        How.
 
     Raises
     ------
@@ -69,7 +64,7 @@ def measure_night(
         If an experiment is malformed or cannot be run.
     """
     started, clock = datetime.now(UTC), time.monotonic()
-    # Told at the start: the checkout may have moved on before the night ends.
+    # Asked at the start: the checkout may have moved on before the run ends.
     origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
     experiments = experiments_of(profile)
     cases = [expand(experiment) for experiment in experiments]
@@ -77,82 +72,76 @@ def measure_night(
         # Refused before the canaries, not after them.
         load_estimators(experiment.estimators)
     definitions = {own.name: definition(own, of_own) for own, of_own in zip(experiments, cases, strict=True)}
-    steps = _Steps(progress, sum(case.realisations for of_own in cases for case in of_own))
+    steps = _Steps(options.progress, sum(case.realisations for of_own in cases for case in of_own))
     figures: list[pl.DataFrame] = []
     with PeakMemory(os.getpid(), _LOOK_S) as peak:
+        # Canaries first: a fault that they see is known before the experiments run.
         if profile.canaries:
-            steps.tell("canaries")
-            figures += [run_canaries(None, variant), *_guarded("error ladder", _ladder)]
+            steps.show("canaries")
+            figures += [run_canaries(None, options.variant), or_failed_canary("error ladder", _ladder)]
         before = time.monotonic()
         runs = run_experiments(
-            [(experiment, folder / experiment.name) for experiment in experiments], command, variant,
-            steps.of("experiments"), engine or make_engine(workers=workers),
+            [(experiment, folder / experiment.name) for experiment in experiments], options.command, options.variant,
+            steps.within("experiments"), options.engine or make_engine(workers=options.workers),
         )  # fmt: skip
         took_s = time.monotonic() - before
         rows = pl.concat([run.results for run in runs], how="diagonal_relaxed")
         figures.insert(0, setting_figures(rows))
         if profile.canaries:
-            figures += _guarded("noises_of", lambda: [as_figures(noise.noises_of(rows, experiments))])
+            figures.append(or_failed_canary("noises_of", lambda: figure_table(noise.noises_of(rows, experiments))))
     if profile.costs:
-        steps.tell("costs")
-        figures += _guarded("costs", lambda: [cost.run_times(variant)])
-        figures.append(cost.memory(peak.peak_mib, workers))
+        steps.show("costs")
+        figures.append(or_failed_canary("costs", lambda: cost.run_times(options.variant)))
+        figures.append(cost.memory(peak.peak_mib, options.workers))
     steps.end()
     library = backend.library_in_use()
-    run = {
-        "id": run_id,
-        "profile": profile.name,
-        "title": profile.title or profile.name,
-        "started": started.isoformat(timespec="seconds"),
-        "duration_s": round(time.monotonic() - clock, 1),
-        "experiments_s": round(took_s, 1),
-        "workers": workers,
-        "definitions": definitions,
-        "command": command,
-        **origin,
-        "variant": backend.requested_variant(variant),
-        # Its name: where it lies says nothing of the numbers, and nights of two machines are compared.
-        "llvm": None if library is None else Path(library).name,
-    }
-    return Night(run, rows, pl.concat([table.select(*FIGURES) for table in figures]))
+    record = RunRecord.model_validate(
+        {
+            "id": run_id,
+            "profile": profile.name,
+            "title": profile.title or profile.name,
+            "started": started.isoformat(timespec="seconds"),
+            "duration_s": round(time.monotonic() - clock, 1),
+            "experiments_s": round(took_s, 1),
+            "workers": options.workers,
+            "definitions": definitions,
+            "command": options.command,
+            **origin,
+            "variant": backend.requested_variant(options.variant),
+            # Its name alone: runs of two machines are compared, where it lies elsewhere.
+            "llvm": None if library is None else Path(library).name,
+        }
+    )
+    return NightlyRun(record, rows, pl.concat([table.select(*FIGURES) for table in figures]))
 
 
-def _ladder() -> list[pl.DataFrame]:
+def _ladder() -> pl.DataFrame:
     figures = ladder_figures()
-    return [figures, ladder_canary(figures)]
-
-
-def _guarded(name: str, measure: Callable[[], list[pl.DataFrame]]) -> list[pl.DataFrame]:
-    """Give figures, or in their place a canary that failed: a fault of one part must not lose a night."""
-    try:
-        return measure()
-    except Exception as error:
-        why = f"{type(error).__name__}: {error}"
-        return [as_figures([Canary(name, "error", "", float("nan"), 0.0, n=0, about=why)])]
+    return pl.concat([figures, ladder_canary(figures)])
 
 
 class _Steps:
-    """The whole night's progress: each part moves the bar by its share."""
+    """The whole run's progress: each part moves the bar by its share."""
 
     def __init__(self, progress: Progress | None, realisations: int) -> None:
         # Canaries, costs, verdict and page count as some realisations each.
         self._progress, self._total, self._done = progress, realisations + max(3, realisations // 20), 0
 
-    def of(self, part: str) -> Callable[[int, int, str], None] | None:
-        """Give the callable that moves the bar within a part; its last step is not the night's."""
+    def within(self, part: str) -> Callable[[int, int, str], None] | None:
+        """Return the callable that moves the bar within a part; its last step is not the run's."""
 
         def move(done: int, total: int, what: str) -> None:
             self._done = done
-            self.tell(what if done < total else part)
+            self.show(what if done < total else part)
 
         return move if self._progress else None
 
-    def tell(self, what: str) -> None:
-        """Say what is done now."""
+    def show(self, what: str) -> None:
+        """Show what is done now."""
         if self._progress:
             self._progress(self._done, self._total, what)
 
     def end(self) -> None:
-        """Say that all is measured."""
+        """Show that all is measured."""
         self._done = self._total
-        self.tell("done")
+        self.show("done")

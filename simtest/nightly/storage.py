@@ -1,22 +1,21 @@
-"""A night as files: the rows, the figures, and the run's record with their hashes."""
+"""A run as files: the rows, the figures, and the run's record with their hashes."""
 
 import contextlib
 import errno
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from simtest.errors import InputError, SimtestError
-from simtest.nightly.gate.records import FIGURES, Night
+from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
 from simtest.runtime.files import sync_folder, write_atomically, write_json
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
-TONIGHT_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
+LATEST_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
 
 _OF_THE_DISK = {
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
@@ -25,58 +24,32 @@ _OF_THE_DISK = {
 
 
 @contextlib.contextmanager
-def told_in_one_line(root: Path, said: str) -> Iterator[None]:
-    """Turn what the disk refuses into an error that says so; any other error is a fault, and stays what it is.
+def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
+    """Raise `SimtestError`, of one line, in place of an error of the disk, also one that polars hands on.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of the reports.
-    said : str
-        What could not be done; what is left as it was, after a semicolon.
-
-    Raises
-    ------
-    SimtestError
-        In place of an error of the file system, also of one that polars hands on.
+    The line names the reports' `root`, what could not be done, and what is left as it was. Any other error is a fault,
+    and stays what it is.
     """
     try:
         yield
-    except OSError as error:
-        if error.errno not in _OF_THE_DISK and "(os error " not in str(error):
+    except (OSError, pl.exceptions.PolarsError) as error:
+        # Polars' own errors, such as of a missing column, have nothing to do with the disk.
+        of_the_disk = isinstance(error, OSError) and error.errno in _OF_THE_DISK
+        if not of_the_disk and "(os error " not in str(error):
             raise
-        raise _refused(root, said, error.strerror or str(error)) from error
-    except pl.exceptions.PolarsError as error:
-        # Its own errors, of a missing column say, have nothing to do with the disk.
-        if "(os error " not in str(error):
-            raise
-        raise _refused(root, said, str(error)) from error
+        why = " ".join(((isinstance(error, OSError) and error.strerror) or str(error)).split())[:200]
+        raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
 
 
-def _refused(root: Path, said: str, why: str) -> SimtestError:
-    what, _, left = said.partition("; ")
-    return SimtestError(f"--reports {shown(root)}: {what} ({' '.join(why.split())[:200]}); {left}")
-
-
-def save_night(folder: Path, night: Night, rows_file: str, columns: Sequence[str] | None = None) -> None:
-    """Write a night.
-
-    Parameters
-    ----------
-    folder : Path
-        Exists.
-    night : Night
-        The night.
-    rows_file : str
-        Name of the file of rows.
-    columns : sequence of str, optional
-        The rows' columns that are kept; default all.
-    """
-    rows = night.rows if columns is None else night.rows.select(name for name in columns if name in night.rows.columns)
-    tables = {rows_file: rows, FIGURES_FILE: night.figures}
+def save_run(folder: Path, run: NightlyRun, rows_file: str, columns: Sequence[str] | None = None) -> None:
+    """Write a run into an existing folder: run.json, the figures, and the rows, or some of their columns."""
+    rows = run.rows if columns is None else run.rows.select(name for name in columns if name in run.rows.columns)
+    # The record comes last: it holds the hashes of the tables.
+    tables = {rows_file: rows, FIGURES_FILE: run.figures}
     for name, table in tables.items():
         write_atomically(folder / name, lambda part, table=table: _write(table, part))  # type: ignore[misc]
-    write_json(folder / RUN_FILE, {**night.run, "files": {name: file_hash(folder / name) for name in tables}})
+    hashes = {name: file_hash(folder / name) for name in tables}
+    write_json(folder / RUN_FILE, {**run.record.to_json(), "files": hashes})
     sync_folder(folder)
 
 
@@ -84,28 +57,23 @@ def _write(table: pl.DataFrame, path: Path) -> None:
     table.write_parquet(path, compression="zstd", compression_level=19)
 
 
-def load_night(folder: Path, rows_file: str) -> Night:
-    """Read a night.
+def load_run(folder: Path, rows_file: str) -> NightlyRun:
+    """Read a run.
 
     Raises
     ------
     InputError
         If a file is missing, damaged, or not the one that was written; the message names it.
     """
-    run = _record(folder / RUN_FILE)
-    rows, figures = (_table(folder / name, run) for name in (rows_file, FIGURES_FILE))
+    record, hashes = _record(folder / RUN_FILE)
+    # A table of another run has another hash.
+    rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))
     check_columns(folder / FIGURES_FILE, figures, FIGURES)
-    return Night({key: value for key, value in run.items() if key != "files"}, rows, figures.select(*FIGURES))
+    return NightlyRun(record, rows, figures.select(*FIGURES))
 
 
 def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataType]) -> None:
-    """Refuse a table that lacks a column, or holds one of another type.
-
-    Raises
-    ------
-    InputError
-        The message names file and column.
-    """
+    """Raise `InputError`, with file and column, where a table lacks a column or holds one of another type."""
     for name, dtype in schema.items():
         if name not in table.columns:
             raise InputError(f"{shown(path)}: damaged (no column {name})")
@@ -113,23 +81,30 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
             raise InputError(f"{shown(path)}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
 
 
-def _record(path: Path) -> dict[str, Any]:
+def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
+    """Read a run's record, and the hashes of its tables by file name."""
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise InputError(f"{shown(path)}: damaged (not JSON: {error})") from error
-    if not isinstance(run, dict) or not all(isinstance(run.get(key), str) for key in ("id", "profile", "started")):
-        raise InputError(f"{shown(path)}: damaged (no record of a night, with id, profile and started)")
-    if not isinstance(run.get("files"), dict):
-        raise InputError(f"{shown(path)}: damaged (no hashes under files)")
-    return run
-
-
-def _table(path: Path, run: dict[str, Any]) -> pl.DataFrame:
     try:
-        same = file_hash(path) == run["files"].get(path.name)
+        hashes = data.pop("files", None)
+        record = RunRecord.model_validate(data)
+        sound = {"id", "profile", "started"} <= record.model_fields_set and record.start is not None
+    except (AttributeError, TypeError, KeyError, ValueError):
+        sound = False
+    if not sound:
+        raise InputError(f"{shown(path)}: damaged (no record of a night, with id, profile and started)")
+    if not isinstance(hashes, dict):
+        raise InputError(f"{shown(path)}: damaged (no hashes under files)")
+    return record, hashes
+
+
+def _table(path: Path, hashes: Mapping[str, str]) -> pl.DataFrame:
+    try:
+        same = file_hash(path) == hashes.get(path.name)
         if same:
             return pl.read_parquet(path, memory_map=False)
     except OSError as error:

@@ -182,7 +182,7 @@ class PictureRecord:
 
 def describe(made: Reconstruction, camera: Camera) -> list[SpecularityRecord]:
     """Describe each specularity of a reconstruction, with what the detector says of it."""
-    judged: Sequence[Highlight | None] = made.highlights or [None] * len(made.specularities)
+    judged: Sequence[Highlight | None] = made.detection.highlights or [None] * len(made.specularities)
     return [_describe(i, *pair, camera) for i, pair in enumerate(zip(made.specularities, judged, strict=True))]
 
 

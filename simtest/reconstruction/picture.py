@@ -129,10 +129,10 @@ def reconstruct_values(
         camera=calibration.camera,
         encoding=calibration.response.kind if calibration.response else "linear",
         detector=detector,
-        view=made.view,
+        view=made.detection.view,
         warnings=list(cautions),
         specularities=describe(made, calibration.camera),
-        other_highlights=made.others,
+        other_highlights=made.detection.others,
     )
 
 

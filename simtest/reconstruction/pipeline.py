@@ -12,10 +12,10 @@ from simtest.calibration import Calibration, Frame, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.blobs import Highlight
-from simtest.detection.colour import ColourDetection, ColourDetector, ColourFrameDetection
+from simtest.detection.colour import ColourDetection, ColourDetector, detect_colour
 from simtest.detection.detector import Detection, Detector, load_detector
 from simtest.detection.peaks import PeakDetector
-from simtest.detection.view_mask import WHOLE, View
+from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
@@ -59,24 +59,6 @@ class Reconstruction:
 
     specularities: list[Specularity]
     detection: Detection
-
-    @property
-    def highlights(self) -> Sequence[Highlight]:
-        """How each detected region was judged; empty where the detector judges none."""
-        return self.detection.highlights if isinstance(self.detection, ColourFrameDetection) else ()
-
-    @property
-    def others(self) -> Sequence[Highlight]:
-        """The highlights that the detector left out."""
-        if not isinstance(self.detection, ColourFrameDetection):
-            return ()
-        taken = {id(highlight) for highlight in self.detection.highlights}
-        return [highlight for highlight in self.detection.colour.highlights if id(highlight) not in taken]
-
-    @property
-    def view(self) -> View:
-        """The part of the picture that shows tissue, as far as the detector looked for it."""
-        return self.detection.view if isinstance(self.detection, ColourFrameDetection) else WHOLE
 
 
 def reconstruct(
@@ -184,8 +166,9 @@ def detect_in_picture(
     # Detection by colour uses no angle, so any field of view serves.
     camera = Camera.from_fov(60.0, picture.shape[1], picture.shape[0])
     calibration = Calibration(camera, response=response or Response("srgb"), saturation_level=level)
-    found = ColourDetector().detect(Frame(picture, calibration, seen=seen), camera)
-    return PictureDetection(found.view, found.colour)
+    frame = Frame(picture, calibration, seen=seen)
+    view = find_view(picture) if seen is None else View(seen)
+    return PictureDetection(view, detect_colour(frame.channels, frame.clipped, view.seen))
 
 
 def run_pipeline(
@@ -234,7 +217,7 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     limited = frame.corrected.limited
     result = Reconstruction([], detection)
     rounded_px = SMALL_RADIUS * frame.smoothing_px
-    small = [_radius_px(highlight) < rounded_px for highlight in result.highlights] or [False] * len(patches)
+    small = [_radius_px(highlight) < rounded_px for highlight in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
         estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
         result.specularities.append(Specularity(region, patch, estimates))

@@ -9,8 +9,8 @@ from benchmarks.measuring import Figure
 
 
 def figures() -> list[Figure]:
-    """Give all figures beside their limits."""
-    # Here: processes that judge nights need nothing of the renderer.
+    """Return all figures beside their limits."""
+    # Imported here: processes that judge runs need nothing of the renderer.
     from studies.gate.proof import figures as proved
 
     return proved()

@@ -18,27 +18,27 @@ def _percent(rate: proof.Rate) -> str:
 
 
 def alarms() -> str:
-    """Give the table of false alarms on fresh seeds."""
+    """Return the table of false alarms on fresh seeds."""
     bank = load_bank(proof.bank_folder())
     rows = [(rate.name, _percent(rate), rate.about) for rate in proof.false_alarms(bank)]
     return f"{frames_of(bank)} realisations in the bank.\n\n" + _table(("fresh seeds", "false alarms", "tests"), rows)
 
 
 def harmless() -> str:
-    """Give the table of false alarms on changes that do no harm."""
+    """Return the table of false alarms on changes that do no harm."""
     rates = proof.harmless()
     return _table(("change", "false alarms", "size"), [(rate.name, _percent(rate), rate.about) for rate in rates])
 
 
 def rises() -> str:
-    """Give the table of a rise of one estimator's errors."""
+    """Return the table of a rise of one estimator's errors."""
     found = proof.rises(load_bank(proof.bank_folder()))
     rows = [(paired.name, _percent(paired), _percent(fresh), paired.about) for paired, fresh, _ in found]
     return _table(("estimator", "seen, same seeds", "seen, fresh seeds", "10 % is beyond the margin in"), rows)
 
 
 def faults() -> str:
-    """Give the table of planted faults."""
+    """Return the table of planted faults."""
     rows = []
     for caught in proof.faults():
         canaries = ", ".join(caught.canaries[:3]) + (
@@ -50,7 +50,7 @@ def faults() -> str:
 
 
 def noise() -> str:
-    """Give the table of the canaries that hold noise."""
+    """Return the table of the canaries that hold noise."""
     sound, reused = proof.noise_canaries()
     return _table(("canaries of noise", "fail"), [("code as it is", _percent(sound)), (reused.name, _percent(reused))])
 

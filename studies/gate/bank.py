@@ -1,11 +1,11 @@
-"""A bank of realisations that nights are drawn from: shipped experiments with seeds of their own, rendered once."""
+"""A bank of realisations that runs are drawn from: shipped experiments with seeds of their own, rendered once."""
 
 from pathlib import Path
 
 import polars as pl
 
 from simtest.nightly.gate.quantities import RESULT_COLUMNS
-from simtest.nightly.gate.records import PLACE
+from simtest.nightly.records import CELL
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import write_atomically
 from simtest.spec import Experiment, load_experiment
@@ -19,17 +19,17 @@ SLOW = "inverse_rendering"
 
 SEED = 20_000
 WORKERS = 2
-COLUMNS = (*PLACE, "realisation", *RESULT_COLUMNS)
+COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS)
 
 
 def experiment(name: str, realisations: int) -> Experiment:
-    """Give a shipped experiment with the bank's seed and number of realisations."""
+    """Return a shipped experiment with the bank's seed and number of realisations."""
     found = load_experiment(name, {"realisations": realisations, "seed": SEED})
     return found.model_copy(update={"estimators": tuple(e for e in found.estimators if e != SLOW)})
 
 
 def load_bank(folder: Path) -> pl.DataFrame:
-    """Give the bank's rows; a bank that is not there yet, or not whole, is made, which takes minutes.
+    """Read the bank's rows; first make a bank that is missing, or not whole, which takes minutes.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class Mutation:
     new: str
 
     def code(self) -> Any:
-        """Compile the changed source; gives the function's new code."""
+        """Compile the changed source into the function's new code."""
         source = textwrap.dedent(inspect.getsource(self.function))
         if source.count(self.old) != 1:
             raise LookupError(f"{self.function.__qualname__}: {self.old!r} occurs {source.count(self.old)} times")
@@ -83,7 +83,7 @@ def _forget() -> None:
 def unscaled_fit(contours: list[Any]) -> Any:
     """Fit ellipses by the published reduced eigenproblem on pixels as they are, neither centred nor scaled [HF98]."""
     conics = np.zeros((len(contours), 3, 3))
-    for place, (x, y) in enumerate(contour.T for contour in contours):
+    for index, (x, y) in enumerate(contour.T for contour in contours):
         quadratic = np.stack([x * x, x * y, y * y], axis=1)
         linear = np.stack([x, y, np.ones_like(x)], axis=1)
         T = -np.linalg.solve(linear.T @ linear, linear.T @ quadratic)
@@ -94,7 +94,7 @@ def unscaled_fit(contours: list[Any]) -> Any:
         a, b, c = vectors_of[:, int(constraint.argmax())]
         d, e, f = T @ (a, b, c)
         conic = np.array([[a, b / 2, d / 2], [b / 2, c, e / 2], [d / 2, e / 2, f]])
-        conics[place] = conic * (1.0 if a + c > 0 else -1.0) / np.sqrt((conic * conic).sum())
+        conics[index] = conic * (1.0 if a + c > 0 else -1.0) / np.sqrt((conic * conic).sum())
     return ellipse_fit.FittedConics(conics, np.broadcast_to(np.eye(3), conics.shape))
 
 

@@ -1,4 +1,4 @@
-"""Nights drawn from rows that were made once, and what the gate says of each."""
+"""Nights drawn from rows that were made once, and the gate's verdict on each."""
 
 import multiprocessing
 from collections.abc import Callable, Iterable
@@ -9,7 +9,7 @@ import numpy.typing as npt
 import polars as pl
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.records import FIGURES, PLACE, Night
+from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
 
 SETTING = ("experiment", "setting")
 WORKERS = 2
@@ -35,7 +35,7 @@ class Source:
 
     @classmethod
     def of(cls, rows: pl.DataFrame) -> "Source":
-        """Give rows with their units numbered."""
+        """Return rows with numbers of their units."""
         units = rows.select(*SETTING, "realisation").unique(maintain_order=True).with_row_index("unit")
         settings = units.select(SETTING).unique(maintain_order=True).with_row_index("number")
         numbers = units.join(settings, on=SETTING, maintain_order="left")["number"].to_numpy().astype(np.int64)
@@ -43,7 +43,7 @@ class Source:
         return cls(rows, unit.astype(np.int64), numbers)
 
     def ranks(self, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        """Give every unit a rank within its setting, in random order, shape (U,)."""
+        """Return a rank for every unit within its setting, in random order, shape (U,)."""
         order = np.lexsort((rng.random(len(self.setting)), self.setting))
         sizes = np.bincount(self.setting)
         ranks = np.empty(len(order), dtype=np.int64)
@@ -51,39 +51,33 @@ class Source:
         return ranks
 
     def chosen(self, units: npt.NDArray[np.bool_]) -> pl.DataFrame:
-        """Give the rows of some units."""
+        """Return the rows of some units."""
         return self.rows.filter(pl.Series(units[self.unit]))
 
 
-def night(rows: pl.DataFrame, name: str, equal: pl.DataFrame | None = None) -> Night:
-    """Give a night of rows; its places' hashes are its name, but for those that are equal to the other night's."""
-    places = rows.select(PLACE).unique(maintain_order=True).with_columns(digest=pl.lit(name))
+def run_of(rows: pl.DataFrame, name: str, equal: pl.DataFrame | None = None) -> NightlyRun:
+    """Make a run of rows; its cells' hashes are its name, except for those that are equal to the other run's."""
+    cells = rows.select(CELL).unique(maintain_order=True).with_columns(digest=pl.lit(name))
     if equal is not None:
-        places = places.join(equal.with_columns(same=pl.lit("equal")), on=PLACE, how="left").select(
-            *PLACE, digest=pl.coalesce("same", "digest")
+        cells = cells.join(equal.with_columns(same=pl.lit("equal")), on=CELL, how="left").select(
+            *CELL, digest=pl.coalesce("same", "digest")
         )
-    columns = [pl.lit(None, dtype).alias(column) for column, dtype in FIGURES.items() if column not in places.columns]
-    figures = places.with_columns(columns).with_columns(kind=pl.lit("setting"), quantity=pl.lit("n"))
-    return Night({}, rows, figures.select(list(FIGURES)))
+    columns = [pl.lit(None, dtype).alias(column) for column, dtype in FIGURES.items() if column not in cells.columns]
+    figures = cells.with_columns(columns).with_columns(kind=pl.lit("setting"), quantity=pl.lit("n"))
+    return NightlyRun(RunRecord(), rows, figures.select(list(FIGURES)))
 
 
-def equal_places(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
-    """Give the places whose rows are the same to the last bit in two tables of the same order."""
+def equal_cells(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
+    """Return the cells whose rows are the same to the last bit in two tables of the same order."""
     same = pl.Series([True] * first.height)
     for name in first.columns:
         same &= first[name].eq_missing(second[name])
-    return (
-        first.select(PLACE)
-        .with_columns(same=same)
-        .group_by(PLACE)
-        .agg(pl.col("same").all())
-        .filter("same")
-        .select(PLACE)
-    )
+    table = first.select(CELL).with_columns(same=same)
+    return table.group_by(CELL).agg(pl.col("same").all()).filter("same").select(CELL)
 
 
-Draw = Callable[[np.random.Generator], tuple[Night, Night]]
-"""Gives tonight and a baseline."""
+Draw = Callable[[np.random.Generator], tuple[NightlyRun, NightlyRun]]
+"""Draws tonight and a baseline."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +98,11 @@ class Fresh:
     n: int
     tonight: Source | None = None
 
-    def __call__(self, rng: np.random.Generator) -> tuple[Night, Night]:
+    def __call__(self, rng: np.random.Generator) -> tuple[NightlyRun, NightlyRun]:
         """Draw two nights without a common unit."""
         ranks = self.source.ranks(rng)
         after = (self.tonight or self.source).chosen((ranks >= self.n) & (ranks < 2 * self.n))
-        return night(after, "tonight"), night(self.source.chosen(ranks < self.n), "baseline")
+        return run_of(after, "tonight"), run_of(self.source.chosen(ranks < self.n), "baseline")
 
 
 @dataclass(frozen=True)
@@ -122,7 +116,7 @@ class Paired:
     n : int
         Realisations of each setting.
     equal : polars.DataFrame, optional
-        Places that are the same in both.
+        Cells that are the same in both.
     """
 
     baseline: Source
@@ -130,18 +124,18 @@ class Paired:
     n: int
     equal: pl.DataFrame | None = None
 
-    def __call__(self, rng: np.random.Generator) -> tuple[Night, Night]:
+    def __call__(self, rng: np.random.Generator) -> tuple[NightlyRun, NightlyRun]:
         """Draw the same units of both."""
         units = self.baseline.ranks(rng) < self.n
         return (
-            night(self.tonight.chosen(units), "tonight", self.equal),
-            night(self.baseline.chosen(units), "baseline", self.equal),
+            run_of(self.tonight.chosen(units), "tonight", self.equal),
+            run_of(self.baseline.chosen(units), "baseline", self.equal),
         )
 
 
 @dataclass(frozen=True)
 class Found:
-    """What the gate said of one night.
+    """The gate's verdict on one night.
 
     Parameters
     ----------

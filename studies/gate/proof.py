@@ -1,4 +1,4 @@
-"""Draws the nights and counts what the gate says of them."""
+"""Draws the nights and counts the gate's verdicts on them."""
 
 import os
 import tempfile
@@ -19,7 +19,7 @@ from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
-from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_places, judge_many, raised
+from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_cells, judge_many, raised
 
 FRESH_NIGHTS, PAIRED_NIGHTS, DETECTION_NIGHTS, CANARY_SEEDS = 1000, 200, 100, 100
 N = 10
@@ -93,7 +93,7 @@ class Caught:
 
 
 def bank_folder() -> Path:
-    """Give the bank's folder."""
+    """Return the bank's folder."""
     return Path(os.environ.get("GATE_BANK") or Path(tempfile.gettempdir()) / "gate-bank")
 
 
@@ -120,17 +120,17 @@ def harmless(nights: int = PAIRED_NIGHTS) -> list[Rate]:
     made = []
     for name, mutations in {TWO_PROCESSES: (), **HARMLESS}.items():
         after = _again(HARMLESS_CONTENT, mutations, workers=2 if name == TWO_PROCESSES else 1)
-        equal = equal_places(before, after) if before.height == after.height else None
+        equal = equal_cells(before, after) if before.height == after.height else None
         draw = Paired(Source.of(before), Source.of(after), HARMLESS_N, equal)
-        places = after.select("experiment", "setting", "estimator").n_unique()
+        cells = after.select("experiment", "setting", "estimator").n_unique()
         same = 0 if equal is None else equal.height
-        about = f"{same} of {places} places bit-equal; {_apart(before, after)}"
+        about = f"{same} of {cells} cells bit-equal; {_apart(before, after)}"
         made.append(_rate(name, draw, nights, about=about))
     return made
 
 
 def _apart(before: pl.DataFrame, after: pl.DataFrame) -> str:
-    """Say how far the errors of the same highlights are apart."""
+    """Report how far the errors of the same highlights are apart."""
     keys = ("experiment", "setting", "realisation", "estimator", "true_id")
     both = before.drop_nulls("error_deg").join(after.drop_nulls("error_deg"), on=keys, suffix="_2")
     apart = (both["error_deg"] - both["error_deg_2"]).abs().drop_nulls().to_numpy()
@@ -156,7 +156,7 @@ EXTRA = ("noise_sigma", "normal_x", "normal_y", "normal_z")
 
 
 def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate, Rate, bool]]:
-    """Judge nights in which one estimator's errors are 10 % larger: paired, and of fresh seeds; and tell if clearly."""
+    """Judge nights in which one estimator's errors are 10 % larger: paired, of fresh seeds, and whether clearly."""
     source = Source.of(bank)
     made = []
     for estimator in sorted(bank["estimator"].unique()):
@@ -176,7 +176,7 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
 
 
 def proof_experiments(realisations: int = 2 * N) -> list[Experiment]:
-    """Give the experiments that faults are planted into: kinds of surface, a light beside the camera, the protocol."""
+    """Return the experiments that faults are planted into: surfaces of all kinds, a light offset, the protocol."""
     plain = {"camera.width": 320, "camera.height": 320}
     groups = [
         {"scene": "plane", "label": "plane", "isolated": False, "set": plain},
@@ -216,7 +216,7 @@ def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS
         if rows is None:
             both = (Rate(name, nights, nights, stopped),) * 2
         else:
-            equal = equal_places(sound, rows) if rows.height == sound.height else None
+            equal = equal_cells(sound, rows) if rows.height == sound.height else None
             after = Source.of(rows)
             both = tuple(_rate(name, draw, nights) for draw in _draws(before, after, equal))
         made.append(Caught(name, watch, *both, rows is None))
@@ -238,7 +238,7 @@ def noise_canaries(seeds: int = CANARY_SEEDS) -> tuple[Rate, Rate]:
 
 
 def figures() -> list[Figure]:
-    """Give all figures beside their limits."""
+    """Return all figures beside their limits."""
     bank = load_bank(bank_folder())
     made = [Figure("realisations in the bank", frames_of(bank), 20_000, True, "")]
     made += [_alarm(f"false alarms, {rate.name}", rate) for rate in (*false_alarms(bank), *harmless())]

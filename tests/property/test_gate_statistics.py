@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
+from simtest.nightly.gate.contrasts import paired, unpaired
 from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.gate.holm import holm
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
 from simtest.nightly.gate.quantities import quantities
-from simtest.nightly.gate.records import OUTCOMES, Night
+from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.validation.results_table import SCHEMA
 
 ERROR = quantities(Limits())["mean_deg"]
@@ -45,7 +45,7 @@ def test_holm_is_closed_testing(p, data):
 
 def pairs_of(x, y):
     return pl.DataFrame(
-        {"place": 0, "quantity": "mean_deg", "realisation": np.arange(len(x)), "baseline": x, "tonight": y}
+        {"cell": 0, "quantity": "mean_deg", "realisation": np.arange(len(x)), "baseline": x, "tonight": y}
     )
 
 
@@ -68,7 +68,7 @@ def test_one_row_a_unit_is_student_s_test(x, data):
     interval = stats.ttest_1samp(y - x, 0).confidence_interval()
     np.testing.assert_allclose([found.low[0], found.high[0]], interval, rtol=1e-5, atol=1e-7)
     one, two = (
-        sums(pl.DataFrame({"place": 0, "quantity": "q", "realisation": np.arange(len(v)), "value": v})) for v in (x, y)
+        sums(pl.DataFrame({"cell": 0, "quantity": "q", "realisation": np.arange(len(v)), "value": v})) for v in (x, y)
     )
     welch = max(
         stats.ttest_ind(y, 1.02 * x, equal_var=False, alternative="greater").pvalue,
@@ -118,7 +118,7 @@ def test_any_two_nights_have_a_verdict_without_a_nan(first, second):
         table = table_of(made)
         # The figures' own intervals are for errors that are numbers: what is not is the gate's to bear.
         sane = table.with_columns(pl.col(pl.Float64).fill_nan(None).clip(0, 90))
-        return Night({}, table, setting_figures(sane))
+        return NightlyRun(RunRecord(), table, setting_figures(sane))
 
     verdict = compare(of(first), of(second))
     comparisons = verdict.comparisons
@@ -132,39 +132,35 @@ def test_any_two_nights_have_a_verdict_without_a_nan(first, second):
     assert verdict.state in ("fine", "regression")
 
 
-PLACES, NIGHTS = 12, 300
+CELLS, NIGHTS = 12, 300
 
 
 def pooled_p(units, factor):
-    """Give the pooled p-values of nights of heavy-tailed errors, tonight's times a factor."""
+    """Return the pooled p-values of nights of heavy-tailed errors, tonight's times a factor."""
     rng = np.random.default_rng(units)
-    shape = (NIGHTS * PLACES, units)
+    shape = (NIGHTS * CELLS, units)
     nights = [np.exp(1.2 * rng.standard_normal(shape)), factor * np.exp(1.2 * rng.standard_normal(shape))]
-    place, realisation = (axis.ravel() for axis in np.indices(shape))
+    cell, realisation = (axis.ravel() for axis in np.indices(shape))
     tables = [
-        sums(pl.DataFrame({"place": place, "quantity": "q", "realisation": realisation, "value": v.ravel()})).sort(
-            "place"
-        )
+        sums(pl.DataFrame({"cell": cell, "quantity": "q", "realisation": realisation, "value": v.ravel()})).sort("cell")
         for v in nights
     ]
     found = unpaired(*tables, ERROR)
-    parts = [np.s_[first : first + PLACES] for first in range(0, NIGHTS * PLACES, PLACES)]
-    return np.array(
-        [pooled(Outcomes(**{k: v[part] for k, v in vars(found).items()}), ERROR).worse[0] for part in parts]
-    )
+    parts = [np.s_[first : first + CELLS] for first in range(0, NIGHTS * CELLS, CELLS)]
+    return np.array([pooled(found[part], ERROR).worse[0] for part in parts])
 
 
 @pytest.mark.parametrize("units", [1, 2, 8])
-def test_places_together_keep_their_level_under_heavy_tails(units):
+def test_cells_together_keep_their_level_under_heavy_tails(units):
     """At 0.05: as many of 300 nights as have a chance below 1e-3 / 3 are too many; a tenfold error must be seen."""
     most = stats.binom.isf(1e-3 / 3, NIGHTS, 0.05)
     assert (pooled_p(units, 1.0) <= 0.05).sum() <= most
     assert (pooled_p(units, 10.0) <= 0.05).mean() > 0.8
 
 
-def test_few_places_of_few_units_say_nothing_together():
+def test_few_cells_of_few_units_say_nothing_together():
     x = pairs_of(np.ones(2), np.array([2.0, 3.0]))
-    table = paired_sums(pl.concat([x, x.with_columns(pl.lit(1, x["place"].dtype).alias("place"))])).sort("place")
+    table = paired_sums(pl.concat([x, x.with_columns(pl.lit(1, x["cell"].dtype).alias("cell"))])).sort("cell")
     found = pooled(paired(table, ERROR), ERROR)
     assert np.isnan(found.worse).all()
     np.testing.assert_allclose(found.difference, [2 * 1.5 / 3.5], rtol=1e-12, atol=1e-300)

@@ -1,17 +1,17 @@
-"""Nights made up for the tests of the gate."""
+"""Runs made up for the tests of the gate."""
 
 import numpy as np
 import polars as pl
 
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.records import FIGURES, Night
+from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
 from simtest.validation.results_table import SCHEMA
 
 RUN = {"id": "x", "versions": {"numpy": "2.4", "simtest": "0.1"}, "processor": "one"}
 
 
 def rows(count=20, level=1.0, seed=0, estimators=("cone_axis",), settings=("a",), spread=0.5, **columns):
-    """Give rows of one highlight a realisation, with Rayleigh-like errors about a level."""
+    """Return rows of one highlight a realisation, with Rayleigh-like errors about a level."""
     made = []
     for setting in settings:
         for estimator in estimators:
@@ -30,7 +30,7 @@ def rows(count=20, level=1.0, seed=0, estimators=("cone_axis",), settings=("a",)
 
 
 def night(table, canaries=(), costs=(), **run):
-    """Give a night of rows; canaries as (name, value, high), costs as (name, quantity, value, low, high)."""
+    """Return a run of rows; canaries as (name, value, high), costs as (name, quantity, value, low, high)."""
     extra = [
         {"kind": "canary", "experiment": name, "label": "", "surface": "", "setting": "", "estimator": "",
          "quantity": "off", "unit": "", "value": value, "low": 0.0, "high": high, "n": 1,
@@ -42,11 +42,11 @@ def night(table, canaries=(), costs=(), **run):
         for name, quantity, value, low, high in costs
     ]  # fmt: skip
     figures = pl.concat([setting_figures(table), pl.DataFrame(extra, schema=FIGURES)])
-    return Night({**RUN, **run}, table, figures)
+    return NightlyRun(RunRecord(**{**RUN, **run}), table, figures)
 
 
 def changed(table, condition, **values):
-    """Give rows with values replaced where a condition holds."""
+    """Return rows with values replaced where a condition holds."""
     return table.with_columns(
         pl.when(condition).then(pl.lit(value)).otherwise(pl.col(name)).cast(SCHEMA[name]).alias(name)
         for name, value in values.items()
@@ -54,6 +54,6 @@ def changed(table, condition, **values):
 
 
 def raised(table, factor, estimator="cone_axis"):
-    """Give rows with one estimator's errors times a factor."""
+    """Return rows with one estimator's errors times a factor."""
     own = pl.when(pl.col("estimator") == estimator).then(pl.col("error_deg") * factor)
     return table.with_columns(error_deg=own.otherwise(pl.col("error_deg")))

@@ -1,11 +1,11 @@
-"""A small night, made without rendering, for the tests of the nightly."""
+"""A small run, made without rendering, for the tests of the nightly."""
 
 from datetime import UTC, datetime
 
 import polars as pl
 
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.records import COMPARISONS, FIGURES, PLACE, Night, Verdict
+from simtest.nightly.records import CELL, COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.validation.results_table import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
@@ -42,28 +42,33 @@ def canary(name="axis ratio", value=1.0, passed=True):
     }  # fmt: skip
 
 
-def make_night(run=None, rows=None, canaries=()):
+def make_run(record=None, rows=None, canaries=()):
     rows = make_rows() if rows is None else rows
     figures = pl.concat([setting_figures(rows), pl.DataFrame(list(canaries) or [canary()], schema=FIGURES)])
-    return Night({**RUN, **(run or {})}, rows, figures)
+    return NightlyRun(RunRecord(**{**RUN, **(record or {})}), rows, figures)
 
 
-def compared(night, outcomes, **more):
-    """Give comparisons of a night's places, with outcomes in turn."""
-    places = night.figures.filter(pl.col("kind") == "setting").select(*PLACE).unique(maintain_order=True).rows()
+def compared(run, outcomes, **more):
+    """Return comparisons of a run's cells, with outcomes in turn."""
+    cells = run.figures_of("setting").select(CELL).unique(maintain_order=True).rows()
     made = [
-        dict(zip(PLACE, place, strict=True))
+        dict(zip(CELL, cell, strict=True))
         | {"quantity": "mean_deg", "unit": "deg", "method": "paired", "n": 4, "baseline": 1.0, "tonight": 1.1,
            "difference": 0.1, "low": 0.05, "high": 0.15, "margin": 0.02, "p": 1e-6, "p_holm": 1e-4}
         | {"outcome": outcomes[i % len(outcomes)], **more}
-        for i, place in enumerate(places)
+        for i, cell in enumerate(cells)
     ]  # fmt: skip
     return pl.DataFrame(made, schema=COMPARISONS)
 
 
-def regression(night, outcomes=("worse", "same", "better", "equivalent"), notes=(), **more):
-    return Verdict("regression", False, compared(night, outcomes, **more), tuple(notes), {**RUN, "reason": "first"})
+def regression(run, outcomes=("worse", "same", "better", "equivalent"), notes=(), **more):
+    baseline = RunRecord(**RUN, reason="first")
+    return Verdict("regression", False, compared(run, outcomes, **more), tuple(notes), baseline)
 
 
 def no_baseline():
     return Verdict("no baseline", None, pl.DataFrame(schema=COMPARISONS), ("No baseline.",), None)
+
+
+def judged(run, verdict):
+    return JudgedRun(run, verdict, pl.DataFrame())

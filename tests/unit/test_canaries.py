@@ -9,7 +9,7 @@ from gate_nights import rows
 from simtest.geometry import Camera
 from simtest.nightly.canaries import geometry, run_canaries
 from simtest.nightly.canaries import randomness as noise
-from simtest.nightly.gate.records import FIGURES
+from simtest.nightly.records import FIGURES
 from simtest.spec import Experiment
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 
@@ -49,7 +49,7 @@ def test_all_canaries_live():
 def test_a_fault_of_the_geometry_kills_its_canary(fault):
     with planted(*FAULTS[fault]):
         found = [c for measure in (geometry.conditioning, geometry.pose, geometry.isophotes) for c in measure()]
-    assert DETECTORS[fault] in {(canary.name, canary.quantity) for canary in found if not canary.passed}
+    assert DETECTORS[fault] in {(canary.cell.experiment, canary.quantity) for canary in found if not canary.passed}
 
 
 @pytest.mark.render

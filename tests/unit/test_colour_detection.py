@@ -107,7 +107,7 @@ def test_fill_keeps_what_is_known_and_is_smooth_between():
 def test_normals_of_a_sphere_point_back_along_the_sightlines():
     camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
     made = reconstruct_colour(picture(lobe(90, 70, 5.0) + lobe(230, 160, 6.0, 4.0)), Calibration(camera))
-    assert len(made.specularities) == len(made.highlights) == 2
+    assert len(made.specularities) == len(made.detection.highlights) == 2
     for spot in made.specularities:
         estimate = spot.estimates["cone_axis"]
         assert isinstance(estimate, Estimate)

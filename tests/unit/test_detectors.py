@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from simtest.reconstruction.colour_pipeline import reconstruct_colour
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Response, srgb_encode
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
@@ -10,7 +11,6 @@ from simtest.detection.peaks import PeakDetector, peaks
 from simtest.errors import InputError
 from simtest.geometry import Camera, Patch, ViewMask
 from simtest.geometry.angular_profile import AngularProfile
-from simtest.reconstruction.colour_pipeline import reconstruct_colour
 from simtest.reconstruction.pipeline import reconstruct
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)

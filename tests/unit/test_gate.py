@@ -7,13 +7,13 @@ from gate_nights import changed, night, raised, rows
 
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.figures import digest, setting_figures
-from simtest.nightly.gate.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
+from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
 
 FIRST_12 = pl.col("realisation") < 12
 
 
-def one(verdict, quantity, **place):
-    found = verdict.comparisons.filter(pl.col("quantity") == quantity, setting=place.pop("setting", "a"), **place)
+def one(verdict, quantity, **cell):
+    found = verdict.comparisons.filter(pl.col("quantity") == quantity, setting=cell.pop("setting", "a"), **cell)
     assert found.height == 1, verdict.comparisons
     return found.row(0, named=True)
 
@@ -57,7 +57,7 @@ def test_another_rounding_is_equivalent_and_said():
     assert verdict.state == "fine"
     assert set(verdict.comparisons["outcome"]) == {"equivalent"}
     assert verdict.notes[0] == "The processor changed from one to two. Costs were not judged."
-    assert verdict.notes[1].startswith("Medians agree to 0.001 deg at 1 of 1 places")
+    assert verdict.notes[1].startswith("Medians agree to 0.001 deg in 1 of 1 cells")
     assert "0 differ in status" in verdict.notes[2]
 
 
@@ -74,7 +74,7 @@ def test_answers_that_fail_do_not_vanish():
     assert "12 differ in status, 12 of them answered in the baseline alone and 0 tonight alone" in verdict.notes[-1]
 
 
-def test_a_place_without_any_answer():
+def test_a_cell_without_any_result():
     table = rows()
     none = changed(table, True, status="no_peak", error_deg=None, mahalanobis2=None, axis_ratio=None)
     gone = compare(night(none), night(table))
@@ -109,7 +109,7 @@ def test_large_rises_of_single_realisations_are_told():
     table = rows(count=1, level=0.01, settings=tuple("abcdefghi"))
     verdict = compare(night(raised(table, 4000.0)), night(table))
     assert (verdict.state, set(verdict.comparisons.filter(quantity="mean_deg")["outcome"])) == ("fine", {"undecided"})
-    assert verdict.notes[-1].startswith("At 9 places of one realisation the error rose by more than 10 margins")
+    assert verdict.notes[-1].startswith("In 9 cells of one realisation the error rose by more than 10 margins")
     for quiet in (raised(table, 50.0), raised(table, 0.001)):
         assert "of one realisation" not in compare(night(quiet), night(table)).notes[-1]
     assert "of one realisation" not in compare(night(raised(rows(), 40.0)), night(rows())).notes[-1]
@@ -125,7 +125,7 @@ def test_many_settings_decide_where_one_cannot():
     assert set(verdict.regressions["setting"]) == {POOLED}
 
 
-def test_places_that_one_night_lacks():
+def test_cells_that_one_night_lacks():
     table = rows(settings=("a", "b"))
     verdict = compare(night(table.filter(setting="b")), night(table.filter(setting="a")))
     outcomes = dict(verdict.comparisons.select("setting", "outcome").iter_rows())
@@ -152,7 +152,7 @@ def test_highlights_that_are_lost_make_nothing_better():
     assert (one(verdict, "mean_deg")["method"], one(verdict, "mean_deg")["outcome"]) == ("paired", "equivalent")
     assert one(verdict, "mean_deg")["n"] == 10
     assert "better" not in set(verdict.comparisons["outcome"])
-    assert verdict.notes[0].startswith("At 1 places highlights of the baseline are missing")
+    assert verdict.notes[0].startswith("In 1 cells highlights of the baseline are missing")
     worse = compare(night(raised(easy, 1.1)), night(table))
     assert set(worse.regressions["quantity"]) == {"n", "mean_deg"}
 
@@ -190,7 +190,7 @@ def test_without_exact_pairs_the_test_is_unpaired(cause):
     verdict = compare(night(other, **run), night(table))
     assert set(verdict.comparisons["method"]) == {"unpaired"}
     assert verdict.state == "fine"
-    told = "Versions changed from numpy 2.4 to numpy 2.5" if cause == "versions" else "of 1 places are not those"
+    told = "Versions changed from numpy 2.4 to numpy 2.5" if cause == "versions" else "of 1 cells differ from"
     assert told in verdict.notes[0]
     worse = compare(night(raised(other, 3.0), **run), night(table))
     assert one(worse, "mean_deg")["outcome"] == "worse"
@@ -204,7 +204,7 @@ def test_a_new_version_of_simtest_itself_leaves_pairs_pairs():
     assert set(verdict.comparisons["method"]) == {"paired"}
 
 
-def test_another_definition_of_an_experiment_unpairs_its_places():
+def test_another_definition_of_an_experiment_unpairs_its_cells():
     table = pl.concat([rows(), rows(seed=3, experiment="f")])
     known, other = {"e": "1", "f": "1"}, {"e": "2", "f": "1", "g": "9"}
     tonight = changed(raised(table, 1 + 1e-9), (pl.col("experiment") == "e") & FIRST_12, error_deg=0.1)
@@ -213,7 +213,7 @@ def test_another_definition_of_an_experiment_unpairs_its_places():
         verdict.comparisons.filter(quantity="mean_deg", label="l").select("experiment", "method").iter_rows()
     )
     assert methods == {"e": "unpaired", "f": "paired"}
-    assert verdict.notes[0] == "The definition changed of e: their places were compared unpaired."
+    assert verdict.notes[0] == "The definition of e changed: their cells were compared unpaired."
     # The same bytes all the same: it is said.
     same = compare(night(table, definitions=other), night(table, definitions=known))
     assert (same.bit_equal, len(same.notes)) == (True, 1)
@@ -352,7 +352,7 @@ def test_tables_keep_to_their_columns():
     assert compare(night(empty), night(empty)).state == "fine"
 
 
-def test_figures_of_a_place():
+def test_figures_of_a_cell():
     table = rows(count=4)
     table = changed(
         table, pl.col("realisation") == 3, status="missed", error_deg=None, mahalanobis2=None, axis_ratio=None

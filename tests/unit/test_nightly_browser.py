@@ -7,8 +7,9 @@ import pytest
 from test_nightly_page import rows_of
 from test_report import make_item
 
-from benchmarks.nights import history_of, night_of, verdict_of
-from simtest.nightly.page import Extras, write_nightly_page
+from benchmarks.nights import history_of, run_of, verdict_of
+from simtest.nightly.page import write_nightly_page
+from simtest.nightly.records import JudgedRun
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
 CHROMIUM = next(
@@ -22,10 +23,10 @@ DESKTOP, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 844}
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser")
-    night = night_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
+    run = run_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
     make_item(folder / "worst-00.npz", detail=3)
-    extras = Extras(gallery=(folder / "worst-00.npz",))
-    page = write_nightly_page(folder / "page", night, verdict_of(night), history_of(night, 30), extras)
+    judged = JudgedRun(run, verdict_of(run), history_of(run, 30), (folder / "worst-00.npz",))
+    page = write_nightly_page(folder / "page", judged)
     return page.as_uri()
 
 

@@ -13,17 +13,18 @@ from polars.testing import assert_frame_equal
 from simtest.errors import InputError
 from simtest.nightly import layout
 from simtest.nightly.baseline import accept, load_baseline
-from simtest.nightly.history import HISTORY, TREND_COLUMNS, append, clock_note, history_rows, read_history, short_commit
-from simtest.nightly.layout import Reports, new_run_id, remove_dead, replace_folder, scratch, turn
-from simtest.nightly.storage import BASELINE_ROWS, TONIGHT_ROWS, load_night, save_night
-from tests.unit.nightly_samples import STARTED, make_night, make_rows, no_baseline
+from simtest.nightly.history import HISTORY, TREND_COLUMNS, append, clock_note, history_rows, read_history
+from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
+from simtest.nightly.phrases import short_commit
+from simtest.nightly.storage import BASELINE_ROWS, LATEST_ROWS, load_run, save_run
+from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
 
 def keep(folder, number, **more):
     """Append a night; gives its file."""
     started = STARTED + timedelta(days=number)
-    run = {"id": f"{started:%Y%m%dT%H%M%SZ}-1-{number:08x}", "started": started.isoformat(), **more}
-    return append(folder, history_rows(make_night(run), no_baseline()))
+    record = {"id": f"{started:%Y%m%dT%H%M%SZ}-1-{number:08x}", "started": started.isoformat(), **more}
+    return append(folder, history_rows(make_run(record), no_baseline()))
 
 
 # History ---------------------------------------------------------------------------------------------------------
@@ -37,7 +38,7 @@ def test_a_night_reads_back_as_it_was_written(tmp_path):
     read, notes = read_history(tmp_path)
     assert notes == []
     assert read.schema == pl.Schema(HISTORY)
-    assert_frame_equal(read, history_rows(make_night({"id": file.stem}), no_baseline()))
+    assert_frame_equal(read, history_rows(make_run({"id": file.stem}), no_baseline()))
     assert read["started"].unique().to_list() == [STARTED]
     assert read["state"].unique().to_list() == ["no baseline"]
 
@@ -131,7 +132,7 @@ def test_a_copy_of_a_night_counts_once(tmp_path):
     copy.write_bytes(file.read_bytes())
     with pytest.warns(UserWarning, match="another file holds already"):
         read, notes = read_history(tmp_path)
-    assert read.height == make_night().figures.height
+    assert read.height == make_run().figures.height
     assert len(notes) == 1
 
 
@@ -210,25 +211,25 @@ def contents(folder):
 def reports(tmp_path):
     """Reports with a last night."""
     made = Reports(tmp_path / "reports")
-    write_tonight(made, make_night())
+    write_latest(made, make_run())
     return made
 
 
-def write_tonight(reports, night):
-    folder = reports.tonight(night.run["profile"])
+def write_latest(reports, run):
+    folder = reports.latest(run.record.profile)
     folder.mkdir(parents=True, exist_ok=True)
-    save_night(folder, night, TONIGHT_ROWS)
+    save_run(folder, run, LATEST_ROWS)
 
 
 def test_a_baseline_is_the_last_night_with_a_reason(reports):
     assert load_baseline(reports, "quick") is None
-    run = accept(reports, "quick", "  first\n night ")
-    found, night = load_baseline(reports, "quick"), make_night()
-    assert found.run == run
-    assert found.run["reason"] == "first night"
-    assert datetime.fromisoformat(run["accepted"]).tzinfo is not None
-    assert_frame_equal(found.figures, night.figures)
-    kept = night.rows.select(found.rows.columns)
+    record = accept(reports, "quick", "  first\n night ")
+    found, run = load_baseline(reports, "quick"), make_run()
+    assert found.record == record
+    assert found.record.reason == "first night"
+    assert datetime.fromisoformat(record.accepted).tzinfo is not None
+    assert_frame_equal(found.figures, run.figures)
+    kept = run.rows.select(found.rows.columns)
     assert_frame_equal(found.rows, kept)
     assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
     assert not list(reports.work.glob("2*"))
@@ -236,7 +237,7 @@ def test_a_baseline_is_the_last_night_with_a_reason(reports):
 
 def test_all_acceptances_are_kept(reports):
     accept(reports, "quick", "first")
-    write_tonight(reports, make_night({"id": "20260302T023000Z-7-0"}, make_rows(error_deg=0.5)))
+    write_latest(reports, make_run({"id": "20260302T023000Z-7-0"}, make_rows(error_deg=0.5)))
     accept(reports, "quick", "better ellipse fit")
     lines = [json.loads(line) for line in (reports.baseline("quick") / "log.jsonl").read_text().splitlines()]
     assert [line["reason"] for line in lines] == ["first", "better ellipse fit"]
@@ -269,7 +270,7 @@ def test_a_damaged_baseline_is_named(reports, name, damage):
         file.write_text("no table")
     else:
         kept = file.read_bytes()
-        write_tonight(reports, make_night(rows=make_rows(error_deg=3.0)))
+        write_latest(reports, make_run(rows=make_rows(error_deg=3.0)))
         accept(reports, "quick", "second")
         if file.read_bytes() == kept:
             pytest.skip("the same in both nights")
@@ -283,8 +284,8 @@ def test_a_damaged_baseline_is_named(reports, name, damage):
 def test_a_damaged_last_night_is_not_accepted(reports):
     accept(reports, "quick", "first")
     before = contents(reports.baseline("quick"))
-    os.truncate(reports.tonight("quick") / TONIGHT_ROWS, 100)
-    with pytest.raises(InputError, match=rf"{TONIGHT_ROWS}: damaged"):
+    os.truncate(reports.latest("quick") / LATEST_ROWS, 100)
+    with pytest.raises(InputError, match=rf"{LATEST_ROWS}: damaged"):
         accept(reports, "quick", "second")
     assert contents(reports.baseline("quick")) == before
 
@@ -293,7 +294,7 @@ def test_a_damaged_last_night_is_not_accepted(reports):
 def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, renames):
     """The renames are where the folder changes hands: a kill before, between and after them."""
     accept(reports, "quick", "first")
-    write_tonight(reports, make_night({"id": "20260302T023000Z-7-0"}))
+    write_latest(reports, make_run({"id": "20260302T023000Z-7-0"}))
     done, rename = [], Path.rename
 
     def killed(self, target):
@@ -311,9 +312,9 @@ def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, re
         with pytest.raises(KeyboardInterrupt):
             accept(reports, "quick", "second")
     monkeypatch.undo()
-    assert load_baseline(reports, "quick").run["reason"] == ("first" if renames < 2 else "second")
+    assert load_baseline(reports, "quick").record.reason == ("first" if renames < 2 else "second")
     accept(reports, "quick", "third")
-    assert load_baseline(reports, "quick").run["reason"] == "third"
+    assert load_baseline(reports, "quick").record.reason == "third"
     assert {path.name for path in reports.baseline("quick").parent.iterdir()} == {"quick", ".quick.lock"}
 
 
@@ -350,7 +351,7 @@ def test_a_folder_is_replaced_whole(tmp_path):
         new = tmp_path / "new"
         new.mkdir()
         (new / text).touch()
-        with turn(folder):
+        with exclusive_replacement(folder):
             replace_folder(new, folder)
         assert [path.name for path in folder.iterdir()] == [text]
 
@@ -362,7 +363,7 @@ def test_reports_that_are_a_file_are_refused(tmp_path):
 
 
 def test_a_night_that_another_wrote_is_refused(tmp_path):
-    save_night(tmp_path, make_night(), TONIGHT_ROWS)
+    save_run(tmp_path, make_run(), LATEST_ROWS)
     (tmp_path / "run.json").write_text('{"id": "x"}')
     with pytest.raises(InputError, match=r"run\.json: damaged"):
-        load_night(tmp_path, TONIGHT_ROWS)
+        load_run(tmp_path, LATEST_ROWS)

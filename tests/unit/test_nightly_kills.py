@@ -14,7 +14,7 @@ import pytest
 from simtest.nightly.baseline import load_baseline
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
-from simtest.nightly.storage import TONIGHT_ROWS, load_night
+from simtest.nightly.storage import LATEST_ROWS, load_run
 
 MAIN = "from simtest.cli.main import main; main()"
 ROUNDS = 2
@@ -69,12 +69,12 @@ def check_whole(reports):
     history, notes = read_history(reports.history)
     assert notes == []
     assert history["run_id"].n_unique() == len(kept(reports))
-    last = load_night(reports.tonight("tiny"), TONIGHT_ROWS)
-    assert last.run["id"] in set(history["run_id"])
-    page = (reports.tonight("tiny") / "index.html").read_text()
+    last = load_run(reports.latest("tiny"), LATEST_ROWS)
+    assert last.record.id in set(history["run_id"])
+    page = (reports.latest("tiny") / "index.html").read_text()
     assert page
     assert {"verdict.json", "junit.xml", "summary.md", "badge.svg"} <= {
-        path.name for path in reports.tonight("tiny").iterdir()
+        path.name for path in reports.latest("tiny").iterdir()
     }
 
 
@@ -115,19 +115,19 @@ def test_a_night_killed_at_any_moment_loses_nothing(tmp_path, profile):
     finish(accept(profile, reports, "first"))
     killed = 0
     for number, stage in enumerate([*STAGES, "work/*/baseline"] * ROUNDS):
-        before, accepted = kept(reports), load_baseline(reports, "tiny").run
+        before, accepted = kept(reports), load_baseline(reports, "tiny").record
         accepting = stage.endswith("baseline")
         process = accept(profile, reports, f"number {number}") if accepting else night(profile, reports)
         killed += kill_at(process, reports, stage, rng.uniform(0, 0.03))
         after = kept(reports)
         assert {path: after.get(path) for path in before} == before
-        assert load_baseline(reports, "tiny").run["reason"] in (accepted["reason"], f"number {number}")
+        assert load_baseline(reports, "tiny").record.reason in (accepted.reason, f"number {number}")
     # The last stages are short: some nights end before the kill.
     assert killed >= 3 * ROUNDS
     finish(night(profile, reports))
     check_whole(reports)
     finish(accept(profile, reports, "last"))
-    assert load_baseline(reports, "tiny").run["reason"] == "last"
+    assert load_baseline(reports, "tiny").record.reason == "last"
     assert not [path for path in reports.work.iterdir() if path.is_dir()]
     assert not [path for path in reports.history.rglob("*.part*")]
     assert {path.name for path in reports.baseline("tiny").parent.iterdir()} == {"tiny", ".tiny.lock"}
@@ -158,7 +158,7 @@ def test_a_full_disk_is_told_and_the_next_night_works(tmp_path, profile):
         finish(accept(profile, reports, "first"))
         stopped = 0
         for left_kib in (4, 48, 160, 1000):
-            before, accepted = kept(reports), load_baseline(reports, "tiny").run
+            before, accepted = kept(reports), load_baseline(reports, "tiny").record
             filler = disk / "filler"
             usage = shutil.disk_usage(disk)
             filler.write_bytes(bytes(max(0, usage.free - (left_kib << 10))))
@@ -172,7 +172,7 @@ def test_a_full_disk_is_told_and_the_next_night_works(tmp_path, profile):
                 assert "No space left on device" in last
             after = kept(reports)
             assert {path: after.get(path) for path in before} == before
-            assert load_baseline(reports, "tiny").run == accepted
+            assert load_baseline(reports, "tiny").record == accepted
             filler.unlink()
         assert stopped >= 2
         finish(night(profile, reports))

@@ -1,4 +1,4 @@
-"""What a night writes beside its page: JSON, JUnit XML, Markdown, a badge."""
+"""What a run writes beside its page: JSON, JUnit XML, Markdown, a badge."""
 
 import dataclasses
 import json
@@ -7,43 +7,45 @@ from xml.etree import ElementTree as ET
 import polars as pl
 import pytest
 
-from simtest.nightly.badge import COLOURS, badge
-from simtest.nightly.gate.records import COMPARISONS, OUTCOMES, PLACE, Verdict
-from simtest.nightly.junit import junit
 from simtest.nightly.outputs import write_outputs
-from simtest.nightly.summary import MAX_CHARACTERS, summary
-from tests.unit.nightly_samples import RUN, canary, compared, make_night, no_baseline, regression
+from simtest.nightly.outputs.badge import COLOURS, badge
+from simtest.nightly.outputs.junit import junit
+from simtest.nightly.outputs.summary import MAX_CHARACTERS, summary
+from simtest.nightly.records import CELL, COMPARISONS, OUTCOMES, RunRecord, Verdict
+from tests.unit.nightly_samples import RUN, canary, compared, judged, make_run, no_baseline, regression
+
+BASELINE = RunRecord(**RUN)
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture(scope="module")
-def night():
-    return make_night(canaries=[canary(), canary("rotated camera", 0.2, False)])
+def run():
+    return make_run(canaries=[canary(), canary("rotated camera", 0.2, False)])
 
 
-def written(folder, night, verdict):
+def written(folder, run, verdict):
     folder.mkdir(exist_ok=True)
-    write_outputs(folder, night, verdict)
+    write_outputs(folder, judged(run, verdict))
     return {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir()}
 
 
-def test_the_same_night_gives_the_same_bytes(tmp_path, night):
-    first = written(tmp_path / "first", night, regression(night))
-    assert written(tmp_path / "second", night, regression(night)) == first
+def test_the_same_night_gives_the_same_bytes(tmp_path, run):
+    first = written(tmp_path / "first", run, regression(run))
+    assert written(tmp_path / "second", run, regression(run)) == first
     assert set(first) == {"verdict.json", "junit.xml", "summary.md", "badge.svg"}
 
 
 # JSON ------------------------------------------------------------------------------------------------------------
 
 
-def test_json_holds_the_verdict(tmp_path, night):
-    verdict = regression(night, notes=["Versions differ."])
-    data = json.loads(written(tmp_path, night, verdict)["verdict.json"])
+def test_json_holds_the_verdict(tmp_path, run):
+    verdict = regression(run, notes=["Versions differ."])
+    data = json.loads(written(tmp_path, run, verdict)["verdict.json"])
     assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (1, "regression", 1, False)
     assert data["counts"] == {**dict.fromkeys(OUTCOMES, 0), "worse": 2, "same": 2, "better": 2, "equivalent": 2}
     assert data["notes"] == ["Versions differ."]
-    assert data["run"] == night.run
+    assert data["run"] == RUN
     assert data["baseline"]["reason"] == "first"
     assert data["canaries"]["n"] == 2
     assert [row["experiment"] for row in data["canaries"]["failed"]] == ["rotated camera"]
@@ -52,13 +54,13 @@ def test_json_holds_the_verdict(tmp_path, night):
     assert data["comparisons"][0]["p_holm"] == 1e-4
 
 
-def test_json_without_a_baseline(tmp_path, night):
-    data = json.loads(written(tmp_path, night, no_baseline())["verdict.json"])
+def test_json_without_a_baseline(tmp_path, run):
+    data = json.loads(written(tmp_path, run, no_baseline())["verdict.json"])
     assert (data["state"], data["exit_code"], data["bit_equal"], data["baseline"]) == ("no baseline", 0, None, None)
 
 
-def test_json_bears_figures_that_are_not_finite(tmp_path, night):
-    text = written(tmp_path, night, regression(night, difference=float("inf"), low=float("nan")))["verdict.json"]
+def test_json_bears_figures_that_are_not_finite(tmp_path, run):
+    text = written(tmp_path, run, regression(run, difference=float("inf"), low=float("nan")))["verdict.json"]
     row = json.loads(text, parse_constant=pytest.fail)["comparisons"][0]
     assert (row["difference"], row["low"]) == ("inf", "nan")
 
@@ -66,8 +68,8 @@ def test_json_bears_figures_that_are_not_finite(tmp_path, night):
 # JUnit -----------------------------------------------------------------------------------------------------------
 
 
-def test_junit_counts_what_it_lists(night):
-    root = ET.fromstring(junit(night, regression(night)))
+def test_junit_counts_what_it_lists(run):
+    root = ET.fromstring(junit(judged(run, regression(run))))
     assert root.tag == "testsuites"
     suites = {suite.get("name"): suite for suite in root}
     assert set(suites) == {"quick.first", "quick.second", "quick.canaries"}
@@ -96,33 +98,33 @@ JUNIT = {
 """Elements and attributes of the schema that the Jenkins plugin xunit publishes (junit-10.xsd), those that we use."""
 
 
-def test_junit_has_what_its_readers_know(night):
-    for verdict in (regression(night), no_baseline()):
-        for element in ET.fromstring(junit(night, verdict)).iter():
+def test_junit_has_what_its_readers_know(run):
+    for verdict in (regression(run), no_baseline()):
+        for element in ET.fromstring(junit(judged(run, verdict))).iter():
             assert set(element.attrib) <= JUNIT[element.tag]
             if "time" in element.attrib:
                 assert float(element.get("time")) >= 0
 
 
-def test_junit_skips_what_it_cannot_compare(night):
-    root = ET.fromstring(junit(night, no_baseline()))
+def test_junit_skips_what_it_cannot_compare(run):
+    root = ET.fromstring(junit(judged(run, no_baseline())))
     assert len(list(root.iter("skipped"))) == 8
     assert int(root.get("failures")) == 1  # the canary
-    new = Verdict("fine", False, compared(night, ("new", "same")), (), RUN)
-    assert len(list(ET.fromstring(junit(night, new)).iter("skipped"))) == 4
+    new = Verdict("fine", False, compared(run, ("new", "same")), (), BASELINE)
+    assert len(list(ET.fromstring(junit(judged(run, new))).iter("skipped"))) == 4
 
 
-def test_junit_names_places_that_are_gone(night):
-    gone = compared(night, ("gone",)).with_columns(pl.lit("third").alias("experiment"))
-    root = ET.fromstring(junit(night, Verdict("fine", False, gone, (), RUN)))
+def test_junit_names_cells_that_are_gone(run):
+    gone = compared(run, ("gone",)).with_columns(pl.lit("third").alias("experiment"))
+    root = ET.fromstring(junit(judged(run, Verdict("fine", False, gone, (), BASELINE))))
     assert {case.find("skipped").get("message") for case in root.iter("testcase")
-            if case.get("classname") == "quick.third"} == {"the place is gone"}  # fmt: skip
+            if case.get("classname") == "quick.third"} == {"the cell is gone"}  # fmt: skip
 
 
-def test_junit_bears_any_label(night):
+def test_junit_bears_any_label(run):
     odd = 'a<b> & "c" \x00\x1b ]]> \ud800'.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
-    rows = night.rows.with_columns(pl.lit(odd).alias("setting"))
-    text = junit(make_night(rows=rows), no_baseline())
+    rows = run.rows.with_columns(pl.lit(odd).alias("setting"))
+    text = junit(judged(make_run(rows=rows), no_baseline()))
     names = [case.get("name") for case in ET.fromstring(text.encode()).iter("testcase")]
     assert any('a<b> & "c"' in name for name in names)
 
@@ -130,17 +132,17 @@ def test_junit_bears_any_label(night):
 def test_canaries_are_told_apart_from_what_they_watch():
     """A canary that has failed, of the name of an experiment; the gate's comparisons hold it too."""
     watching = canary("first", 0.5, False)
-    night = make_night(canaries=[watching])
-    own = {name: watching[name] for name in (*PLACE, "quantity", "unit", "value", "low", "high")}
+    run = make_run(canaries=[watching])
+    own = {name: watching[name] for name in (*CELL, "quantity", "unit", "value", "low", "high")}
     row = {**own, "tonight": own.pop("value"), "method": "none", "outcome": "worse"}
     row.pop("value")
-    comparisons = pl.concat([compared(night, ("same",)), pl.DataFrame([row], schema=COMPARISONS)])
-    verdict = Verdict("regression", False, comparisons, (), RUN)
-    root = ET.fromstring(junit(night, verdict))
+    comparisons = pl.concat([compared(run, ("same",)), pl.DataFrame([row], schema=COMPARISONS)])
+    verdict = Verdict("regression", False, comparisons, (), BASELINE)
+    root = ET.fromstring(junit(judged(run, verdict)))
     (suite,) = [suite for suite in root if suite.get("name") == "quick.first"]
     assert (suite.get("tests"), suite.get("failures")) == ("4", "0")
     assert int(root.get("failures")) == 1
-    text = summary(night, verdict)
+    text = summary(judged(run, verdict))
     assert "### Worse" not in text
     assert "### Canaries failed: 1" in text
     assert "| first | 16 | 15 | 1 | 0 | 4 | 0 | 0 | 0 | 0 | 0 | 0 |" in text
@@ -149,8 +151,8 @@ def test_canaries_are_told_apart_from_what_they_watch():
 # Markdown --------------------------------------------------------------------------------------------------------
 
 
-def test_the_summary_says_first_what_matters(night):
-    lines = summary(night, regression(night, notes=["Versions differ."])).splitlines()
+def test_the_summary_says_first_what_matters(run):
+    lines = summary(judged(run, regression(run, notes=["Versions differ."]))).splitlines()
     assert lines[0] == "## Nightly quick: regression: 2 figures worse"
     assert lines[2].startswith('Not bit-equal to the baseline of 2026-03-01T02:30:00+00:00, commit 0123456789ab+: "fir')
     titles = [line for line in lines if line.startswith("#")]
@@ -160,9 +162,9 @@ def test_the_summary_says_first_what_matters(night):
                for line in lines)  # fmt: skip
 
 
-def test_tables_are_whole(night):
+def test_tables_are_whole(run):
     head = None
-    for line in summary(night, regression(night)).splitlines():
+    for line in summary(judged(run, regression(run))).splitlines():
         if not line.startswith("|"):
             head = None
             continue
@@ -171,24 +173,24 @@ def test_tables_are_whole(night):
         assert cells == head
 
 
-def test_the_counts_by_experiment(night):
-    text = summary(night, no_baseline())
+def test_the_counts_by_experiment(run):
+    text = summary(judged(run, no_baseline()))
     assert "| first | 16 | 15 | 1 | 0 |" in text
     assert "| second | 15 | 15 | 0 | 1 |" in text
 
 
-def test_a_huge_verdict_fits_a_comment(night):
-    places = pl.concat([compared(night, ("worse", "better"))] * 500)
-    long = places.with_columns(pl.lit("x" * 5000).alias("setting"))
-    verdict = Verdict("regression", False, long, tuple("note " * 500 for _ in range(1000)), RUN)
-    many = make_night(canaries=[canary("c" * 4000, passed=False)] * 500)
-    text = summary(many, verdict)
+def test_a_huge_verdict_fits_a_comment(run):
+    cells = pl.concat([compared(run, ("worse", "better"))] * 500)
+    long = cells.with_columns(pl.lit("x" * 5000).alias("setting"))
+    verdict = Verdict("regression", False, long, tuple("note " * 500 for _ in range(1000)), BASELINE)
+    many = make_run(canaries=[canary("c" * 4000, passed=False)] * 500)
+    text = summary(judged(many, verdict))
     assert 10_000 < len(text) <= MAX_CHARACTERS
 
 
-def test_texts_of_a_user_stay_texts(night):
+def test_texts_of_a_user_stay_texts(run):
     odd = "a|b <script>x</script> `c` @everyone\n# d"
-    lines = summary(night, regression(night, setting=odd, notes=[odd])).splitlines()
+    lines = summary(judged(run, regression(run, setting=odd, notes=[odd]))).splitlines()
     assert not [line for line in lines if "<script>" in line or "`c`" in line or "@everyone" in line]
     assert not [line for line in lines if line.startswith("# d")]
     assert any("a\\|b &lt;script>" in line for line in lines)
@@ -198,9 +200,9 @@ def test_texts_of_a_user_stay_texts(night):
 
 
 @pytest.mark.parametrize("state", COLOURS)
-def test_the_badge_is_told_to_those_who_do_not_see_it(night, state):
+def test_the_badge_is_told_to_those_who_do_not_see_it(run, state):
     verdict = Verdict(state, state == "fine", pl.DataFrame(schema=COMPARISONS), (), None)
-    root = ET.fromstring(badge(night, verdict))
+    root = ET.fromstring(badge(judged(run, verdict)))
     assert root.get("role") == "img"
     title = root.find(f"{SVG}title")
     assert root.get("aria-labelledby") == title.get("id")
@@ -221,7 +223,7 @@ def contrast_with_white(colour):
     return 1.05 / (0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2] + 0.05)
 
 
-def test_the_badge_tells_equal_bytes(night):
-    fine = Verdict("fine", True, pl.DataFrame(schema=COMPARISONS), (), RUN)
-    assert "fine, bit-equal" in badge(night, fine)
-    assert "bit-equal" not in badge(night, dataclasses.replace(fine, bit_equal=False))
+def test_the_badge_tells_equal_bytes(run):
+    fine = Verdict("fine", True, pl.DataFrame(schema=COMPARISONS), (), BASELINE)
+    assert "fine, bit-equal" in badge(judged(run, fine))
+    assert "bit-equal" not in badge(judged(run, dataclasses.replace(fine, bit_equal=False)))

@@ -1,4 +1,4 @@
-"""A night from start to end: exit codes, what it leaves, and what stops it."""
+"""A run from start to end: exit codes, what it leaves, and what stops it."""
 
 import errno
 import json
@@ -15,20 +15,22 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
+from simtest.nightly import draw as draw_module
+from simtest.nightly import judge as judge_module
 from simtest.nightly import measure
 from simtest.nightly import run as run_module
 from simtest.nightly.baseline import accept, load_baseline
-from simtest.nightly.gate.records import FIGURES
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
-from simtest.nightly.overview import failed_canaries
+from simtest.nightly.measure import RunOptions
+from simtest.nightly.records import FIGURES
 from simtest.nightly.run import run_nightly
-from simtest.nightly.storage import BASELINE_ROWS, save_night
+from simtest.nightly.storage import BASELINE_ROWS, save_run
 from simtest.runtime.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.runner import definition
-from tests.unit.nightly_samples import STARTED, canary, make_night, regression
+from tests.unit.nightly_samples import STARTED, canary, make_run, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -58,7 +60,7 @@ sweep = [{ "surface.tilt_deg" = [0.5, 3.0] }]
 
 @pytest.fixture
 def small(tmp_path):
-    """Give the path of a profile of two quick experiments."""
+    """Return the path of a profile of two quick experiments."""
     (tmp_path / "planes.toml").write_text(PLANES)
     (tmp_path / "small.toml").write_text(SMALL)
     return tmp_path / "small.toml"
@@ -71,18 +73,20 @@ def reports(tmp_path):
 
 @pytest.fixture
 def measured(monkeypatch):
-    """Have nights that are measured in no time; gives the list whose first one is next."""
-    nights = [make_night() for _ in range(10)]
+    """Have runs that are measured in no time; return the list whose first one is next."""
+    runs = [make_run() for _ in range(10)]
 
-    def measure_night(profile, folder, run_id, *_, **__):
-        night = nights.pop(0)
-        night.run.update(id=run_id, profile=profile.name)
-        return night
+    def measure_run(profile, folder, run_id, *_, **__):
+        return with_record(runs.pop(0), id=run_id, profile=profile.name)
 
-    monkeypatch.setattr(run_module, "measure_night", measure_night)
+    monkeypatch.setattr(run_module, "measure_run", measure_run)
     # Their experiments are made up.
-    monkeypatch.setattr(run_module, "worst_cases", lambda *_: ())
-    return nights
+    monkeypatch.setattr(draw_module, "worst_cases", lambda *_: ())
+    return runs
+
+
+def with_record(run, **values):
+    return replace(run, record=run.record.model_copy(update=values))
 
 
 def quick():
@@ -95,7 +99,7 @@ def accept_first(reports):
 
 
 def contents(folder):
-    """Give all files by path, but for locks."""
+    """Return all files by path, but for locks."""
     return {
         path.relative_to(folder): path.read_bytes()
         for path in folder.rglob("*")
@@ -189,9 +193,9 @@ def test_a_night_refuses_an_experiment_before_it_works(tmp_path, reports, entry,
 def test_a_night_is_measured_kept_and_published(small, reports):
     """Twice, with an accept between them: the second has the first's bytes."""
     profile, steps = load_profile(small), []
-    first = run_nightly(profile, reports, "simtest nightly", progress=lambda *step: steps.append(step))
-    assert (first.exit_code, first.verdict.state) == (0, "no baseline")
-    assert any("run simtest nightly accept" in note for note in first.verdict.notes)
+    first = run_nightly(profile, reports, RunOptions("simtest nightly", progress=lambda *step: steps.append(step)))
+    assert (first.judged.verdict.exit_code, first.judged.verdict.state) == (0, "no baseline")
+    assert any("run simtest nightly accept" in note for note in first.judged.verdict.notes)
     (total,) = {total for _, total, _ in steps}
     assert [done for done, *_ in steps] == sorted(done for done, *_ in steps)
     assert steps[0][0] == 0
@@ -200,7 +204,7 @@ def test_a_night_is_measured_kept_and_published(small, reports):
     assert {"index.html", "verdict.json", "junit.xml", "summary.md", "badge.svg", "run.json", "rows.parquet",
             "figures.parquet"} <= files  # fmt: skip
     history, _ = read_history(reports.history)
-    assert set(history["run_id"]) == {first.night.run["id"]}
+    assert set(history["run_id"]) == {first.judged.run.record.id}
     assert {"setting", "cost"} <= set(history["kind"])
     costs = history.filter(pl.col("kind") == "cost")
     assert {"cone_axis", "reconstruct", "night"} <= set(costs["estimator"])
@@ -211,28 +215,30 @@ def test_a_night_is_measured_kept_and_published(small, reports):
     accept(reports, "small", "first")
     second = run_nightly(profile.model_copy(update={"costs": False}), reports)
     # Costs that are no longer measured are missed, and nothing else.
-    assert set(second.verdict.regressions["experiment"]) == {"costs"}
-    assert second.night.rows.equals(first.night.rows)
-    settings = [night.figures.filter(pl.col("kind") == "setting") for night in (first.night, second.night)]
+    assert set(second.judged.verdict.regressions["experiment"]) == {"costs"}
+    assert second.judged.run.rows.equals(first.judged.run.rows)
+    settings = [outcome.judged.run.figures_of("setting") for outcome in (first, second)]
     assert settings[0].equals(settings[1])
     assert read_history(reports.history)[0]["run_id"].n_unique() == 2
-    assert second.verdict.baseline["reason"] == "first"
+    assert second.judged.verdict.baseline.reason == "first"
 
 
 def test_a_regression_exits_1(measured, reports, monkeypatch):
     accept_first(reports)
-    monkeypatch.setattr(run_module, "compare", lambda tonight, baseline: regression(tonight))
+    monkeypatch.setattr(judge_module, "compare", lambda tonight, baseline: regression(tonight))
     outcome = run_nightly(quick(), reports)
-    assert outcome.exit_code == 1
+    assert outcome.judged.verdict.exit_code == 1
     assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
     history, _ = read_history(reports.history, "quick")
-    assert history.filter(pl.col("run_id") == outcome.night.run["id"])["state"].unique().to_list() == ["regression"]
+    assert history.filter(pl.col("run_id") == outcome.judged.run.record.id)["state"].unique().to_list() == [
+        "regression"
+    ]
 
 
 def test_a_failed_canary_is_a_regression_without_a_baseline(measured, reports):
-    measured.insert(0, make_night(canaries=[canary("rotated camera", 0.5, False)]))
+    measured.insert(0, make_run(canaries=[canary("rotated camera", 0.5, False)]))
     outcome = run_nightly(quick(), reports)
-    assert outcome.exit_code == 1
+    assert outcome.judged.verdict.exit_code == 1
     text = (outcome.folder / "summary.md").read_text()
     assert "### Canaries failed: 1" in text
     assert "| rotated camera |" in text
@@ -243,18 +249,18 @@ def test_damage_in_the_history_is_told_on_the_page_and_the_night_goes_on(measure
     first = run_nightly(quick(), reports)
     os.truncate(first.history_file, 50)
     second = run_nightly(quick(), reports)
-    assert [note for note in second.verdict.notes if first.history_file.name in note]
+    assert [note for note in second.judged.verdict.notes if first.history_file.name in note]
     assert first.history_file.stat().st_size == 50
-    assert set(read_history(reports.history)[0]["run_id"]) == {second.night.run["id"]}
+    assert set(read_history(reports.history)[0]["run_id"]) == {second.judged.run.record.id}
 
 
 def test_a_clock_that_goes_back_is_told_and_nothing_is_overwritten(measured, reports):
-    measured[0].run["started"] = (STARTED + timedelta(days=30)).isoformat()
+    measured[0] = with_record(measured[0], started=(STARTED + timedelta(days=30)).isoformat())
     first, second = (run_nightly(quick(), reports) for _ in range(2))
-    assert [note for note in second.verdict.notes if note.startswith("The clock went back")]
-    assert not [note for note in first.verdict.notes if "clock" in note]
+    assert [note for note in second.judged.verdict.notes if note.startswith("The clock went back")]
+    assert not [note for note in first.judged.verdict.notes if "clock" in note]
     history, _ = read_history(reports.history)
-    assert history["run_id"].unique(maintain_order=True).to_list() == [o.night.run["id"] for o in (second, first)]
+    assert history["run_id"].unique(maintain_order=True).to_list() == [o.judged.run.record.id for o in (second, first)]
 
 
 def test_a_damaged_baseline_stops_a_night_before_it_works(measured, reports):
@@ -270,19 +276,19 @@ def test_a_damaged_baseline_stops_a_night_before_it_works(measured, reports):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda night: replace(night, rows=night.rows.drop("seed")), "quick/night.parquet: damaged .no column seed"),
-        (lambda night: replace(night, rows=night.rows.cast({"error_deg": pl.String})),
+        (lambda run: replace(run, rows=run.rows.drop("seed")), "quick/night.parquet: damaged .no column seed"),
+        (lambda run: replace(run, rows=run.rows.cast({"error_deg": pl.String})),
          "quick/night.parquet: damaged .column error_deg is of type String, not Float64"),
-        (lambda night: replace(night, figures=night.figures.cast({"value": pl.String})),
+        (lambda run: replace(run, figures=run.figures.cast({"value": pl.String})),
          "quick/figures.parquet: damaged .column value is of type String, not Float64"),
-        (lambda night: replace(night, run={**night.run, "profile": "full"}), "quick/run.json: profile = full; the "
+        (lambda run: with_record(run, profile="full"), "quick/run.json: profile = full; the "
          "baseline of this night must be of the profile quick"),
     ],
 )  # fmt: skip
 def test_a_baseline_that_cannot_be_compared_stops_a_night_before_it_works(measured, reports, change, said):
     """Its hashes are right: it was written so."""
     accept_first(reports)
-    save_night(reports.baseline("quick"), change(load_baseline(reports, "quick")), BASELINE_ROWS)
+    save_run(reports.baseline("quick"), change(load_baseline(reports, "quick")), BASELINE_ROWS)
     before, left = contents(reports.root), len(measured)
     with pytest.raises(InputError, match=said):
         run_nightly(quick(), reports)
@@ -317,7 +323,7 @@ def test_the_next_night_works_after_a_full_disk(measured, reports, monkeypatch):
         patch.setattr(run_module, "append", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
         with pytest.raises(SimtestError):
             run_nightly(quick(), reports)
-    assert run_nightly(quick(), reports).exit_code == 0
+    assert run_nightly(quick(), reports).judged.verdict.exit_code == 0
 
 
 def fails_with(error):
@@ -328,20 +334,20 @@ def fails_with(error):
 
 
 def test_a_night_without_its_pictures_is_kept_and_says_so(measured, reports, monkeypatch):
-    monkeypatch.setattr(run_module, "save_worst", fails_with(RuntimeError("no such\nframe")))
+    monkeypatch.setattr(draw_module, "save_worst", fails_with(RuntimeError("no such\nframe")))
     outcome = run_nightly(quick(), reports)
     said = "The worst cases could not be made again (RuntimeError: no such frame)."
-    assert said in outcome.verdict.notes
+    assert said in outcome.judged.verdict.notes
     assert said in json.loads((outcome.folder / "verdict.json").read_text())["notes"]
     assert outcome.history_file.is_file()
 
 
 @pytest.mark.parametrize("error", [RuntimeError("a page's fault"), KeyboardInterrupt()])
-@pytest.mark.parametrize("step", ["make_page", "write_nightly_page", "append"])
+@pytest.mark.parametrize("step", ["judge", "draw", "write_nightly_page", "append"])
 def test_nothing_is_kept_of_a_night_that_stops_before_it_is_whole(measured, reports, monkeypatch, step, error):
     accept_first(reports)
     before = contents(reports.root)
-    monkeypatch.setattr(run_module, step, fails_with(error))
+    monkeypatch.setattr(draw_module if step == "write_nightly_page" else run_module, step, fails_with(error))
     with pytest.raises(type(error)) as stop:
         run_nightly(quick(), reports)
     assert contents(reports.root) == before
@@ -358,10 +364,10 @@ def test_a_ctrl_c_after_the_history_says_what_is_kept(measured, here, monkeypatc
 
 def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
     for error in (pl.exceptions.ColumnNotFoundError("seed"), OSError(errno.ENOMEM, "Cannot allocate memory")):
-        monkeypatch.setattr(run_module, "measure_night", fails_with(error))
+        monkeypatch.setattr(run_module, "measure_run", fails_with(error))
         with pytest.raises(type(error)):
             run_nightly(quick(), reports)
-    monkeypatch.setattr(run_module, "measure_night", fails_with(
+    monkeypatch.setattr(run_module, "measure_run", fails_with(
         pl.exceptions.ComputeError("No space left on device (os error 28)")))  # fmt: skip
     with pytest.raises(SimtestError, match=r"the night could not be written .No space left"):
         run_nightly(quick(), reports)
@@ -385,7 +391,7 @@ def figure_of(kind, name):
 
 @pytest.fixture
 def parts(monkeypatch):
-    """Have a night whose parts but the experiments do nothing; gives the order in which they are asked."""
+    """Have a run whose parts but the experiments do nothing; return the order in which they are asked."""
     told, experiments = [], measure.run_experiments
 
     def tells(name, result):
@@ -409,14 +415,14 @@ PAPER = '[[experiments]]\nexperiment = "paper"\nlabels = ["noise"]\nrealisations
 def night_of(tmp_path, text=PAPER):
     folder = tmp_path / f"night-{len(list(tmp_path.glob('night-*')))}"
     folder.mkdir()
-    return measure.measure_night(profile_of(tmp_path, text), folder, "id")
+    return measure.measure_run(profile_of(tmp_path, text), folder, "id")
 
 
 def test_canaries_come_first(parts, tmp_path):
-    night = night_of(tmp_path)
+    run = night_of(tmp_path)
     assert parts == ["canaries", "ladder", "experiments", "noises_of", "costs"]
-    assert failed_canaries(night).height == 0
-    assert set(night.figures["kind"]) == {"setting", "canary", "ladder", "cost"}
+    assert run.failed_canaries.height == 0
+    assert set(run.figures["kind"]) == {"setting", "canary", "ladder", "cost"}
 
 
 @pytest.mark.parametrize("part", ["ladder_figures", "noises_of", "run_times"])
@@ -424,19 +430,19 @@ def test_canaries_come_first(parts, tmp_path):
 def test_a_part_that_breaks_is_a_failed_canary_of_a_night_that_is_kept(parts, tmp_path, monkeypatch, part, error):
     monkeypatch.setattr({"noises_of": measure.noise, "run_times": measure.cost}.get(part, measure), part,
                         fails_with(error))  # fmt: skip
-    night = night_of(tmp_path)
-    assert night.rows.height
-    (failed,) = failed_canaries(night).to_dicts()
+    run = night_of(tmp_path)
+    assert run.rows.height
+    (failed,) = run.failed_canaries.to_dicts()
     names = {"ladder_figures": "error ladder", "noises_of": "noises_of", "run_times": "costs"}
     assert (failed["experiment"], failed["about"]) == (names[part], f"{type(error).__name__}: odd")
 
 
 def test_the_record_says_what_ran(parts, tmp_path):
     first, again, more = (night_of(tmp_path, text) for text in (PAPER, PAPER, PAPER + "seed = 3\n"))
-    assert set(first.run["definitions"]) == {"paper"}
-    assert re.fullmatch("[0-9a-f]{64}", first.run["definitions"]["paper"])
-    assert first.run["definitions"] == again.run["definitions"]
-    assert first.run["definitions"] != more.run["definitions"]
+    assert set(first.record.definitions) == {"paper"}
+    assert re.fullmatch("[0-9a-f]{64}", first.record.definitions["paper"])
+    assert first.record.definitions == again.record.definitions
+    assert first.record.definitions != more.record.definitions
 
 
 def test_a_definition_is_that_of_scene_and_files_and_not_of_place_or_source(small, tmp_path, monkeypatch):
@@ -485,13 +491,13 @@ def test_the_command_prints_a_table_and_the_page(measured, here, tmp_path):
     code, output, errors = here("accept", "--reason", "first night")
     assert (code, errors) == (0, [])
     assert output.endswith(" is the baseline of quick: first night\n")
-    assert load_baseline(Reports(tmp_path / "reports"), "quick").run["reason"] == "first night"
+    assert load_baseline(Reports(tmp_path / "reports"), "quick").record.reason == "first night"
 
 
 def test_the_command_prints_what_is_worse(measured, here, monkeypatch):
     assert here()[0] == 0
     assert here("accept", "--reason", "first")[0] == 0
-    monkeypatch.setattr(run_module, "compare", lambda tonight, baseline: regression(tonight))
+    monkeypatch.setattr(judge_module, "compare", lambda tonight, baseline: regression(tonight))
     code, output, _ = here()
     assert code == 1
     assert "worse: first, plane, tilt_deg=0, cone_axis, mean_deg: 1.1 deg, baseline 1 deg" in output.splitlines()
@@ -511,7 +517,7 @@ def test_a_night_that_could_not_be_run_exits_2(here, monkeypatch, error, said):
     def fails(*_, **__):
         raise error
 
-    monkeypatch.setattr(run_module, "measure_night", fails)
+    monkeypatch.setattr(run_module, "measure_run", fails)
     assert here() == (2, "", [f"simtest: {said}"])
 
 
@@ -532,12 +538,12 @@ def test_bad_use_exits_2(here, line, said):
 
 
 def test_ctrl_c_says_what_is_kept(here, monkeypatch, tmp_path):
-    def stopped(profile, folder, run_id, command, variant, engine, workers, progress):
-        progress(0, 5, "first")
+    def stopped(profile, folder, run_id, options):
+        options.progress(0, 5, "first")
         os.kill(os.getpid(), signal.SIGINT)
-        progress(1, 5, "first")
+        options.progress(1, 5, "first")
 
-    monkeypatch.setattr(run_module, "measure_night", stopped)
+    monkeypatch.setattr(run_module, "measure_run", stopped)
     code, output, errors = here()
     assert (code, output) == (130, "")
     assert errors[-1] == (
@@ -556,12 +562,12 @@ def test_the_bar_moves_one_way():
     """Each part of a night has its share of the bar."""
     told = []
     steps = measure._Steps(lambda *step: told.append(step), 10)
-    move = steps.of("experiments")
+    move = steps.within("experiments")
     for done in range(11):
         move(done, 10, "plane")
-    steps.tell("costs")
+    steps.show("costs")
     steps.end()
     assert told[0] == (0, 13, "plane")
     assert told[10] == (10, 13, "experiments")
     assert told[-1] == (13, 13, "done")
-    assert measure._Steps(None, 10).of("experiments") is None
+    assert measure._Steps(None, 10).within("experiments") is None

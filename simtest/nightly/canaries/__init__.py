@@ -1,6 +1,10 @@
-"""Canaries: figures whose value is known, which see faults that the errors of a night do not show."""
+"""Canaries: figures whose value is known, which see faults that the errors of a run do not show.
 
-from collections.abc import Callable, Sequence
+`geometry` renders nothing, `rendered` checks radiance and truth, `randomness` the noise; `by_hand` holds the formulas
+written down anew that they compare with.
+"""
+
+from collections.abc import Callable
 from functools import cache, partial
 
 import polars as pl
@@ -8,35 +12,24 @@ import polars as pl
 from simtest.errors import BackendError
 from simtest.nightly.canaries import geometry, rendered
 from simtest.nightly.canaries import randomness as noise
-from simtest.nightly.canaries.record import Canary, as_figures
+from simtest.nightly.canaries.canary import or_failed_canary
+from simtest.nightly.records import Figure, figure_table
 from simtest.rendering import Session
-from simtest.spec import Experiment
 
-__all__ = ["Canary", "run_canaries"]
+__all__ = ["run_canaries"]
+
+ALONE = (geometry.sightlines, geometry.conditioning, geometry.pose, geometry.isophotes, noise.published)
+IN_SESSION = (rendered.photometry, rendered.truth, rendered.plane_errors, rendered.curved_errors, rendered.rotated)
 
 
-def run_canaries(
-    rows: pl.DataFrame | None = None, variant: str | None = None, seed: int = 0,
-    experiments: Sequence[Experiment] | None = None,
-) -> pl.DataFrame:  # fmt: skip
-    """Measure all canaries.
-
-    Parameters
-    ----------
-    rows : polars.DataFrame, optional
-        Results of the night's experiments, whose noise is looked at too.
-    variant : str, optional
-        Mitsuba variant.
-    seed : int
-        Of the noise.
-    experiments : sequence of Experiment, optional
-        What the rows are of: tells whether they must be noisy.
+def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None) -> pl.DataFrame:
+    """Measure all canaries, of the noise of some results too, where there are any.
 
     Returns
     -------
     polars.DataFrame
-        Columns `simtest.nightly.gate.records.FIGURES`, kind "canary". One that cannot be measured for an error has no
-        value, and has not passed; its `about` holds the error.
+        Columns `FIGURES`, kind "canary". One that an error stops has no value, and has not passed; its `about` holds
+        the error.
 
     Raises
     ------
@@ -48,30 +41,18 @@ def run_canaries(
     def session() -> Session:
         return Session(rendered.described(rendered.PLANE), variant)
 
-    alone = (geometry.sightlines, geometry.conditioning, geometry.pose, geometry.isophotes, noise.published)
-    in_session = (
-        rendered.photometry, rendered.truth, rendered.plane_errors, rendered.curved_errors, rendered.rotated
-    )  # fmt: skip
-    measured: list[Callable[[], list[Canary]]] = [*alone]
-    measured += [partial(_in, session, measure) for measure in in_session]
-    measured.append(partial(noise.noises, variant, seed))
+    measured: dict[str, Callable[[], list[Figure]]] = {measure.__name__: measure for measure in ALONE}
+    measured |= {measure.__name__: partial(_in, session, measure) for measure in IN_SESSION}
+    measured["noises"] = partial(noise.noises, variant)
     if rows is not None:
-        measured.append(partial(noise.noises_of, rows, experiments))
-    names = [*(measure.__name__ for measure in (*alone, *in_session)), "noises", "noises_of"]
-    return as_figures(
-        [canary for name, measure in zip(names, measured, strict=False) for canary in _any(name, measure)]
-    )
+        measured["noises_of"] = partial(noise.noises_of, rows)
+    # Without a backend there is no run; any other error fails its canary.
+    return pl.concat(or_failed_canary(name, partial(_table, own), (BackendError,)) for name, own in measured.items())
 
 
-def _in(session: Callable[[], Session], measure: Callable[[Session], list[Canary]]) -> list[Canary]:
+def _in(session: Callable[[], Session], measure: Callable[[Session], list[Figure]]) -> list[Figure]:
     return measure(session())
 
 
-def _any(name: str, measure: Callable[[], list[Canary]]) -> list[Canary]:
-    """Give canaries, or in their place one that says why there are none: a fault may break any of them."""
-    try:
-        return measure()
-    except BackendError:
-        raise
-    except Exception as error:
-        return [Canary(name, "error", "", float("nan"), 0.0, n=0, about=f"{type(error).__name__}: {error}")]
+def _table(measure: Callable[[], list[Figure]]) -> pl.DataFrame:
+    return figure_table(measure())

@@ -6,7 +6,8 @@ from hashlib import sha256
 import numpy as np
 import polars as pl
 
-from simtest.nightly.canaries.record import Canary
+from simtest.nightly.canaries.canary import canary
+from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import render_view
@@ -18,7 +19,7 @@ from simtest.validation.paper.rows import paper_rows
 from simtest.validation.results_table import ResultRow
 
 SLANT_OFF_DEG = 0.05
-"""What interpolation may leave of the error of circle_pose without noise and smoothing; 0.0085 deg."""
+"""Bound of circle_pose's error without noise and smoothing; interpolation leaves 0.0085 deg."""
 
 _SIGMA_PATH = "sensor.noise_sigma"
 
@@ -26,16 +27,8 @@ REALISATIONS = 8
 SIGMA = 0.05
 
 
-def noises(variant: str | None = None, seed: int = 0) -> list[Canary]:
-    """Make the frames of some realisations, rendered and of the published protocol.
-
-    Parameters
-    ----------
-    variant : str, optional
-        Mitsuba variant.
-    seed : int
-        Of the run.
-    """
+def noises(variant: str | None = None, seed: int = 0) -> list[Figure]:
+    """Check the noise of some realisations' frames, rendered and of the published protocol."""
     small = {"camera.width": 64, "camera.height": 64, "camera.fx": 100.0, "camera.fy": 100.0}
     groups = [
         {"scene": "plane", "isolated": False, "set": {**small, "sensor.noise_sigma": SIGMA}, "label": "rendered"},
@@ -43,13 +36,15 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Canary]:
     ]
     experiment = Experiment(name="canary", realisations=REALISATIONS, seed=seed, groups=groups)
     case, published = expand(experiment)
-    # A scene of its own, so that no other canary's session is moved.
+    # A session of its own, so that no other canary's scene is changed.
     scene = scene_from_dict(case.data, "canary")
     seen = render_view(Session(scene, variant), scene)
     frames = [seen.frame(case.noise_seed(experiment, number)) for number in case.numbers()]
+    # The published protocol
     pipeline = Pipeline(PaperSetting(size=64, sigma=SIGMA), {})
     generators = [from_integer(published.noise_seed(experiment, number)) for number in published.numbers()]
     pictures = [pipeline.stages(rng).noisy for rng in generators]
+    # The noise that the rendered frames have beside their light
     clean = seen.light / np.float32(seen.full_scale)
     left = np.std([frame - clean for frame in frames])
     count = len(frames) * clean.size
@@ -57,33 +52,33 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Canary]:
     return [
         _distinct("rendered", frames),
         _distinct("published", pictures),
-        Canary("noise", "sigma", "", float(left), *_around(SIGMA, 5 * SIGMA / np.sqrt(2 * count)), count, about),
+        canary("noise", "sigma", "", float(left), *_around(SIGMA, 5 * SIGMA / np.sqrt(2 * count)), count, about),
     ]
 
 
-def published() -> list[Canary]:
+def published() -> list[Figure]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)
     rows = paper_rows(setting, ResultRow(), range(1), [0], ("circle_pose",))
     off = rows["error_deg"].fill_null(np.nan).item()
     about = "circle_pose at a slant of 58 deg, without noise; unsmoothed; interpolation leaves 0.01 deg"
-    return [Canary("published", "circle_pose_off", "deg", off, SLANT_OFF_DEG, about=about)]
+    return [canary("published", "circle_pose_off", "deg", off, SLANT_OFF_DEG, about=about)]
 
 
 def _around(value: float, gap: float) -> tuple[float, float]:
-    """Give the upper and the lower bound."""
+    """Return the upper and the lower bound."""
     return value + gap, value - gap
 
 
-def _distinct(name: str, frames: list[np.ndarray]) -> Canary:
+def _distinct(name: str, frames: list[np.ndarray]) -> Figure:
     found = len({sha256(np.ascontiguousarray(frame).tobytes()).digest() for frame in frames})
     count = len(frames)
     about = "hashes of the frames of one setting; all differ"
-    return Canary("noise", f"distinct_{name}", "", float(found), count, count, count, about)
+    return canary("noise", f"distinct_{name}", "", float(found), count, count, count, about)
 
 
-def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = None) -> list[Canary]:
-    """Count the realisations of a night's noisy settings that repeat another's seed, or its answers to the last bit.
+def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = None) -> list[Figure]:
+    """Count the realisations of noisy settings that repeat another's seed, or its results to the last bit.
 
     Parameters
     ----------
@@ -91,47 +86,47 @@ def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = Non
         Results of all experiments.
     experiments : sequence of Experiment, optional
         What was run. Where one is defined with noise and its rows have none, the noise is lost and there is nothing to
-        count: no value, which does not pass. Without them, rows that all state a noise of 0 are taken at their word.
+        count: no value, which does not pass. Without them, rows that all state a noise of 0 are trusted.
     """
     lost = _without_noise(rows, experiments)
     setting = ("experiment", "setting")
     noisy = rows.filter(pl.col("noise_sigma") > 0)
+    # Repeated seeds
     frames = noisy.select(*setting, "realisation", "seed").unique()
     seeds = frames.group_by(setting).agg(repeated=pl.len() - pl.col("seed").n_unique())["repeated"].sum()
-    # Three numbers of white noise that are equal by chance: the same noise.
-    answers = noisy.filter(pl.col("status") == "ok", pl.col("true_id").is_not_null(), pl.col("specularity") == 0)
-    place = (*setting, "estimator")
-    same = answers.group_by(place).agg(repeated=pl.len() - pl.struct("normal_x", "normal_y", "normal_z").n_unique())
-    # No repetition among no answers is no proof of different ones.
-    silent = frames.height > 0 and answers.is_empty()
-    told = f"; no noise in {', '.join(lost)}" if lost else ""
+    # Repeated results: three numbers of white noise are not equal by chance, it is the same noise.
+    results = noisy.filter(pl.col("status") == "ok", pl.col("true_id").is_not_null(), pl.col("specularity") == 0)
+    normals = pl.struct("normal_x", "normal_y", "normal_z")
+    same = results.group_by(*setting, "estimator").agg(repeated=pl.len() - normals.n_unique())["repeated"].sum()
+    # Without results there are no repeated ones, which proves nothing.
+    silent = frames.height > 0 and results.is_empty()
+    more = f"; no noise in {', '.join(lost)}" if lost else ""
     return [
-        Canary(
+        canary(
             "noise", "repeated_seeds", "", float("nan") if lost else float(seeds), 0, n=frames.height,
-            about="of the night's noisy settings" + told,
+            about="of the night's noisy settings" + more,
         ),
-        Canary(
-            "noise", "repeated_answers", "", float("nan") if lost or silent else float(same["repeated"].sum()), 0,
-            n=answers.height,
-            about="normals of the brightest highlight of the night's noisy settings that are the same bits" + told,
+        canary(
+            "noise", "repeated_answers", "", float("nan") if lost or silent else float(same), 0, n=results.height,
+            about="normals of the brightest highlight of the night's noisy settings that are the same bits" + more,
         ),
     ]  # fmt: skip
 
 
 def _without_noise(rows: pl.DataFrame, experiments: Sequence[Experiment] | None) -> list[str]:
-    """Name the experiments whose noise is not in their rows."""
+    """Return the experiments whose noise is not in their rows."""
     found = rows.group_by("experiment", maintain_order=True).agg(
         noisy=(pl.col("noise_sigma").is_finite() & (pl.col("noise_sigma") > 0)).any(),
-        told=pl.col("noise_sigma").is_finite().any(),
+        stated=pl.col("noise_sigma").is_finite().any(),
     )
     if experiments is None:
-        return found.filter(~pl.col("told"))["experiment"].to_list()
+        return found.filter(~pl.col("stated"))["experiment"].to_list()
     noisy = set(found.filter("noisy")["experiment"].to_list())
     return [own.name for own in experiments if own.name not in noisy and any(_sigma(case) > 0 for case in expand(own))]
 
 
 def _sigma(case: Case) -> float:
-    """Give the standard deviation of a case's noise; where it is drawn, the largest."""
+    """Return the standard deviation of a case's noise; where it is drawn, the largest."""
     if case.is_paper:
         return case.paper_setting().sigma
     drawn = case.random.get(_SIGMA_PATH)

@@ -1,4 +1,4 @@
-"""Canaries that render: radiance, truth and noise-free reconstructions against what was written down by hand."""
+"""Canaries that render: radiance, truth and noise-free reconstructions against formulas computed by hand."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,7 +8,8 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.record import Canary
+from simtest.nightly.canaries.canary import canary
+from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, Scene, scene_from_dict
@@ -19,21 +20,21 @@ Array = by_hand.Array
 
 DISTANCE_MM = 10.0
 TILT_DEG, AZIMUTH_DEG = 14.0, 130.0
-"""Of the plane: its axes are none of the camera's, and its highlight lies off the optical axis."""
+"""Orientation of the plane: its axes are not the camera's, and its highlight lies off the optical axis."""
 
 EXPONENT = 60.0
 LIGHT_MM = (0.6, -0.8, 0.0)
 """1 mm beside the camera."""
 
 ESTIMATORS = ("cone_axis", "brightest_point", "curved", "photometric")
-"""Those whose noise-free error is next to nothing: under a light at the camera circle_pose is at its branch point."""
+"""Those with next to no noise-free error; not circle_pose: under a light at the camera it is at its branch point."""
 
 ERROR_DEG = {"plane": 0.03, "cylinder": 0.03}
-"""What pixels, smoothing and interpolation leave of a noise-free error, of each estimator; see docs/gate.md."""
+"""Bound of each estimator's noise-free error, which pixels, smoothing and interpolation leave; see docs/gate.md."""
 
 
 def described(surface: dict[str, Any], light: Iterable[float] = (0.0, 0.0, 0.0), **more: Any) -> Scene:
-    """Give a noise-free scene of the canaries' camera and lobe."""
+    """Return a noise-free scene of the canaries' camera and lobe."""
     return scene_from_dict(
         {
             "surface": {"distance_mm": DISTANCE_MM, **surface},
@@ -50,8 +51,8 @@ def described(surface: dict[str, Any], light: Iterable[float] = (0.0, 0.0, 0.0),
 PLANE = {"type": "plane", "tilt_deg": TILT_DEG, "azimuth_deg": AZIMUTH_DEG}
 
 
-def photometry(session: Session) -> list[Canary]:
-    """Hold every pixel of a plane under a light beside the camera against the closed form."""
+def photometry(session: Session) -> list[Figure]:
+    """Compare every pixel of a plane under a light beside the camera with the closed form."""
     session.update(described(PLANE, LIGHT_MM))
     normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     points = by_hand.plane_points(normal, DISTANCE_MM)
@@ -60,63 +61,66 @@ def photometry(session: Session) -> list[Canary]:
     bright = expected > 1e-3 * expected.max()
     off = np.abs(found[bright] / expected[bright] - 1).max()
     about = "cos^n(beta) over squared distance; single precision leaves 1e-5"
-    return [Canary("photometry", "residual", "", float(off), 1e-4, n=int(bright.sum()), about=about)]
+    return [canary("photometry", "residual", "", float(off), 1e-4, n=int(bright.sum()), about=about)]
 
 
-def truth(session: Session) -> list[Canary]:
-    """Hold the truth of a tilted plane against its own description."""
+def truth(session: Session) -> list[Figure]:
+    """Compare the truth of a tilted plane with its own description."""
     session.update(described(PLANE, LIGHT_MM))
     normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     maps = session.truth()
     turned = by_hand.angle_deg(maps.normal[maps.mask], normal).max()
     points = by_hand.plane_points(normal, DISTANCE_MM)
     moved = np.abs(maps.position[maps.mask] - points[maps.mask]).max()
+    # Its one highlight
     (highlight,) = session.highlights(session.radiance()) or (None,)
-    place = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
-    gap = np.nan if highlight is None else float(np.abs(highlight.position - place).max())
+    expected = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
+    gap = np.nan if highlight is None else float(np.abs(highlight.position - expected).max())
     count = int(maps.mask.sum())
     about = "a plane tilted by 14 deg towards 130 deg, 10 mm away, in double precision"
     return [
-        Canary("truth", "normal_off", "deg", float(turned), 1e-6, n=count, about=about),
-        Canary("truth", "position_off", "mm", float(moved), 1e-6, n=count, about=about),
-        Canary("truth", "highlight_off", "mm", gap, 1e-4, about="mirror image of the light; Newton stops at 1e-5 px"),
+        canary("truth", "normal_off", "deg", float(turned), 1e-6, n=count, about=about),
+        canary("truth", "position_off", "mm", float(moved), 1e-6, n=count, about=about),
+        canary("truth", "highlight_off", "mm", gap, 1e-4, about="mirror image of the light; Newton stops at 1e-5 px"),
     ]
 
 
-def plane_errors(session: Session) -> list[Canary]:
-    """Reconstruct a noise-free plane: with the light at the camera, and beside it, where the error's law is exact."""
+def plane_errors(session: Session) -> list[Figure]:
+    """Reconstruct a noise-free plane with the light at the camera, and beside it, where the error's law is exact."""
     made = _realised(session, described(PLANE))
     normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     canaries = _errors("plane", made, normal)
-    aside = _realised(session, described(PLANE, LIGHT_MM))
-    place = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
-    half = float(by_hand.angle_deg(-place, np.array(LIGHT_MM) - place)) / 2
-    # As the rows of results state it, the metric included.
-    stated = [row.error_deg for row in aside.rows if row.estimator == "cone_axis" and row.status == "ok"]
+    # The light beside the camera
+    offset = _realised(session, described(PLANE, LIGHT_MM))
+    point = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
+    half = float(by_hand.angle_deg(-point, np.array(LIGHT_MM) - point)) / 2
+    # As the rows of results state it, so that the metric is checked too.
+    stated = [row.error_deg for row in offset.rows if row.estimator == "cone_axis" and row.status == "ok"]
     ratio = stated[0] / half if len(stated) == 1 and stated[0] is not None else np.nan
     about = f"half the angle between light and camera, {half:.4f} deg; falloff moves the peak by 1 % of it"
-    return [*canaries, Canary("light_offset", "error_over_law", "x", float(ratio), 1.03, 0.97, about=about)]
+    return [*canaries, canary("light_offset", "error_over_law", "x", float(ratio), 1.03, 0.97, about=about)]
 
 
-def curved_errors(session: Session) -> list[Canary]:
+def curved_errors(session: Session) -> list[Figure]:
     """Reconstruct a noise-free cylinder as wide as it is far: its normal, and the axis ratio of its isophotes."""
     surface = {"type": "cylinder", "radius_mm": DISTANCE_MM, "tilt_deg": 5.0, "azimuth_deg": 20.0, "spin_deg": 75.0}
     made = _realised(session, described(surface, camera=by_hand.FINE))
     normal = made.truths[0].normal if len(made.truths) == 1 else np.full(3, np.nan)
     # The normal at a highlight of a light at the camera is the reversed sightline, whatever the surface.
-    place = made.truths[0].position if len(made.truths) == 1 else np.full(3, np.nan)
-    canaries = _errors("cylinder", made, -place / np.sqrt((place**2).sum()), ("cone_axis", "curved"))
-    turned = float(by_hand.angle_deg(normal, -place))
+    point = made.truths[0].position if len(made.truths) == 1 else np.full(3, np.nan)
+    canaries = _errors("cylinder", made, -point / np.sqrt((point**2).sum()), ("cone_axis", "curved"))
+    turned = float(by_hand.angle_deg(normal, -point))
     about = "the true normal at the highlight against the reversed sightline"
-    canaries.append(Canary("cylinder", "truth_off", "deg", turned, 1e-5, about=about))
+    canaries.append(canary("cylinder", "truth_off", "deg", turned, 1e-5, about=about))
+    # Isophotes of a cylinder as wide as it is far are ellipses of axis ratio 1/2.
     estimate = _estimate(made, "cone_axis")
     ratio = np.nan if estimate is None or estimate.axis_ratio is None else estimate.axis_ratio / 0.5
     about = "abs(1 + d k) of 1 and 2 make 0.5; smoothing, falloff and finite isovalues leave 1 %"
-    return [*canaries, Canary("axis_ratio", "over_law", "x", float(ratio), 1.02, 0.98, about=about)]
+    return [*canaries, canary("axis_ratio", "over_law", "x", float(ratio), 1.02, 0.98, about=about)]
 
 
-def rotated(session: Session) -> list[Canary]:
-    """Look at a saddle from a turned camera: the truth's normals against differences of its own positions."""
+def rotated(session: Session) -> list[Figure]:
+    """Compare the normals of a saddle, seen by a turned camera, with differences of its own positions."""
     surface = {
         "type": "quadric", "k1_per_mm": 0.05, "k2_per_mm": -0.03, "tilt_deg": 20.0, "azimuth_deg": 65.0,
         "spin_deg": 40.0,
@@ -130,7 +134,7 @@ def rotated(session: Session) -> list[Canary]:
     sound = np.isfinite(crossed).all(axis=-1)
     turned = by_hand.angle_deg(crossed[sound], maps.normal[1:-1, 1:-1][sound])
     about = "central differences over 2 px; curvature's third order leaves 0.01 deg"
-    return [Canary("rotated_camera", "normal_off", "deg", float(turned.max()), 0.05, n=turned.size, about=about)]
+    return [canary("rotated_camera", "normal_off", "deg", float(turned.max()), 0.05, n=turned.size, about=about)]
 
 
 def _realised(session: Session, scene: Scene) -> Realisation:
@@ -141,18 +145,18 @@ def _realised(session: Session, scene: Scene) -> Realisation:
 
 
 def _estimate(made: Realisation, name: str) -> Estimate | None:
-    """Give an estimator's answer at the one highlight."""
+    """Return an estimator's result at the one highlight."""
     matched = [made.specularities[i] for i in made.matched]
     found = matched[0].estimates[name] if len(matched) == 1 else None
     return None if found is None or isinstance(found, Failure) else found
 
 
-def _errors(name: str, made: Realisation, normal: Array, names: Iterable[str] = ESTIMATORS) -> list[Canary]:
-    """Give each estimator's error."""
+def _errors(name: str, made: Realisation, normal: Array, names: Iterable[str] = ESTIMATORS) -> list[Figure]:
+    """Compare each estimator's normal with the true one."""
     canaries = []
     for estimator in names:
         estimate = _estimate(made, estimator)
         off = np.nan if estimate is None else float(by_hand.angle_deg(estimate.normal, normal))
         about = f"{estimator} without noise"
-        canaries.append(Canary(name, f"{estimator}_off", "deg", off, ERROR_DEG[name], about=about))
+        canaries.append(canary(name, f"{estimator}_off", "deg", off, ERROR_DEG[name], about=about))
     return canaries

@@ -1,1 +1,7 @@
-"""The nightly's judge: what a night measured, held against another night by tests whose error rates are measured."""
+"""The gate: a run against the baseline, by tests whose error rates are measured (docs/gate.md).
+
+`compare.compare` is the way in. It hashes cells (`figures`), pairs the rows of differing ones (`pairing`,
+`pairing_units`), tests them (`contrasts`, `pooling`) for the quantities of `quantities` against the margins of
+`limits`, and corrects the p-values (`holm`). `missing_results`, `expectations` (canaries, costs) and `notes` add what
+needs no test.
+"""

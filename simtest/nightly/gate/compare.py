@@ -1,240 +1,221 @@
 """The gate: tonight against the baseline."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate import expectations as known
-from simtest.nightly.gate import missing_results as missing
 from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
+from simtest.nightly.gate.expectations import canaries, costs
 from simtest.nightly.gate.holm import holm
 from simtest.nightly.gate.limits import Limits
+from simtest.nightly.gate.missing_results import digests, lost_highlights, missing_cells
 from simtest.nightly.gate.notes import large_and_undecided, notes_on, redefined
-from simtest.nightly.gate.pairing import Numbered, alone, pairing, pairs
+from simtest.nightly.gate.pairing import pairing, pairs
 from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
-from simtest.nightly.gate.quantities import WHERE_MIXED, Quantity, quantities
-from simtest.nightly.gate.records import COMPARISONS, PLACE, POOLED, Night, Verdict
+from simtest.nightly.gate.quantities import PENALISED, WHERE_MIXED, Quantity, harms, quantities
+from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict
 
 DEFAULTS = Limits()
-PENALISED = "mean_penalised_deg"
+
+_WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
+"""Columns of comparisons before `_judged`: `better` is the p-value of the mirror image, `within` as in `Outcomes`; an
+outcome that is set already stands."""
 
 
-def compare(tonight: Night, baseline: Night | None, limits: Limits = DEFAULTS) -> Verdict:
-    """Hold a night against the baseline.
+def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = DEFAULTS) -> Verdict:
+    """Compare a run with the baseline, if there is one; canaries are judged all the same.
 
-    Places whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
+    Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
     are the same, with all tests as one family (docs/gate.md).
-
-    Parameters
-    ----------
-    tonight : Night
-        The night.
-    baseline : Night or None
-        What it is held against; None where there is none: canaries are judged all the same.
-    limits : Limits
-        Level and margins.
 
     Returns
     -------
     Verdict
-        "regression" where a comparison is worse, else "no baseline" or "fine". What tonight lacks (a place, true
-        highlights of a place whose seeds are the same, a canary) is worse.
+        "regression" where a comparison is worse, else "no baseline" or "fine". What tonight lacks (a cell, true
+        highlights of a cell whose seeds are the same, a canary) is worse.
     """
     before = None if baseline is None else baseline.figures
-    same_machine = baseline is None or baseline.run.get("processor") == tonight.run.get("processor")
-    made = known.canaries(tonight.figures, before) + known.costs(tonight.figures, before, limits, same_machine)
-    bit_equal: bool | None = None
+    same_machine = baseline is None or baseline.record.processor == tonight.record.processor
+    made = [canaries(tonight.figures, before), costs(tonight.figures, before, limits, same_machine)]
+    state, bit_equal = "no baseline", None
     notes: tuple[str, ...] = ("There is no baseline: nothing but the canaries was judged.",)
     if baseline is not None:
-        first, second = missing.digests(baseline.figures), missing.digests(tonight.figures)
-        bit_equal = first.select(*PLACE, "digest").equals(second.select(*PLACE, "digest"))
-        shared = first.join(second, on=PLACE, suffix="_2", maintain_order="left")
-        differing = shared.filter(pl.col("digest") != pl.col("digest_2")).select(*PLACE)
-        made += missing.places(first, second) + _same(shared, tonight.figures, limits)
-        tested, unmatched, short = _tested(baseline, tonight, differing, limits)
+        state = "fine"
+        first, second = digests(baseline.figures), digests(tonight.figures)
+        bit_equal = first.select(*CELL, "digest").equals(second.select(*CELL, "digest"))
+        shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
+        equal = pl.col("digest") == pl.col("digest_2")
+        made += [missing_cells(first, second), _same(shared.filter(equal).select(CELL), tonight.figures, limits)]
+        tested, unmatched, short = _tested(baseline, tonight, shared.filter(~equal).select(CELL), limits)
         made += tested
         notes = notes_on(baseline, tonight, bit_equal, unmatched, short, limits)
-    comparisons = pl.DataFrame(made, schema=COMPARISONS)
-    state = "fine" if baseline is not None else "no baseline"
+    comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *made], how="diagonal_relaxed"), limits)
     if (comparisons["outcome"] == "worse").any():
         state = "regression"
     notes += large_and_undecided(comparisons)
-    return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.run)
+    return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.record)
 
 
-def _same(shared: pl.DataFrame, figures: pl.DataFrame, limits: Limits) -> list[dict[str, Any]]:
-    """Give the comparisons of places whose results are the same bytes."""
-    equal = shared.filter(pl.col("digest") == pl.col("digest_2")).select(*PLACE)
-    wanted = quantities(limits)
-    values = figures.filter((pl.col("kind") == "setting") & pl.col("quantity").is_in(list(wanted)))
-    made = []
-    for row in equal.join(values, on=PLACE, maintain_order="left_right").to_dicts():
-        own = {name: row[name] for name in (*PLACE, "quantity", "n")}
-        quantity = wanted[row["quantity"]]
-        margin = max(quantity.relative * row["value"], quantity.absolute)
-        same = {"unit": quantity.unit, "method": "equal", "baseline": row["value"], "tonight": row["value"]}
-        made.append({**own, **same, "difference": 0.0, "low": 0.0, "high": 0.0, "margin": margin, "outcome": "same"})
-    return made
+def _same(equal: pl.DataFrame, figures: pl.DataFrame, limits: Limits) -> pl.DataFrame:
+    """Compare cells whose results are the same bytes."""
+    margins = pl.DataFrame(
+        [(name, own.unit, own.relative, own.absolute) for name, own in quantities(limits).items()],
+        schema=["quantity", "unit", "relative", "absolute"], orient="row",
+    )  # fmt: skip
+    values = figures.filter(pl.col("kind") == "setting").select(*CELL, "quantity", "n", "value")
+    found = equal.join(values, on=CELL, maintain_order="left_right").join(margins, on="quantity", maintain_order="left")
+    value, zero = pl.col("value"), pl.lit(0.0)
+    return found.select(
+        *CELL, "quantity", "unit", "n", method=pl.lit("equal"), baseline=value, tonight=value, difference=zero,
+        low=zero, high=zero, margin=pl.max_horizontal(pl.col("relative") * value, "absolute"), outcome=pl.lit("same"),
+    )  # fmt: skip
 
 
 def _tested(
-    baseline: Night, tonight: Night, differing: pl.DataFrame, limits: Limits
-) -> tuple[list[dict[str, Any]], int, int]:
-    """Give the comparisons of places whose results differ; how many are no pairs, and how many lost highlights."""
+    baseline: NightlyRun, tonight: NightlyRun, differing: pl.DataFrame, limits: Limits
+) -> tuple[list[pl.DataFrame], int, int]:
+    """Compare cells whose results differ; return also how many are no pairs, and how many lost highlights."""
     if differing.is_empty():
         return [], 0, 0
-    names = differing.with_row_index("place").with_columns(pl.col("place").cast(pl.Int64))
-    before, after = (Numbered.of(night.rows, names) for night in (baseline, tonight))
+    # Pair the rows
+    cells = differing.with_row_index("cell").with_columns(pl.col("cell").cast(pl.Int64))
+    before, after = (harms(run.rows, cells) for run in (baseline, tonight))
     matched = pairing(before, after)
-    moved = redefined(baseline.run, tonight.run)
-    comparable = frozenset(names.filter(~pl.col("experiment").is_in(moved))["place"].to_list())
-    if known_versions(baseline.run) != known_versions(tonight.run):
-        comparable = frozenset()
-    found = matched.places & comparable
-    every, named = quantities(limits), names.select(PLACE).to_dicts()
-    made = missing.highlights(matched.lost, named, comparable)
-    # Where all answered, the penalised mean is the mean: it would be tested twice.
-    once = (pl.col("quantity") != PENALISED) | pl.col("place").is_in(_with_unanswered(before, after))
-    for name in WHERE_MIXED:
-        once &= (pl.col("quantity") != name) | pl.col("place").is_in(_mixed(name, before, after))
-    sums_of_pairs = paired_sums(pairs(before, after, found).filter(once))
-    singles = [sums(alone(night, found).filter(once)) for night in (before, after)]
-    for name, quantity in every.items():
-        own = sums_of_pairs.filter(pl.col("quantity") == name).sort("place")
-        tables = [(own["place"].to_list(), paired(own, quantity), "paired")]
-        shared, first, second = _matched(*(table.filter(pl.col("quantity") == name) for table in singles))
-        tables.append((shared, unpaired(first, second, quantity), "unpaired"))
-        for places, outcomes, method in tables:
-            rows = [named[place] for place in places]
-            made += _as_rows(rows, name, quantity, outcomes, method)
-            made += _pooled_rows(rows, name, quantity, outcomes, method)
+    comparable = _comparable(baseline.record, tonight.record, cells)
+    in_pairs = pl.col("cell").is_in(list(matched.cells & comparable))
+    # Choose the quantities and add up
+    without = _not_tested(pl.concat([before, after]))
+    chosen = [run.join(without, on=("cell", "quantity"), how="anti", maintain_order="left") for run in (before, after)]
+    of_pairs = paired_sums(pairs(*(run.filter(in_pairs) for run in chosen)))
+    of_each = [sums(run.filter(~in_pairs)) for run in chosen]
+    # Test
+    made = [lost_highlights(matched.lost, cells, comparable)]
+    for name, quantity in quantities(limits).items():
+        own = of_pairs.filter(pl.col("quantity") == name).sort("cell")
+        first, second = _shared(*(table.filter(pl.col("quantity") == name) for table in of_each))
+        for table, outcomes, method in (
+            (own, paired(own, quantity), "paired"), (first, unpaired(first, second, quantity), "unpaired")
+        ):  # fmt: skip
+            names = table.select("cell").join(cells, on="cell", maintain_order="left").select(CELL)
+            made.append(_compared(names, name, quantity, outcomes, method, quantity.unit))
+            made += _pooled(names, name, quantity, outcomes, method)
         if name != PENALISED and name not in WHERE_MIXED:
-            made += _unanswerable(named, name, quantity, (before, after), {*own["place"], *shared})
-    return _judged(made, limits), names.height - len(matched.places), matched.lost.height
+            rest = cells.join(own, on="cell", how="anti").join(first, on="cell", how="anti").sort("cell")
+            made.append(_untested(rest, name, quantity, before, after))
+    return made, cells.height - len(matched.cells), matched.lost.height
 
 
-def _with_unanswered(*nights: Numbered) -> list[int]:
-    """Give the places where a highlight went unanswered in one of the nights."""
-    return sorted({place for night in nights for place in night.rows.filter(pl.col("unanswered") > 0)["place"]})
+def _comparable(baseline: RunRecord, tonight: RunRecord, cells: pl.DataFrame) -> frozenset[int]:
+    """Return the cells whose seeds mean the same in both runs: of the same definition, made by the same versions."""
+    # simtest's own version does not count: the gate is there to judge it.
+    first, second = ({**run.versions, "simtest": ""} for run in (baseline, tonight))
+    if first != second:
+        return frozenset()
+    moved = redefined(baseline, tonight)
+    return frozenset(cells.filter(~pl.col("experiment").is_in(moved))["cell"].to_list())
 
 
-def _mixed(name: str, *nights: Numbered) -> list[int]:
-    """Give the places where what a quantity counts is so of some answers and not of others, of both nights together."""
-    both = pl.concat([night.rows.select("place", name) for night in nights]).drop_nulls()
-    found = both.group_by("place").agg(pl.col(name).n_unique().alias("kinds")).filter(pl.col("kinds") > 1)
-    return sorted(found["place"].to_list())
+def _not_tested(harms: pl.DataFrame) -> pl.DataFrame:
+    """Return the cells and quantities of two runs' harms that are not tested.
+
+    Where all highlights are answered the penalised mean is the mean, and would be tested twice; an indicator of
+    `WHERE_MIXED` is tested in the cells where it takes both values across the two runs.
+    """
+    found = harms.group_by("cell", "quantity").agg(kinds=pl.col("value").n_unique(), most=pl.col("value").max())
+    answered = found.filter(pl.col("quantity") == "unanswered", pl.col("most") == 0)
+    alike = found.filter(pl.col("quantity").is_in(WHERE_MIXED), pl.col("kinds") == 1)
+    return pl.concat([answered.select("cell", quantity=pl.lit(PENALISED)), alike.select("cell", "quantity")])
 
 
-def known_versions(run: Mapping[str, Any]) -> dict[str, str]:
-    """Give the versions of the packages that numbers depend on; simtest's own is what the gate is there for."""
-    return {name: version for name, version in dict(run.get("versions") or {}).items() if name != "simtest"}
+def _shared(first: pl.DataFrame, second: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return the rows of cells that both tables hold, in the order of the cells."""
+    kept = [one.join(other, on="cell", how="semi").sort("cell") for one, other in ((first, second), (second, first))]
+    return kept[0], kept[1]
 
 
-def _matched(first: pl.DataFrame, second: pl.DataFrame) -> tuple[list[int], pl.DataFrame, pl.DataFrame]:
-    """Give the places that both tables hold, and the tables of these, in order."""
-    shared = sorted(set(first["place"].to_list()) & set(second["place"].to_list()))
-    kept = [table.filter(pl.col("place").is_in(shared)).sort("place") for table in (first, second)]
-    return shared, kept[0], kept[1]
-
-
-def _as_rows(
-    places: list[dict[str, Any]], name: str, quantity: Quantity, found: Outcomes, method: str, unit: str | None = None
-) -> list[dict[str, Any]]:
-    """Give outcomes as rows, still without corrected p-values; `better` is the p-value of the mirror image."""
+def _compared(
+    cells: pl.DataFrame, name: str, quantity: Quantity, found: Outcomes, method: str, unit: str
+) -> pl.DataFrame:
+    """Return outcomes as comparisons, still without corrected p-values; numbers that are not finite become null."""
+    # From harms to the figures that are shown
     sign, start = (-1.0, 1.0) if quantity.falls else (1.0, 0.0)
-    columns = {
-        "n": found.n, "baseline": start + sign * found.baseline, "tonight": start + sign * found.tonight,
-        "difference": sign * found.difference, "low": sign * (found.high if quantity.falls else found.low),
-        "high": sign * (found.low if quantity.falls else found.high), "margin": found.margin, "p": found.worse,
-        "better": found.better, "within": found.within,
-    }  # fmt: skip
-    lists = {key: values.tolist() for key, values in columns.items()}
-    shared = {"quantity": name, "unit": quantity.unit if unit is None else unit, "method": method}
-    return [
-        {**place, **shared, **{key: _plain(values[i]) for key, values in lists.items()}}
-        for i, place in enumerate(places)
+    low, high = (found.high, found.low) if quantity.falls else (found.low, found.high)
+    table = pl.DataFrame(
+        {"n": found.n, "baseline": start + sign * found.baseline, "tonight": start + sign * found.tonight,
+         "difference": sign * found.difference, "low": sign * low, "high": sign * high, "margin": found.margin,
+         "p": found.worse, "better": found.better, "within": found.within}
+    )  # fmt: skip
+    floats = pl.col(pl.Float64)
+    table = table.with_columns(pl.when(floats.is_finite()).then(floats))
+    constants = {"quantity": name, "unit": unit, "method": method}
+    return cells.hstack(table).with_columns(pl.lit(value).alias(key) for key, value in constants.items())
+
+
+def _pooled(
+    cells: pl.DataFrame, name: str, quantity: Quantity, found: Outcomes, method: str
+) -> Iterator[pl.DataFrame]:  # fmt: skip
+    """Yield the tests over all cells of an estimator, in each experiment and in all together."""
+    groups: dict[Cell, list[int]] = {}
+    experiments: dict[Cell, set[str]] = {}
+    for i, (experiment, estimator) in enumerate(cells.select("experiment", "estimator").rows()):
+        for over in (experiment, POOLED):
+            group = Cell(over, POOLED, POOLED, POOLED, estimator)
+            groups.setdefault(group, []).append(i)
+            experiments.setdefault(group, set()).add(experiment)
+    for group, members in groups.items():
+        # All experiments together are another test only where they are several.
+        if len(members) > 1 and (group.experiment != POOLED or len(experiments[group]) > 1):
+            over = pl.DataFrame([group], schema=list(CELL), orient="row")
+            unit = "x" if quantity.relative else quantity.unit
+            yield _compared(over, name, quantity, pooled(found[members], quantity), method, unit)
+
+
+def _untested(
+    cells: pl.DataFrame, name: str, quantity: Quantity, before: pl.DataFrame, after: pl.DataFrame
+) -> pl.DataFrame:  # fmt: skip
+    """Compare the cells where one run alone knows a quantity, or both but for no pair: without a test."""
+    means = [
+        run.filter(pl.col("quantity") == name).group_by("cell").agg(pl.col("value").mean().alias(name))
+        for run in (before, after)
     ]
+    both = means[0].join(means[1], on="cell", how="full", coalesce=True, suffix="_2")
+    first, second = pl.col(name), pl.col(f"{name}_2")
+    shown = (1 - first, 1 - second) if quantity.falls else (first, second)
+    one_sided = pl.when(first.is_null()).then(pl.lit("new")).when(second.is_null()).then(pl.lit("gone"))
+    return cells.join(both, on="cell", how="inner", maintain_order="left").select(
+        *CELL, quantity=pl.lit(name), unit=pl.lit(quantity.unit), method=pl.lit("none"), baseline=shown[0],
+        tonight=shown[1], outcome=one_sided.otherwise(pl.lit("undecided")),
+    )  # fmt: skip
 
 
-def _plain(value: Any) -> Any:
-    """Give a number, or None where it is none."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _pooled_rows(
-    places: list[dict[str, Any]], name: str, quantity: Quantity, found: Outcomes, method: str
-) -> list[dict[str, Any]]:
-    """Give the tests over all places of an estimator, in each experiment and in all together."""
-    made = []
-    everywhere = dict.fromkeys(("label", "surface", "setting"), POOLED)
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i, place in enumerate(places):
-        for experiment in (place["experiment"], POOLED):
-            groups.setdefault((experiment, place["estimator"]), []).append(i)
-    for (experiment, estimator), members in groups.items():
-        several = len({places[i]["experiment"] for i in members}) > 1
-        if len(members) < 2 or (experiment == POOLED and not several):
-            continue
-        own = Outcomes(**{key: values[members] for key, values in vars(found).items()})
-        row = {"experiment": experiment, **everywhere, "estimator": estimator}
-        made += _as_rows([row], name, quantity, pooled(own, quantity), method, "x" if quantity.relative else None)
-    return made
-
-
-def _unanswerable(
-    named: list[dict[str, Any]], name: str, quantity: Quantity, nights: Iterable[Numbered], tested: set[int]
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Give the places where a quantity is known in one night alone, or in both but of no pair."""
-    table = "frames" if name == "false" else "rows"
-    here, there = (
-        {place: value for place, value in _means(getattr(night, table), name) if place not in tested}
-        for night in nights
+def _judged(made: pl.DataFrame, limits: Limits) -> pl.DataFrame:
+    """Correct the p-values, of one family, and settle the outcomes."""
+    # Correct both sides
+    family = made["p"].is_not_null().to_numpy()
+    weights = _weights((made["setting"] == POOLED).fill_null(False).to_numpy()[family], limits.pooled_weight)
+    corrected = np.full((2, made.height), np.nan)
+    for side, name in enumerate(("p", "better")):
+        corrected[side, family] = holm(made[name].to_numpy()[family], weights)
+    made = made.with_columns(p_holm=corrected[0], better=corrected[1]).with_columns(
+        pl.col("p_holm", "better").fill_nan(None)
     )
-    made = []
-    for place in sorted(here.keys() | there.keys()):
-        before, after = here.get(place), there.get(place)
-        outcome = "new" if before is None else "gone" if after is None else "undecided"
-        if quantity.falls:
-            before, after = (None if value is None else 1 - value for value in (before, after))
-        values = {"baseline": before, "tonight": after, "unit": quantity.unit, "method": "none"}
-        made.append({**named[place], "quantity": name, **values, "settled": outcome})
-    return made
+    # Settle
+    margin = pl.col("margin")
+    inside = (pl.col("low") >= -margin) & (pl.col("high") <= margin)
+    outcome = (
+        pl.when(pl.col("outcome").is_not_null()).then("outcome")
+        .when(pl.col("p_holm") <= limits.alpha).then(pl.lit("worse"))
+        .when(pl.col("better") <= limits.alpha).then(pl.lit("better"))
+        .when(inside.fill_null(False) | pl.col("within").fill_null(False)).then(pl.lit("equivalent"))
+        .otherwise(pl.lit("undecided"))
+    )  # fmt: skip
+    return made.with_columns(outcome=outcome).select(*COMPARISONS)
 
 
-def _means(table: pl.DataFrame, name: str) -> list[tuple[int, float]]:
-    known_rows = table.filter(pl.col(name).is_not_null())
-    return list(known_rows.group_by("place").agg(pl.col(name).mean()).iter_rows())
-
-
-def _judged(made: list[dict[str, Any]], limits: Limits) -> list[dict[str, Any]]:
-    """Correct the p-values of one family, and settle the outcomes."""
-    family = [row for row in made if row.get("p") is not None]
-    if family:
-        shares = _weights([row["setting"] == POOLED for row in family], limits.pooled_weight)
-        worse, better = (holm([row[key] for row in family], shares) for key in ("p", "better"))
-        for row, p, mirrored in zip(family, worse.tolist(), better.tolist(), strict=True):
-            row |= {"p_holm": p, "outcome": _outcome(row, p, mirrored, limits)}
-    for row in made:
-        row.setdefault("outcome", row.get("settled") or ("equivalent" if row.get("within") else "undecided"))
-    return [{name: row.get(name) for name in COMPARISONS} for row in made]
-
-
-def _weights(is_pooled: list[bool], share: float) -> np.ndarray:
-    """Give each test its weight in the family: the pooled ones have a share of it together, where there are both."""
-    flags = np.array(is_pooled)
-    if flags.all() or not flags.any():
-        return np.ones(len(flags))
-    return np.where(flags, share / flags.sum(), (1 - share) / (~flags).sum())
-
-
-def _outcome(row: dict[str, Any], worse: float, better: float, limits: Limits) -> str:
-    if worse <= limits.alpha:
-        return "worse"
-    if better <= limits.alpha:
-        return "better"
-    low, high, margin = row["low"], row["high"], row["margin"]
-    inside = low is not None and high is not None and -margin <= low and high <= margin
-    return "equivalent" if inside or row["within"] else "undecided"
+def _weights(is_pooled: np.ndarray, share: float) -> np.ndarray:
+    """Return each test's weight in the family: the pooled ones share a part of it, where there are both."""
+    if is_pooled.all() or not is_pooled.any():
+        return np.ones(len(is_pooled))
+    return np.where(is_pooled, share / is_pooled.sum(), (1 - share) / (~is_pooled).sum())

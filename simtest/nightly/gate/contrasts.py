@@ -1,4 +1,4 @@
-"""One-sided tests of "worse by more than the margin", of many places at once: a studentised mean with Student's tail.
+"""One-sided tests of "worse by more than the margin", of many cells at once: a studentised mean with Student's tail.
 
 Resampling cannot reach the levels that a family of hundreds of tests asks for (1e-5 and less) with the ten or twenty
 units of a setting: signs of ten differences have 2^10 patterns. Student's tail can, and docs/gate.md has its measured
@@ -20,49 +20,34 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What tests of one quantity at N places say, in its harm; NaN where there is nothing to say it from.
+    """Results of the tests of one quantity in N cells, in its harm, shape (N,); NaN where a test cannot be made."""
 
-    Parameters
-    ----------
-    n : ndarray of int, shape (N,)
-        Units; of the smaller night where they are not paired.
-    baseline, tonight : ndarray, shape (N,)
-        Means.
-    difference, low, high : ndarray, shape (N,)
-        Tonight less the baseline, and its 95 % interval.
-    margin : ndarray, shape (N,)
-        What the difference may be.
-    worse, better : ndarray, shape (N,)
-        p-values of "no worse than by the margin" and of "no better".
-    within : ndarray of bool, shape (N,)
-        Whether no pair differs by more than the margin.
-    deviation, freedom : ndarray, shape (N,)
-        Standard error of the difference and its degrees of freedom, 0 where there is no error to be had.
-    """
-
-    n: npt.NDArray[np.int64]
-    baseline: Array
+    n: npt.NDArray[np.int64]  # units; of the smaller run where they are not paired
+    baseline: Array  # mean
     tonight: Array
-    difference: Array
-    low: Array
+    difference: Array  # tonight less the baseline
+    low: Array  # its 95 % interval
     high: Array
-    margin: Array
-    worse: Array
-    better: Array
-    within: npt.NDArray[np.bool_]
-    deviation: Array
-    freedom: Array
+    margin: Array  # its harmless size
+    worse: Array  # p-value of "no worse than by the margin"
+    better: Array  # p-value of "no better than by the margin"
+    within: npt.NDArray[np.bool_]  # whether no pair differs by more than the margin
+    deviation: Array  # standard error of the difference
+    freedom: Array  # its degrees of freedom; 0 where there is no standard error
+
+    def __getitem__(self, cells: slice | list[int]) -> "Outcomes":
+        return Outcomes(**{name: values[cells] for name, values in vars(self).items()})
 
 
 def margin_of(quantity: Quantity, baseline: Array) -> Array:
-    """Give the margin at baselines: the larger of the share and the absolute one."""
+    """Return the margins at some baselines: the larger of the relative and the absolute one."""
     return np.maximum(quantity.relative * baseline, quantity.absolute)
 
 
 def tail(estimate: Array, deviation: Array, freedom: Array) -> Array:
-    """Give the chance of an estimate as large or larger where its mean is 0; NaN without a degree of freedom.
+    """Return the chance of so large an estimate where its mean is 0; NaN without a degree of freedom.
 
-    Without variance what is above 0 is above it for certain, and what is not is not.
+    Without variance the chance is 0 above 0, 1 below it, and a half at 0.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = np.where(
@@ -73,49 +58,36 @@ def tail(estimate: Array, deviation: Array, freedom: Array) -> Array:
 
 
 def half_width(deviation: Array, freedom: Array) -> Array:
-    """Give half of the 95 % interval's width; NaN without a degree of freedom."""
+    """Return half of the 95 % interval's width; NaN without a degree of freedom."""
     usable = freedom >= 1
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, np.where(usable, freedom, 1.0))
     return np.where(usable, quantile * deviation, np.nan)
 
 
 def _margins(quantity: Quantity) -> list[tuple[float, float]]:
-    """Give the share and the absolute margin; both must be exceeded."""
+    """Return the parts of the margin as (share, shift), each of which must be exceeded."""
     return [(quantity.relative, 0.0), (0.0, quantity.absolute)] if quantity.relative else [(0.0, quantity.absolute)]
 
 
 def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
-    """Test pairs.
-
-    Parameters
-    ----------
-    sums : polars.DataFrame
-        See `simtest.nightly.gate.pairing_units.paired_sums`; of one quantity.
-    quantity : Quantity
-        Which.
-
-    Returns
-    -------
-    Outcomes
-    """
-    s = {name: sums[name].to_numpy().astype(float) for name in sums.columns if name not in ("place", "quantity")}
+    """Test pairs, by their sums of one quantity; see `simtest.nightly.gate.pairing_units.paired_sums`."""
+    s = {name: sums[name].to_numpy().astype(float) for name in sums.columns if name not in ("cell", "quantity")}
     units, rows = s["units"], s["rows"]
     baseline, difference = s["x"] / rows, s["d"] / rows
     margin = margin_of(quantity, baseline)
-    moments = dict(s)
+    # Two invented units, one that harms tonight alone and one that harmed before alone.
+    m = dict(s)
     if quantity.span:
-        # Two invented units, one that harms tonight alone and one that harmed before alone.
         size = rows / units
         most = quantity.span * size
-        moments |= {"units": units + 2, "rows": rows + 2 * size, "x": s["x"] + most, "nn": s["nn"] + 2 * size**2}
-        moments |= {"dd": s["dd"] + 2 * most**2, "xx": s["xx"] + most**2, "dx": s["dx"] - most**2}
-        moments["xn"] = s["xn"] + most * size
+        m |= {"units": units + 2, "rows": rows + 2 * size, "x": s["x"] + most, "nn": s["nn"] + 2 * size**2}
+        m |= {"dd": s["dd"] + 2 * most**2, "xx": s["xx"] + most**2, "dx": s["dx"] - most**2}
+        m["xn"] = s["xn"] + most * size
 
     def contrast(share: float, shift: float, sign: float) -> tuple[Array, Array]:
-        """Give sign d - share x - shift, mean and standard error."""
-        m = moments
+        """Compute mean and standard error of sign d - share x - shift."""
         mean = (sign * m["d"] - share * m["x"]) / m["rows"] - shift
-        # Of the residual sign d - share x - (mean + shift) n.
+        # The residual of a unit is sign d - share x - c n.
         c = mean + shift
         squares = (
             m["dd"] + share**2 * m["xx"] + c**2 * m["nn"]
@@ -126,6 +98,7 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
             variance = np.maximum(squares, 0.0) / (count * (count - 1)) / (m["rows"] / count) ** 2
         return mean, np.sqrt(variance)
 
+    # Worse (sign 1) and better (-1); the larger p-value of both parts of the margin counts.
     freedom = units - 1
     p = [
         np.max([tail(*contrast(share, shift, sign), freedom) for share, shift in _margins(quantity)], axis=0)
@@ -140,25 +113,16 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
 
 
 def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> Outcomes:
-    """Test two nights of different seeds, versions or numbers of units by Welch's statistic.
+    """Test two runs of different seeds, versions or numbers of units by Welch's statistic.
 
-    Parameters
-    ----------
-    before, after : polars.DataFrame
-        See `simtest.nightly.gate.pairing_units.sums`; of one quantity, the same places in the same order.
-    quantity : Quantity
-        Which.
-
-    Returns
-    -------
-    Outcomes
-        `within` is false: there are no pairs.
+    `before` and `after` are `simtest.nightly.gate.pairing_units.sums` of one quantity, of the same cells in the same
+    order. `within` of the outcomes is false: there are no pairs.
     """
     x, y = (_Arm.of(table, quantity.span) for table in (before, after))
     margin = margin_of(quantity, x.shown)
 
     def test(worse: _Arm, better: _Arm, share_of: _Arm) -> Array:
-        """Give the p-value of the first arm's mean being above the second's by no more than the margin."""
+        """Compute the p-value of the first arm's mean being above the second's by no more than the margin."""
         found = []
         for share, shift in _margins(quantity):
             # The share is the baseline's, whichever arm that is.
@@ -179,7 +143,7 @@ def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> O
 
 @dataclass(frozen=True)
 class _Arm:
-    """One night's means at N places: `shown` as they are, `mean` with the invented units."""
+    """One run's means in N cells: `shown` as they are, `mean` with the invented units."""
 
     units: Array
     shown: Array
@@ -200,6 +164,7 @@ class _Arm:
             x, xx, nn, xn = x + most, xx + most**2, nn + 2 * size**2, xn + most * size
             rows, units = rows + 2 * size, units + 2
         mean = x / rows
+        # Of the units' residuals about the mean
         with np.errstate(divide="ignore", invalid="ignore"):
             squares = np.maximum(xx - 2 * mean * xn + mean**2 * nn, 0.0)
             # A constant's squares cancel to rounding.
@@ -209,7 +174,7 @@ class _Arm:
 
 
 def _welch(first: _Arm, second: _Arm, a: float, b: float) -> tuple[Array, Array]:
-    """Give the standard error of a times one mean less b times the other, and its degrees of freedom."""
+    """Compute the standard error of a times one mean less b times the other, and its degrees of freedom."""
     v, w = a**2 * first.variance, b**2 * second.variance
     least = np.minimum(first.freedom, second.freedom)
     with np.errstate(divide="ignore", invalid="ignore"):

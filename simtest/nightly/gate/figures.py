@@ -1,18 +1,18 @@
-"""Figures of a night's rows by place, and the hash of each place's results."""
+"""Figures of a run's rows by cell, and the hash of each cell's results."""
 
 import hashlib
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import polars as pl
 from scipy import stats
 
 from simtest.nightly.gate.quantities import RATIO_OFF
-from simtest.nightly.gate.records import FIGURES, PLACE
+from simtest.nightly.records import CELL, Cell, Figure, figure_table
 from simtest.validation.statistics import CONFIDENCE, figures, student_interval
 
 DIGEST_KEYS = ("realisation", "true_id", "specularity", "seed")
-"""Order of the rows within a place."""
+"""Order of the rows within a cell."""
 
 DIGEST_NUMBERS = (
     "error_deg", "error_oracle_deg", "error_look_deg", "error_law_deg", "n_candidates", "choice_margin", "rank_correct",
@@ -25,7 +25,7 @@ DIGEST_NUMBERS = (
 
 
 def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
-    """Give the figures of a night's rows by place.
+    """Compute the figures of a run's rows by cell.
 
     Parameters
     ----------
@@ -35,82 +35,76 @@ def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
     Returns
     -------
     polars.DataFrame
-        Columns `FIGURES`, kind "setting", in the order of the rows: of each place `n` (true highlights), `n_ok`,
+        Columns `FIGURES`, kind "setting", in the order of the rows: of each cell `n` (true highlights), `n_ok`,
         `failed`, `missed`, `unanswered` (shares of n), `false` (detections a frame), `mean_deg`, `median_deg`,
         `p95_deg`, `mean_penalised_deg`, `coverage95`, `axis_ratio` (mean deviation from the law over the law, at most 1
-        a row) and `axis_ratio_median`. Figures that nothing is known of are left out.
+        a row) and `axis_ratio_median`. Unknown figures are left out.
     """
-    made: list[dict[str, Any]] = []
-    for place, own in rows.group_by(*PLACE, maintain_order=True):
-        names = {"kind": "setting", **dict(zip(PLACE, place, strict=True)), "digest": digest(own)}
-        made += [{**names, **figure} for figure in _figures_of(own)]
-    return pl.DataFrame(made, schema=FIGURES)
+    cells = rows.group_by(CELL, maintain_order=True)
+    return figure_table(figure for cell, own in cells for figure in _cell_figures(Cell(*cell), own))
 
 
-def _figures_of(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    """Give the figures of one place."""
+def _cell_figures(cell: Cell, rows: pl.DataFrame) -> Iterator[Figure]:
+    """Yield the known figures of one cell."""
+    hashed = digest(rows)
+
+    def figure(
+        quantity: str, unit: str, value: float | None, n: int,
+        interval: tuple[float | None, float | None] = (None, None), about: str = "",
+    ) -> Iterator[Figure]:  # fmt: skip
+        # A result that is no number makes a figure of its cell unknown.
+        value, low, high = (float(v) if v is not None and np.isfinite(v) else None for v in (value, *interval))
+        if value is not None:
+            yield Figure("setting", cell, quantity, unit, value, low, high, n, None, hashed, about)
+
+    def share(quantity: str, count: int, n: int) -> Iterator[Figure]:
+        return figure(quantity, "", count / n, n, _share_interval(count, n), f"{count} of {n}")
+
+    # Counts and shares
     found, frames = figures(rows), rows["realisation"].n_unique()
-    n, failed = found.n, sum(found.n_failed_by_reason.values())
-    made = [_figure("n", "", n, n), _figure("n_ok", "", found.n_ok, n)]
+    n, n_ok, missed, failed = found.n, found.n_ok, found.n_missed, sum(found.n_failed_by_reason.values())
+    yield from figure("n", "", n, n)
+    yield from figure("n_ok", "", n_ok, n)
     if n:
-        unanswered = failed + found.n_missed
-        counts = {"failed": failed, "missed": found.n_missed, "unanswered": unanswered}
-        made += [_share(name, count, n) for name, count in counts.items()]
-    made.append(_figure("false", "a frame", found.n_false / frames, frames))
-    low, high = found.ci95_deg
-    made.append(_figure("mean_deg", "deg", found.mean_deg, found.n_ok, low, high))
-    for name in ("median_deg", "p95_deg", "mean_penalised_deg"):
-        made.append(_figure(name, "deg", getattr(found, name), n if name == "mean_penalised_deg" else found.n_ok))
+        yield from share("failed", failed, n)
+        yield from share("missed", missed, n)
+        yield from share("unanswered", failed + missed, n)
+    yield from figure("false", "a frame", found.n_false / frames, frames)
+    # Errors
+    yield from figure("mean_deg", "deg", found.mean_deg, n_ok, found.ci95_deg)
+    yield from figure("median_deg", "deg", found.median_deg, n_ok)
+    yield from figure("p95_deg", "deg", found.p95_deg, n_ok)
+    yield from figure("mean_penalised_deg", "deg", found.mean_penalised_deg, n)
     if found.coverage95 is not None:
-        judged = _judged(rows)
-        made.append(_share("coverage95", round(found.coverage95 * judged), judged))
+        stated = _results_with_region(rows)
+        yield from share("coverage95", round(found.coverage95 * stated), stated)
+    # Axis ratios against their law
     off = rows.select(off=RATIO_OFF)["off"].drop_nulls().to_numpy()
     if len(off):
-        low, high = student_interval(off)
         about = "abs(axis ratio / law - 1)"
-        made.append(_figure("axis_ratio", "", float(np.mean(off)), len(off), low, high, about))
-        made.append(_figure("axis_ratio_median", "", float(np.median(off)), len(off), about=about))
-    return [figure for figure in made if figure["value"] is not None]
+        yield from figure("axis_ratio", "", float(np.mean(off)), len(off), student_interval(off), about)
+        yield from figure("axis_ratio_median", "", float(np.median(off)), len(off), about=about)
 
 
-def _judged(rows: pl.DataFrame) -> int:
-    """Count the answers that state an uncertainty, as `figures` does."""
+def _results_with_region(rows: pl.DataFrame) -> int:
+    """Count the results that state an uncertainty, as `figures` does."""
     answered = rows.filter(pl.col("true_id").is_not_null() & (pl.col("status") == "ok"))
     return answered["mahalanobis2"].drop_nulls().len()
 
 
-def _figure(
-    quantity: str, unit: str, value: float | None, n: int, low: float | None = None, high: float | None = None,
-    about: str = "",
-) -> dict[str, Any]:  # fmt: skip
-    known = {"value": value, "low": low, "high": high}
-    # An answer without a number makes a figure of its place unknown, not no number.
-    finite = {name: float(v) if v is not None and np.isfinite(v) else None for name, v in known.items()}
-    return {"quantity": quantity, "unit": unit, **finite, "n": n, "about": about}
-
-
-def _share(quantity: str, count: int, n: int) -> dict[str, Any]:
-    """Give a share with its exact interval [Clopper and Pearson 1934]."""
+def _share_interval(count: int, n: int) -> tuple[float, float]:
+    """Compute the exact interval of a share [Clopper and Pearson 1934]."""
     tail = (1 - CONFIDENCE) / 2
     low = float(stats.beta.ppf(tail, count, n - count + 1)) if count else 0.0
     high = float(stats.beta.isf(tail, count + 1, n - count)) if count < n else 1.0
-    return _figure(quantity, "", count / n, n, low, high, f"{count} of {n}")
+    return low, high
 
 
 def digest(rows: pl.DataFrame) -> str:
-    """Hash the results of a place: equal for two nights exactly where all their numbers are the same bytes.
+    """Hash a cell's results, rows in any order: equal for two runs exactly where all numbers are the same bytes.
 
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        Of one place, in any order.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal, over the rows sorted by `DIGEST_KEYS`: the bytes of where the columns are null, those of
-        the keys as int64 and of the numbers as float64, little-endian, and the status. A column that is absent counts
-        as null.
+    SHA-256, hexadecimal, over the rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the numbers
+    as float64, little-endian, and the status. A column that is absent counts as null.
     """
     ordered = rows.sort(*DIGEST_KEYS, nulls_last=True)
     found = hashlib.sha256(f"{ordered.height} {DIGEST_KEYS} {DIGEST_NUMBERS}".encode())

@@ -1,4 +1,4 @@
-"""Holm's correction for many tests, with weights."""
+"""Holm's correction with weights; ours, since scipy has no Holm correction and that of statsmodels has no weights."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,14 +9,14 @@ Array = npt.NDArray[np.float64]
 def holm(p: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> Array:
     """Correct p-values for the size of their family by Holm's step-down procedure [H79], section 2 and 4.
 
-    Rejecting what is at most alpha keeps the chance of any false rejection at alpha, however the tests hang together.
+    Rejecting those of at most alpha keeps the chance of any false rejection at alpha, under arbitrary dependence.
 
     Parameters
     ----------
     p : array_like, shape (N,)
         p-values in [0, 1].
     weights : array_like, shape (N,), optional
-        How much of alpha each test is given, positive; only their ratios count. Default equal ones.
+        Share of alpha of each test, positive; only their ratios count. Default equal ones.
 
     Returns
     -------
@@ -26,7 +26,7 @@ def holm(p: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> Array:
     own = np.asarray(p, dtype=float)
     share = np.ones_like(own) if weights is None else np.asarray(weights, dtype=float)
     order = np.argsort(own / share, kind="stable")
-    # What is left of the weights when a test's turn comes: its own and those of the less significant ones.
+    # Weight that is left at each step: the test's own and that of all less significant ones.
     left = np.cumsum(share[order][::-1])[::-1]
     stepped = np.maximum.accumulate(own[order] * left / share[order])
     corrected = np.empty_like(own)

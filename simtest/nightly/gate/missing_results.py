@@ -1,67 +1,44 @@
-"""What one of two nights lacks: a place, or highlights of one. What vanishes is a regression until it is accepted."""
-
-from typing import Any
+"""Results that a run lacks against another: whole cells, or highlights of one; a regression until accepted."""
 
 import polars as pl
 
-from simtest.nightly.gate.records import PLACE
+from simtest.nightly.records import CELL
 
 
 def digests(figures: pl.DataFrame) -> pl.DataFrame:
-    """Give each place's hash, in the order of the places' names, and its number of true highlights, `n`."""
+    """Return each cell's hash, in the order of the cells' names, and its number of true highlights, `highlights`."""
     own = figures.filter(pl.col("kind") == "setting")
-    counted = own.filter(pl.col("quantity") == "n").select(*PLACE, highlights="value").unique(PLACE)
-    return own.select(*PLACE, "digest").unique(PLACE).join(counted, on=PLACE, how="left").sort(PLACE)
+    counted = own.filter(pl.col("quantity") == "n").select(*CELL, highlights="value").unique(CELL)
+    return own.select(*CELL, "digest").unique(CELL).join(counted, on=CELL, how="left").sort(CELL)
 
 
-def places(first: pl.DataFrame, second: pl.DataFrame) -> list[dict[str, Any]]:
-    """Give the comparisons of places that one of the nights lacks, on `n`: worse where it is tonight that lacks them.
+def missing_cells(baseline: pl.DataFrame, tonight: pl.DataFrame) -> pl.DataFrame:
+    """Compare the cells that one of two runs lacks, by `n`: worse where tonight lacks them, else new; see `digests`."""
+    zero, count = pl.lit(0.0), pl.col("highlights")
+    # What vanishes is a regression until it is accepted; what is new is not.
+    gone = _only_in(baseline, tonight).select(
+        *CELL, baseline=count, tonight=zero, difference=-count, margin=zero, outcome=pl.lit("worse")
+    )
+    new = _only_in(tonight, baseline).select(*CELL, tonight=count, outcome=pl.lit("new"))
+    return pl.concat([gone, new], how="diagonal").with_columns(
+        quantity=pl.lit("n"), unit=pl.lit(""), method=pl.lit("none")
+    )
 
-    Parameters
-    ----------
-    first, second : polars.DataFrame
-        See `digests`: of the baseline and of tonight.
 
-    Returns
-    -------
-    list of dict
-        Rows of `COMPARISONS`.
+def _only_in(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
+    return first.join(second, on=CELL, how="anti", maintain_order="left")
+
+
+def lost_highlights(lost: pl.DataFrame, cells: pl.DataFrame, comparable: frozenset[int]) -> pl.DataFrame:
+    """Compare the cells that have lost highlights of the baseline, by `n`; see `simtest.nightly.gate.pairing.Pairing`.
+
+    `cells` names the cells by their number. In `comparable` ones seeds mean the same in both runs; in others a loss is
+    reported, and not judged.
     """
-    made: list[dict[str, Any]] = []
-    for here, there, outcome in ((first, second, "worse"), (second, first, "new")):
-        for row in here.join(there, on=PLACE, how="anti", maintain_order="left").to_dicts():
-            own: dict[str, Any] = {"quantity": "n", "unit": "", "method": "none", "outcome": outcome}
-            had = row["highlights"]
-            if outcome == "worse":
-                own |= {"baseline": had, "tonight": 0.0, "difference": None if had is None else -had, "margin": 0.0}
-            else:
-                own["tonight"] = had
-            made.append({**{name: row[name] for name in PLACE}, **own})
-    return made
-
-
-def highlights(lost: pl.DataFrame, named: list[dict[str, Any]], comparable: frozenset[int]) -> list[dict[str, Any]]:
-    """Give the comparisons of places that have lost highlights of the baseline, on `n`.
-
-    Parameters
-    ----------
-    lost : polars.DataFrame
-        See `simtest.nightly.gate.pairing.Pairing`.
-    named : list of dict
-        Names of the places by their number.
-    comparable : frozenset of int
-        Places whose seeds mean the same in both nights; of others a loss is told, and not judged.
-
-    Returns
-    -------
-    list of dict
-        Rows of `COMPARISONS`.
-    """
-    return [
-        {
-            **named[row["place"]], "quantity": "n", "unit": "", "method": "paired", "baseline": float(row["before"]),
-            "tonight": float(row["kept"]), "difference": float(row["kept"] - row["before"]), "margin": 0.0,
-            "settled": "worse" if row["place"] in comparable else "undecided",
-        }
-        for row in lost.sort("place").to_dicts()
-    ]  # fmt: skip
+    before, kept = pl.col("before").cast(pl.Float64), pl.col("kept").cast(pl.Float64)
+    judged = pl.col("cell").is_in(list(comparable))
+    return lost.sort("cell").join(cells, on="cell", maintain_order="left").select(
+        *CELL, quantity=pl.lit("n"), unit=pl.lit(""), method=pl.lit("paired"), baseline=before, tonight=kept,
+        difference=kept - before, margin=pl.lit(0.0),
+        outcome=pl.when(judged).then(pl.lit("worse")).otherwise(pl.lit("undecided")),
+    )  # fmt: skip

@@ -1,127 +1,101 @@
-"""What a reader of the verdict must know beside its comparisons."""
-
-from collections.abc import Mapping
-from typing import Any
+"""Notes of a verdict: in what two runs differ beside the comparisons."""
 
 import polars as pl
 
 from simtest.nightly.gate.limits import Limits
-from simtest.nightly.gate.pairing import changes
-from simtest.nightly.gate.quantities import ANSWERED
-from simtest.nightly.gate.records import PLACE, POOLED, Night
+from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, KEY
+from simtest.nightly.records import CELL, POOLED, NightlyRun, RunRecord
 
 _FAR, _FAR_DEG = 10, 1.0
-"""A rise of so many margins, and of so many degrees, is told even where nothing can be decided."""
-
-_FOLLOWS = {"Versions": "All places were compared unpaired.", "The processor": "Costs were not judged."}
+"""A rise by so many margins and so many degrees is reported even where nothing can be decided."""
 
 
-def redefined(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """Name the experiments whose definition is known in both records, and another.
-
-    Parameters
-    ----------
-    before, after : mapping
-        `Night.run`; `definitions` is a hash by experiment, or missing where it is not known.
-    """
-    first, second = (dict(run.get("definitions") or {}) for run in (before, after))
+def redefined(baseline: RunRecord, tonight: RunRecord) -> list[str]:
+    """Return the experiments whose definition is known in both records, and differs."""
+    first, second = baseline.definitions, tonight.definitions
     return sorted(name for name in first.keys() & second.keys() if first[name] != second[name])
 
 
 def large_and_undecided(comparisons: pl.DataFrame) -> tuple[str, ...]:
-    """Say where a single realisation rose so much that a reader must look, though one number decides nothing.
-
-    Parameters
-    ----------
-    comparisons : polars.DataFrame
-        Columns `COMPARISONS`.
-    """
+    """Report rises of single realisations that a reader must look at, though one number decides nothing."""
     errors = pl.col("quantity").is_in(["mean_deg", "mean_penalised_deg"]) & (pl.col("setting") != POOLED)
     far = (pl.col("difference") > _FAR * pl.col("margin")) & (pl.col("difference") > _FAR_DEG)
     found = comparisons.filter(errors & far, pl.col("n") == 1, pl.col("outcome") == "undecided")
-    count = found.select(PLACE).n_unique()
+    count = found.select(CELL).n_unique()
     if not count:
         return ()
     return (
-        f"At {count} places of one realisation the error rose by more than {_FAR} margins and {_FAR_DEG:g} deg, by "
+        f"In {count} cells of one realisation the error rose by more than {_FAR} margins and {_FAR_DEG:g} deg, by "
         f"{float(found['difference'].to_numpy().max()):.2g} deg at most: too few to decide, look at them.",
     )
 
 
 def notes_on(
-    baseline: Night, tonight: Night, bit_equal: bool, unmatched: int, short: int, limits: Limits
+    baseline: NightlyRun, tonight: NightlyRun, bit_equal: bool, unmatched: int, short: int, limits: Limits
 ) -> tuple[str, ...]:
-    """Say in what two nights differ beside their numbers.
+    """Report in what two runs differ beside their numbers, in plain sentences.
 
-    Parameters
-    ----------
-    baseline, tonight : Night
-        The nights.
-    bit_equal : bool
-        Whether all results are the same bytes.
-    unmatched : int
-        Places whose results differ and whose rows are no exact pairs.
-    short : int
-        Places that have lost highlights of the baseline.
-    limits : Limits
-        `medians_deg`.
-
-    Returns
-    -------
-    tuple of str
-        Plain sentences.
+    `unmatched` counts the cells whose results differ and whose rows are no exact pairs, `short` those that have lost
+    highlights of the baseline.
     """
-    made = [_other("Versions", *_differing(baseline.run, tonight.run))]
-    made.append(_other("The processor", baseline.run.get("processor"), tonight.run.get("processor")))
+    before, after = baseline.record, tonight.record
+    first, second = before.versions, after.versions
+    names = [name for name in sorted(first.keys() | second.keys()) if first.get(name) != second.get(name)]
+    was, now = (", ".join(f"{name} {own.get(name, 'missing')}" for name in names) for own in (first, second))
+    made = [
+        _changed("Versions", was, now, "All cells were compared unpaired."),
+        _changed("The processor", before.processor, after.processor, "Costs were not judged."),
+    ]
     for key in ("profile", "variant", "llvm", "python"):
-        # A record that does not have it says nothing of it.
-        if baseline.run.get(key) and tonight.run.get(key):
-            made.append(_other(f"The {key}", str(baseline.run[key]), str(tonight.run[key])))
-    if changed := redefined(baseline.run, tonight.run):
-        made.append(f"The definition changed of {', '.join(changed)}: their places were compared unpaired.")
+        # A record that lacks a key says nothing of it.
+        if getattr(before, key) and getattr(after, key):
+            made.append(_changed(f"The {key}", getattr(before, key), getattr(after, key)))
+    if names := redefined(before, after):
+        made.append(f"The definition of {', '.join(names)} changed: their cells were compared unpaired.")
     if unmatched:
-        made.append(
-            f"Seeds, or the rows, of {unmatched} places are not those of the baseline: these places were compared "
-            "unpaired."
-        )
+        made.append(f"Seeds or rows of {unmatched} cells differ from the baseline's: these were compared unpaired.")
     if short:
-        made.append(f"At {short} places highlights of the baseline are missing tonight, in frames of the same seeds.")
+        made.append(f"In {short} cells highlights of the baseline are missing tonight, in frames of the same seeds.")
     if not bit_equal:
         made += _numbers(baseline, tonight, limits)
     return tuple(note for note in made if note)
 
 
-def _differing(before: dict[str, Any], after: dict[str, Any]) -> tuple[str, str]:
-    first, second = (dict(run.get("versions") or {}) for run in (before, after))
-    names = [name for name in sorted(first.keys() | second.keys()) if first.get(name) != second.get(name)]
-    return tuple(", ".join(f"{name} {own.get(name, 'missing')}" for name in names) for own in (first, second))  # type: ignore[return-value]
-
-
-def _other(what: str, before: str | None, after: str | None) -> str:
+def _changed(what: str, before: str | None, after: str | None, consequence: str = "") -> str:
     if before == after:
         return ""
-    more = _FOLLOWS.get(what, "")
-    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}. {more}".strip()
+    return f"{what} changed from {before or 'unknown'} to {after or 'unknown'}. {consequence}".strip()
 
 
-def _numbers(baseline: Night, tonight: Night, limits: Limits) -> list[str]:
-    """Say how near the medians are, and how many answers changed in kind."""
-    first, second = (
-        night.rows.filter(ANSWERED).group_by(PLACE).agg(pl.col("error_deg").median()) for night in (baseline, tonight)
-    )
-    both = first.join(second, on=PLACE, suffix="_2")
+def _numbers(baseline: NightlyRun, tonight: NightlyRun, limits: Limits) -> list[str]:
+    """Report how near the medians are, and how many results changed in kind."""
+    tables, made = (baseline.rows, tonight.rows), []
+    # Medians by cell
+    first, second = (rows.filter(ANSWERED).group_by(CELL).agg(pl.col("error_deg").median()) for rows in tables)
+    both = first.join(second, on=CELL, suffix="_2")
     apart = (both["error_deg"] - both["error_deg_2"]).abs()
-    made = []
     if both.height:
         made.append(
-            f"Medians agree to {limits.medians_deg:g} deg at {int((apart <= limits.medians_deg).sum())} of "
-            f"{both.height} places; they differ by {float(apart.to_numpy().max()):.2g} deg at most."
+            f"Medians agree to {limits.medians_deg:g} deg in {int((apart <= limits.medians_deg).sum())} of "
+            f"{both.height} cells; they differ by {float(apart.to_numpy().max()):.2g} deg at most."
         )
-    found = changes(baseline.rows, tonight.rows)
-    if found.pairs:
+    # Status by highlight: isophotes that opened, highlights that are no longer found
+    first, second = (
+        rows.filter(IS_TRUE).select(*KEY, "status", answered=ANSWERED).unique(KEY, keep="first") for rows in tables
+    )
+    both = first.join(second, on=KEY, suffix="_2")
+    before, after = pl.col("answered"), pl.col("answered_2")
+    other = pl.col("status").ne_missing(pl.col("status_2"))
+    status, lost, gained = both.select(status=other, lost=before & ~after, gained=after & ~before).sum().row(0)
+    # Detections by frame
+    frame = ("experiment", "setting", "realisation", "seed")
+    first, second = (rows.group_by(frame).agg(found=pl.col("specularity").drop_nulls().n_unique()) for rows in tables)
+    frames = first.join(second, on=frame, suffix="_2")
+    detections = frames.filter(pl.col("found") != pl.col("found_2")).height
+    if both.height:
         made.append(
-            f"Of {found.pairs} pairs of answers {found.status} differ in status, {found.lost} of them answered in the "
-            f"baseline alone and {found.gained} tonight alone; of {found.frames} frames {found.detections} have "
-            "another number of detections: contours that changed topology."
+            f"Of {both.height} pairs of results {status} differ in status, {lost} of them answered in the baseline "
+            f"alone and {gained} tonight alone; of {frames.height} frames {detections} have another number of "
+            "detections: contours that changed topology."
         )
     return made

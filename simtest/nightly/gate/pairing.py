@@ -1,170 +1,63 @@
-"""Which rows of two nights are pairs, and what nights differ in beside their numbers."""
+"""Which rows of two runs are pairs."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import polars as pl
 
 from simtest.nightly.gate.pairing_units import UNIT
-from simtest.nightly.gate.quantities import ANSWERED, HARMS, IS_TRUE, KEY, harms_of_frames, harms_of_rows
-from simtest.nightly.gate.records import PLACE
+from simtest.nightly.gate.quantities import PENALISED
+
+_FALSE = pl.col("quantity") == "false"
 
 
-@dataclass(frozen=True)
-class Numbered:
-    """One night's rows of the shared places.
+class Pairing(NamedTuple):
+    """Cells whose frames have the same seeds in two runs."""
 
-    Parameters
-    ----------
-    rows, frames : polars.DataFrame
-        See `harms_of_rows` and `harms_of_frames`, with the number of the place, `place`.
-    """
-
-    rows: pl.DataFrame
-    frames: pl.DataFrame
-
-    @classmethod
-    def of(cls, rows: pl.DataFrame, names: pl.DataFrame) -> "Numbered":
-        """Give the rows of places with their numbers; those of others are left out."""
-        own = rows.join(names, on=PLACE, how="inner", maintain_order="left")
-        return cls(
-            *(made.join(names, on=PLACE, maintain_order="left") for made in (harms_of_rows(own), harms_of_frames(own)))
-        )
+    cells: frozenset[int]  # all true highlights tonight are in the baseline, once: rows are compared pair by pair
+    lost: pl.DataFrame  # `cell`, `before` (true highlights of the baseline), `kept`: where tonight lacks some of them
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """Which places of two nights are pairs.
-
-    Parameters
-    ----------
-    places : frozenset of int
-        Places whose frames have the same seeds, and all of whose true highlights tonight are in the baseline, once:
-        what both nights have is compared pair by pair.
-    lost : polars.DataFrame
-        `place`, `before` (true highlights of the baseline), `kept` (those that tonight has too): places whose frames
-        have the same seeds, and of whose true highlights some are missing tonight.
-    """
-
-    places: frozenset[int]
-    lost: pl.DataFrame
-
-
-def pairing(before: Numbered, after: Numbered) -> Pairing:
-    """Find the places that are pairs, and those that have lost highlights."""
-    key = ("place", "realisation", "true_id", "seed")
+def pairing(before: pl.DataFrame, after: pl.DataFrame) -> Pairing:
+    """Find the cells that are pairs, and those that have lost highlights, in the `harms` of two runs."""
+    # Count each true highlight in both runs; each has one row of this quantity.
+    key = ("cell", "realisation", "true_id", "seed")
     counted = [
-        night.rows.group_by(key).agg(pl.len().alias(name)) for night, name in ((before, "once"), (after, "again"))
+        run.filter(pl.col("quantity") == PENALISED).group_by(key).agg(pl.len().alias(name))
+        for run, name in ((before, "first"), (after, "second"))
     ]
-    once, again = pl.col("once"), pl.col("again")
+    first, second = pl.col("first"), pl.col("second")
     counts = (
         counted[0]
         .join(counted[1], on=key, how="full", coalesce=True, nulls_equal=True)
-        .with_columns(once.fill_null(0), again.fill_null(0))
-        .group_by("place")
+        .with_columns(first.fill_null(0), second.fill_null(0))
+        .group_by("cell")
         .agg(
-            before=(once > 0).sum(), kept=((once > 0) & (again > 0)).sum(), gained=(once == 0).sum(),
-            repeated=((once > 1) | (again > 1)).any(),
+            before=(first > 0).sum(), kept=((first > 0) & (second > 0)).sum(), gained=(first == 0).sum(),
+            repeated=((first > 1) | (second > 1)).any(),
         )
     )  # fmt: skip
-    # A frame without a highlight has rows only where something was found in it.
-    frames = before.frames.join(after.frames, on=("place", "realisation"), suffix="_2")
-    moved = set(frames.filter(pl.col("seed").ne_missing(pl.col("seed_2")))["place"].to_list())
+    # Compare the frames' seeds. A frame without a highlight has rows only where something was found in it.
+    frames = [run.filter(_FALSE).select("cell", "realisation", "seed") for run in (before, after)]
+    both = frames[0].join(frames[1], on=("cell", "realisation"), suffix="_2")
+    moved = set(both.filter(pl.col("seed").ne_missing(pl.col("seed_2")))["cell"].to_list())
     # Realisations of other numbers are other realisations: nothing of them is lost.
-    same = (pl.col("kept") < pl.col("before")) & pl.col("place").is_in(list(set(frames["place"].to_list()) - moved))
-    lost = counts.filter(same).select("place", "before", "kept")
-    other = counts.filter((pl.col("gained") > 0) | pl.col("repeated") | ((pl.col("kept") < pl.col("before")) & ~same))
-    every = set(before.frames["place"].to_list()) & set(after.frames["place"].to_list())
-    return Pairing(frozenset(every - set(other["place"].to_list()) - moved), lost)
+    fewer = pl.col("kept") < pl.col("before")
+    lost = fewer & pl.col("cell").is_in(list(set(both["cell"].to_list()) - moved))
+    unequal = counts.filter((pl.col("gained") > 0) | pl.col("repeated") | (fewer & ~lost))
+    every = set(frames[0]["cell"].to_list()) & set(frames[1]["cell"].to_list())
+    return Pairing(
+        frozenset(every - set(unequal["cell"].to_list()) - moved), counts.filter(lost).select("cell", "before", "kept")
+    )
 
 
-def pairs(before: Numbered, after: Numbered, paired: frozenset[int]) -> pl.DataFrame:
-    """Give the pairs of all quantities: `UNIT`, `baseline`, `tonight`; a row where both nights have a value."""
-    kept = pl.col("place").is_in(list(paired))
-    rows = _long(before.rows.filter(kept), "baseline").join(
-        _long(after.rows.filter(kept), "tonight"), on=(*UNIT, "true_id")
-    )
-    # A frame that had highlights and has no row at all tonight is lost: it is not one without false detections.
-    unseen = before.rows.join(after.frames, on=("place", "realisation"), how="anti").select("place", "realisation")
-    frames = (
-        _frames(before.frames.filter(kept).join(unseen, on=("place", "realisation"), how="anti"), "baseline")
-        .join(_frames(after.frames.filter(kept), "tonight"), on=UNIT, how="full", coalesce=True)
-        .with_columns(pl.col("baseline", "tonight").fill_null(0.0))
-    )
+def pairs(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    """Join the `harms` of two runs to pairs: `UNIT`, `baseline`, `tonight`; a row where both runs have a value."""
+    first, second = before.rename({"value": "baseline"}), after.rename({"value": "tonight"})
+    rows = first.filter(~_FALSE).join(second.filter(~_FALSE), on=(*UNIT, "true_id"), maintain_order="left")
+    # A frame with highlights that has no row at all tonight is lost: it is not one without false detections.
+    frame = ("cell", "realisation")
+    lost = before.filter(~_FALSE).join(after, on=frame, how="anti")
+    frames = first.filter(_FALSE).join(lost, on=frame, how="anti", maintain_order="left")
+    frames = frames.join(second.filter(_FALSE), on=UNIT, how="full", coalesce=True, maintain_order="left_right")
+    frames = frames.with_columns(pl.col("baseline", "tonight").fill_null(0.0))
     return pl.concat([table.select(*UNIT, "baseline", "tonight") for table in (rows, frames)])
-
-
-def alone(night: Numbered, paired: frozenset[int]) -> pl.DataFrame:
-    """Give one night's values of all quantities at the places that are not paired: `UNIT`, `value`."""
-    kept = ~pl.col("place").is_in(list(paired))
-    tables = (_long(night.rows.filter(kept), "value"), _frames(night.frames.filter(kept), "value"))
-    return pl.concat([table.select(*UNIT, "value") for table in tables])
-
-
-def _long(rows: pl.DataFrame, name: str) -> pl.DataFrame:
-    index = ("place", "realisation", "true_id")
-    tables = [
-        rows.select(*index, quantity=pl.lit(quantity), **{name: pl.col(quantity)}).filter(pl.col(name).is_not_null())
-        for quantity in HARMS
-    ]
-    return pl.concat(tables)
-
-
-def _frames(frames: pl.DataFrame, name: str) -> pl.DataFrame:
-    return frames.select("place", "realisation", quantity=pl.lit("false"), **{name: pl.col("false")})
-
-
-@dataclass(frozen=True)
-class Changes:
-    """How answers, rather than their values, changed between two nights.
-
-    Parameters
-    ----------
-    pairs : int
-        True highlights times estimators in both nights, of the same seed.
-    lost, gained : int
-        Of these, answered in the baseline alone, and tonight alone.
-    status : int
-        Of these, whose status differs.
-    frames : int
-        Frames in both nights.
-    detections : int
-        Of these, with another number of detections.
-    """
-
-    pairs: int
-    lost: int
-    gained: int
-    status: int
-    frames: int
-    detections: int
-
-
-def changes(baseline: pl.DataFrame, tonight: pl.DataFrame) -> Changes:
-    """Count what changed in kind: isophotes that opened, highlights that were found no more.
-
-    Parameters
-    ----------
-    baseline, tonight : polars.DataFrame
-        Rows of two nights.
-
-    Returns
-    -------
-    Changes
-    """
-    key = (*KEY, "seed")
-    first, second = (
-        rows.filter(IS_TRUE).select(*key, "status", answered=ANSWERED).unique(key, keep="first")
-        for rows in (baseline, tonight)
-    )
-    both = first.join(second, on=key, suffix="_2")
-    lost, gained = pl.col("answered") & ~pl.col("answered_2"), pl.col("answered_2") & ~pl.col("answered")
-    frame = ("experiment", "setting", "realisation", "seed")
-    seen = [
-        rows.group_by(frame).agg(found=pl.col("specularity").drop_nulls().n_unique()) for rows in (baseline, tonight)
-    ]
-    frames = seen[0].join(seen[1], on=frame, suffix="_2")
-    return Changes(
-        both.height, both.filter(lost).height, both.filter(gained).height,
-        both.filter(pl.col("status").ne_missing(pl.col("status_2"))).height, frames.height,
-        frames.filter(pl.col("found") != pl.col("found_2")).height,
-    )  # fmt: skip

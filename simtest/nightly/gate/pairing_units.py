@@ -1,11 +1,12 @@
 """Sums over resampling units: realisations, each a scene or a pose, whatever number of highlights it shows."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
 
 import polars as pl
 
-GROUP = ("place", "quantity")
-"""Number of the place and name of the quantity: a test each."""
+GROUP = ("cell", "quantity")
+"""Number of the cell and name of the quantity: a test each."""
 
 UNIT = (*GROUP, "realisation")
 
@@ -22,38 +23,28 @@ def paired_sums(values: pl.DataFrame) -> pl.DataFrame:
     -------
     polars.DataFrame
         `GROUP`, `units`, `rows`; sums over units of d (tonight less baseline), x (baseline) and of products of d, x and
-        n (the unit's rows): `d`, `x`, `dd`, `xx`, `nn`, `dx`, `dn`, `xn`; `largest`: the largest abs(d) of a row.
+        n (the unit's rows): `d`, `x`, `dd`, `dx`, `dn`, `xx`, `xn`, `nn`; `largest`: the largest abs(d) of a row.
     """
     d = pl.col("tonight") - pl.col("baseline")
-    units = values.group_by(UNIT).agg(
-        d=d.sum(), x=pl.col("baseline").sum(), n=pl.len().cast(pl.Float64), largest=d.abs().max()
-    )
-    return units.group_by(GROUP).agg(
-        pl.len().alias("units"), pl.col("n").sum().alias("rows"), pl.col("d", "x").sum(),
-        *_products((("d", "d"), ("x", "x"), ("n", "n"), ("d", "x"), ("d", "n"), ("x", "n"))),
-        pl.col("largest").max(),
-    )  # fmt: skip
+    return _sums(values, (d.alias("d"), pl.col("baseline").alias("x")), d.abs())
 
 
 def sums(values: pl.DataFrame) -> pl.DataFrame:
-    """Add up one night's values by unit, then over units.
+    """Add up one run's values (`UNIT`, `value`) as `paired_sums` does, without d; `largest` is the largest value."""
+    return _sums(values, (pl.col("value").alias("x"),), pl.col("value"))
 
-    Parameters
-    ----------
-    values : polars.DataFrame
-        `UNIT`, `value`.
 
-    Returns
-    -------
-    polars.DataFrame
-        `GROUP`, `units`, `rows`; sums over units of `x` and of products of x and n: `xx`, `nn`, `xn`.
-    """
-    units = values.group_by(UNIT).agg(x=pl.col("value").sum(), n=pl.len().cast(pl.Float64))
-    return units.group_by(GROUP).agg(
-        pl.len().alias("units"), pl.col("n").sum().alias("rows"), pl.col("x").sum(),
-        *_products((("x", "x"), ("n", "n"), ("x", "n"))),
+def _sums(values: pl.DataFrame, terms: Sequence[pl.Expr], size: pl.Expr) -> pl.DataFrame:
+    # The order of the units is kept, so that equal inputs have equal sums to the last bit.
+    units = values.group_by(UNIT, maintain_order=True).agg(
+        *(term.sum() for term in terms), n=pl.len().cast(pl.Float64), largest=size.max()
+    )
+    names = [term.meta.output_name() for term in terms]
+    products = [
+        (pl.col(first) * pl.col(second)).sum().alias(first + second)
+        for first, second in combinations_with_replacement((*names, "n"), 2)
+    ]
+    return units.group_by(GROUP, maintain_order=True).agg(
+        pl.len().alias("units"), pl.col("n").sum().alias("rows"), pl.col(names).sum(), *products,
+        pl.col("largest").max(),
     )  # fmt: skip
-
-
-def _products(pairs: Iterable[tuple[str, str]]) -> list[pl.Expr]:
-    return [(pl.col(first) * pl.col(second)).sum().alias(first + second) for first, second in pairs]

@@ -1,7 +1,7 @@
-"""One test over all places of an estimator: what is too small to show in ten realisations of one setting shows in many.
+"""One test over all cells of an estimator: what is too small to show in ten realisations of one setting shows in many.
 
-Each place gives one number, its difference over the mean of the two nights' figures: symmetric about 0 where nothing
-changed, and never beyond 2, however heavy the errors' tails. A sum of pairs of places cannot then hang on one of them.
+Each cell contributes one number, its difference over the mean of the two runs' figures: symmetric about 0 where nothing
+changed, and never beyond 2, however heavy the errors' tails. A sum of many such shares cannot hang on one of them.
 """
 
 import numpy as np
@@ -10,40 +10,32 @@ from simtest.nightly.gate.contrasts import Array, Outcomes, half_width, tail
 from simtest.nightly.gate.quantities import Quantity
 
 MIN_UNITS = 5
-"""Where each place has as many units, the places' own standard errors are taken."""
+"""Where each cell has as many units, the cells' own standard errors are taken."""
 
-MIN_PLACES = 10
-"""Where not, but there are as many places, the places themselves are the sample."""
+MIN_CELLS = 10
+"""Where not, but there are as many cells, the cells themselves are the sample."""
 
 MOST_SHARE = 2.0
-"""A difference over the mean of both nights is no larger."""
+"""A difference over the mean of both runs is no larger."""
 
 
 def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
-    """Test many places at once.
-
-    Parameters
-    ----------
-    found : Outcomes
-        Of the places.
-    quantity : Quantity
-        Which.
+    """Test many cells at once.
 
     Returns
     -------
     Outcomes
-        Of shape (1,). Relative quantities are shares of the places' own means: the baseline is 1, the margin the
+        Of shape (1,). Relative quantities are shares of the cells' own means: the baseline is 1, the margin the
         relative one, which is the absolute margin where a mean is so small that this is the larger. p-values are NaN
-        where the places are too few, with too few units.
+        where the cells are too few, with too few units.
     """
     shares, deviations = found.difference, found.deviation
     margin = quantity.relative or quantity.absolute
     if quantity.relative:
         scale = np.maximum((found.baseline + found.tonight) / 2, quantity.scale_floor)
         shares, deviations = shares / scale, deviations / scale
-    mean, deviation, freedom = _mean(
-        shares, deviations, found, MOST_SHARE if quantity.relative and quantity.span else quantity.span
-    )
+    span = MOST_SHARE if quantity.relative and quantity.span else quantity.span
+    mean, deviation, freedom = _mean(shares, deviations, found, span)
     half = half_width(deviation, freedom)
     baseline = np.ones(1) if quantity.relative else np.array([found.baseline.mean()])
     return Outcomes(
@@ -54,19 +46,21 @@ def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
 
 
 def _mean(shares: Array, deviations: Array, found: Outcomes, span: float) -> tuple[Array, Array, Array]:
-    """Give the mean over places, its standard error and degrees of freedom, each of shape (1,)."""
+    """Compute the mean over cells, its standard error and degrees of freedom, each of shape (1,)."""
     count = len(shares)
     mean = np.array([shares.mean()])
+    # The cells' own standard errors, with Welch and Satterthwaite's degrees of freedom.
     if (found.n >= MIN_UNITS).all():
         variances = deviations**2 / count**2
         whole = variances.sum()
         freedom = whole**2 / np.sum(variances**2 / found.freedom) if whole > 0 else float(found.freedom.min())
         return mean, np.array([np.sqrt(whole)]), np.array([freedom])
-    if count < MIN_PLACES:
+    if count < MIN_CELLS:
         return mean, np.array([np.nan]), np.zeros(1)
+    # The cells as the sample.
     residuals = shares - mean
     if span:
-        # Two invented units, as in each place.
+        # Two invented units, as in each cell.
         extra = span * float(np.mean(1 / found.n))
         residuals = np.append(residuals, [extra, -extra])
     deviation = np.sqrt(np.sum(residuals**2) / (count - 1) / count)

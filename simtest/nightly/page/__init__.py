@@ -1,6 +1,8 @@
-"""The page of a night: the verdict first, then what changed, trends, and what to look at."""
+"""The page of a run: the verdict first, then what changed, trends, figures, worst cases and the other tables.
 
-from simtest.nightly.page.extras import Extras
-from simtest.nightly.page.writer import write_nightly_page
+`nightly_page` fills nightly.html.j2 with what the other modules make of a `JudgedRun`.
+"""
 
-__all__ = ["Extras", "write_nightly_page"]
+from simtest.nightly.page.nightly_page import write_nightly_page
+
+__all__ = ["write_nightly_page"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from simtest.nightly.gate.records import Night
+from simtest.nightly.records import NightlyRun
 from simtest.pages import style
 from simtest.report import labels as words
 from simtest.report.paper.sweeps import sweep_figures
@@ -42,12 +42,12 @@ class Group:
     charts: list[dict[str, Any]] = field(default_factory=list)
 
 
-def error_figures(night: Night, colours: Mapping[str, str]) -> tuple[list[Group], dict[str, str]]:
+def error_figures(night: NightlyRun, colours: Mapping[str, str]) -> tuple[list[Group], dict[str, str]]:
     """Draw the figures of curves of each experiment.
 
     Parameters
     ----------
-    night : Night
+    night : NightlyRun
         Whose rows are drawn.
     colours : mapping of str to str
         Colour by estimator.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.records import Night
-from simtest.nightly.page.phrases import interval
+from simtest.nightly.phrases import interval
+from simtest.nightly.records import NightlyRun
 from simtest.pages import style
 from simtest.pages.style import degrees, number
 
@@ -37,7 +37,7 @@ class Ladder:
     chart: str
 
 
-def ladder(night: Night, colours: Mapping[str, str]) -> Ladder | None:
+def ladder(night: NightlyRun, colours: Mapping[str, str]) -> Ladder | None:
     """Give the ladder of a night; None where it has none."""
     figures = night.figures.filter((pl.col("kind") == "ladder") & pl.col("value").is_not_null())
     if figures.is_empty():

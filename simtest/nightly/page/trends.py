@@ -8,21 +8,20 @@ peak is lost. Values are stored as 16 bits between the curve's own least and lar
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from simtest.nightly.gate.records import PLACE, Night
-from simtest.nightly.page.phrases import short_commit
+from simtest.nightly.phrases import short_commit
+from simtest.nightly.records import CELL, NightlyRun
 from simtest.pages.style import Array
 
 Mask = npt.NDArray[np.bool_]
 
 NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
-HISTORY_COLUMNS = ("kind", *PLACE, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
+HISTORY_COLUMNS = ("kind", *CELL, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
 """All that the page reads of the history; a history of other columns may leave the rest out."""
 
 BUDGET_BYTES = 2_800_000
@@ -39,7 +38,7 @@ LEAST_POINTS = NEWEST + 20
 
 COSTS, MEDIAN = "run time and memory", "median over all settings"
 
-_KEY = ("kind", *PLACE, "quantity", "unit")
+_KEY = ("kind", *CELL, "quantity", "unit")
 _KINDS = ("setting", "cost", "ladder")
 _NAMES_BYTES, _NIGHT_BYTES = 45, 50
 """What a curve's names and ends, and a night's, take."""
@@ -65,14 +64,14 @@ class Trends:
     points: int
 
 
-def trends(history: pl.DataFrame, night: Night, budget: int = BUDGET_BYTES) -> Trends | None:
+def trends(history: pl.DataFrame, night: NightlyRun, budget: int = BUDGET_BYTES) -> Trends | None:
     """Pack the history of a night's profile, the night included.
 
     Parameters
     ----------
     history : polars.DataFrame
         Rows of the history's files, `HISTORY_COLUMNS` at least; may be empty, and may hold the night already.
-    night : Night
+    night : NightlyRun
         Tonight's.
     budget : int
         Bytes for the packed curves.
@@ -97,16 +96,16 @@ def trends(history: pl.DataFrame, night: Night, budget: int = BUDGET_BYTES) -> T
     return Trends(_packed(keys, values, _thinned(values, points), nights), shown, left_out, points)
 
 
-def _held(history: pl.DataFrame, night: Night) -> pl.DataFrame:
+def _held(history: pl.DataFrame, night: NightlyRun) -> pl.DataFrame:
     """Give the numbers of all nights of the profile, `HISTORY_COLUMNS`, a night's rows together."""
-    run = night.run
+    run = night.record
     parts = []
     if not history.is_empty():
-        past = history.select(HISTORY_COLUMNS).filter(pl.col("profile") == run["profile"])
+        past = history.select(HISTORY_COLUMNS).filter(pl.col("profile") == run.profile)
         parts.append(past.with_columns(pl.col("started").cast(_TIME)))
-    if not parts or not (parts[0]["run_id"] == run["id"]).any():
-        own = {"run_id": run["id"], "commit": run.get("commit"), "state": None, "profile": run["profile"]}
-        started = datetime.fromisoformat(run["started"]).astimezone(UTC)
+    if not parts or not (parts[0]["run_id"] == run.id).any():
+        own = {"run_id": run.id, "commit": run.commit, "state": None, "profile": run.profile}
+        started = run.start
         constants = [pl.lit(value, pl.String).alias(name) for name, value in own.items()]
         tonight = night.figures.with_columns(pl.lit(started).cast(_TIME).alias("started"), *constants)
         parts.append(tonight.select(HISTORY_COLUMNS))

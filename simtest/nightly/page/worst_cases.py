@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.nightly.page.extras import Extras
+from simtest.nightly.records import JudgedRun
 from simtest.pages.html import picture
 from simtest.report import labels as words
 from simtest.report import static
@@ -15,10 +15,10 @@ MOST_CASES = 12
 PICTURE_BYTES, PICTURE_DPI = 48_000, 130
 
 
-def read_cases(extras: Extras) -> tuple[list[GalleryItem], list[str]]:
+def read_cases(judged: JudgedRun) -> tuple[list[GalleryItem], list[str]]:
     """Read the gallery items; gives those that can be read, and a line for each that cannot."""
     items, lines = [], []
-    for path in extras.gallery[:MOST_CASES]:
+    for path in judged.gallery[:MOST_CASES]:
         try:
             items.append(read_item(Path(path)))
         except InputError as error:

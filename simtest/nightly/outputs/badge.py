@@ -1,9 +1,9 @@
-"""A badge with the verdict, drawn here: it needs no service and no font of its own."""
+"""A badge with the verdict as SVG, drawn here so that it needs no service and no font of its own."""
 
 from xml.sax.saxutils import escape
 
-from simtest.nightly.gate.records import Night, Verdict
-from simtest.nightly.overview import headline
+from simtest.nightly.phrases import headline
+from simtest.nightly.records import JudgedRun
 
 # White on these has a contrast of 4.5 or more (WCAG AA).
 COLOURS = {"fine": "#1a7f37", "regression": "#c62828", "no baseline": "#5f6368"}
@@ -12,14 +12,12 @@ _LEFT = "#444444"
 _CHARACTER_PX, _PADDING_PX, _HEIGHT_PX = 7.0, 10.0, 20
 
 
-def badge(night: Night, verdict: Verdict) -> str:
-    """Give the badge as SVG text."""
-    left, right = f"nightly {night.run['profile']}", headline(verdict)
-    colour = COLOURS.get(verdict.state, COLOURS["no baseline"])
+def badge(judged: JudgedRun) -> str:
+    """Return the badge as SVG text."""
+    left, right = f"nightly {judged.run.record.profile}", headline(judged.verdict)
     widths = [round(len(text) * _CHARACTER_PX + 2 * _PADDING_PX) for text in (left, right)]
-    title = escape(f"{left}: {right}")
     texts = "".join(
-        # The length is given, since the reader's font may be wider than ours.
+        # The length is stated, since the reader's font may be wider than ours.
         f'<text x="{x:g}" y="14" textLength="{len(text) * _CHARACTER_PX:g}" lengthAdjust="spacingAndGlyphs">'
         f"{escape(text)}</text>"
         for text, x in ((left, _PADDING_PX), (right, widths[0] + _PADDING_PX))
@@ -28,8 +26,8 @@ def badge(night: Night, verdict: Verdict) -> str:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{total}" height="{_HEIGHT_PX}" '
         f'viewBox="0 0 {total} {_HEIGHT_PX}" role="img" aria-labelledby="title">'
-        f'<title id="title">{title}</title>'
+        f'<title id="title">{escape(f"{left}: {right}")}</title>'
         f'<rect width="{widths[0]}" height="{_HEIGHT_PX}" fill="{_LEFT}"/>'
-        f'<rect x="{widths[0]}" width="{widths[1]}" height="{_HEIGHT_PX}" fill="{colour}"/>'
+        f'<rect x="{widths[0]}" width="{widths[1]}" height="{_HEIGHT_PX}" fill="{COLOURS[judged.verdict.state]}"/>'
         f'<g fill="#ffffff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11">{texts}</g></svg>\n'
     )

@@ -1,0 +1,94 @@
+"""The verdict as Markdown that fits a comment on a pull request."""
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from simtest.nightly.phrases import cell_name, headline, plain, short_commit
+from simtest.nightly.records import OUTCOMES, JudgedRun, Verdict
+
+MAX_CHARACTERS = 60_000
+"""A comment on GitHub may have 65,536."""
+
+MAX_ROWS, MAX_NOTES, MAX_TEXT = 20, 20, 300
+
+
+def summary(judged: JudgedRun) -> str:
+    """Return the summary as Markdown text of at most `MAX_CHARACTERS`."""
+    record, verdict = judged.run.record, judged.verdict
+    notes = [f"- {_safe(note)}" for note in verdict.notes[:MAX_NOTES]]
+    if len(verdict.notes) > MAX_NOTES:
+        notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
+    parts = [
+        f"## Nightly {_safe(record.profile)}: {headline(verdict)}",
+        _compared(verdict),
+        *(["\n".join(notes)] if notes else []),
+        *_changes("Worse", judged.with_outcome("worse")),
+        *_canaries(judged.run.failed_canaries),
+        *_changes("Better", judged.with_outcome("better")),
+        "### By experiment",
+        _by_experiment(judged),
+        f"{_safe(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
+        f"{_safe(record.processor)}; run `{_safe(record.id)}`",
+    ]
+    text = "\n\n".join(parts) + "\n"
+    # A cut table is still readable, a comment that GitHub refuses is not.
+    if len(text) > MAX_CHARACTERS:
+        end = "\n\n(cut; the page has the rest)\n"
+        text = text[: MAX_CHARACTERS - len(end)] + end
+    return text
+
+
+def _compared(verdict: Verdict) -> str:
+    baseline = verdict.baseline
+    if baseline is None:
+        return "There is no baseline to compare with."
+    equal = {True: "Bit-equal to", False: "Not bit-equal to", None: "Compared with"}[verdict.bit_equal]
+    reason = f': "{_safe(baseline.reason)}"' if baseline.reason else ""
+    return f"{equal} the baseline of {_safe(baseline.started)}, commit {short_commit(baseline.commit)}{reason}."
+
+
+def _changes(title: str, changes: pl.DataFrame) -> list[str]:
+    if not changes.height:
+        return []
+    rows = []
+    for row in changes.head(MAX_ROWS).iter_rows(named=True):
+        interval = "" if row["low"] is None else f" [{plain(row['low'])}, {plain(row['high'])}]"
+        rows.append(
+            (row["experiment"], cell_name(row), row["quantity"], plain(row["baseline"], row["unit"]),
+             plain(row["tonight"], row["unit"]), plain(row["difference"]) + interval, plain(row["p_holm"]))
+        )  # fmt: skip
+    head = ("experiment", "cell", "figure", "baseline", "tonight", "difference [95 %]", "p (Holm)")
+    more = [f"... and {changes.height - MAX_ROWS} more; the page has them."] if changes.height > MAX_ROWS else []
+    return [f"### {title}: {changes.height}", _table(head, rows), *more]
+
+
+def _canaries(failed: pl.DataFrame) -> list[str]:
+    if not failed.height:
+        return []
+    rows = [
+        (row["experiment"], row["setting"], row["quantity"], plain(row["value"], row["unit"]),
+         f"{plain(row['low'])} to {plain(row['high'])}")
+        for row in failed.head(MAX_ROWS).iter_rows(named=True)
+    ]  # fmt: skip
+    return [f"### Canaries failed: {failed.height}", _table(("canary", "setting", "figure", "value", "allowed"), rows)]
+
+
+def _by_experiment(judged: JudgedRun) -> str:
+    counts = OUTCOMES if judged.verdict.baseline is not None else ()
+    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
+    return _table(columns, judged.by_experiment().select(columns).rows())
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str | int | None]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join("" if cell is None else _safe(cell) for cell in line) + " |" for line in lines)
+
+
+def _safe(value: object) -> str:
+    """Return a text on one line, without the signs of Markdown or HTML."""
+    text = " ".join(str(value).split())
+    text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
+    for sign, safe in (("\\", "\\\\"), ("|", "\\|"), ("`", "'"), ("&", "&amp;"), ("<", "&lt;"), ("@", "&#64;")):
+        text = text.replace(sign, safe)
+    return text

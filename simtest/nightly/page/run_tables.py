@@ -1,0 +1,174 @@
+"""The page's tables: comparisons, canaries, results and failures, costs, provenance."""
+
+from typing import NamedTuple
+
+import polars as pl
+
+from simtest.nightly.gate.quantities import COVERED
+from simtest.nightly.phrases import MEANINGS, bounds, interval, joined, measure, signed
+from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
+from simtest.pages.style import estimator_order, number
+from simtest.report.labels import flattened
+
+MOST_ROWS = 800
+"""Rows of the table; equal and equivalent ones are left out first. verdict.json holds all."""
+
+
+class Entry(NamedTuple):
+    """An entry of a table."""
+
+    text: str | int
+    css: str = ""  # "text": aligned left; "wrap": may be broken; "trend": a link to it; "estimator": with its colour
+    value: float | None = None  # sorts the entry in the place of its text
+    head: bool = False  # whether it names its row
+    sign: str = ""  # outcome whose sign and colour the text has
+
+
+class Table(NamedTuple):
+    """A table: accessible name, headings (those of columns of text begin with "="), and rows."""
+
+    label: str
+    heads: tuple[str, ...]
+    rows: list[list[Entry]]
+
+
+class Comparisons(NamedTuple):
+    """The table of comparisons, the worst first; how many it does not hold, by outcome; values by column to filter."""
+
+    table: Table
+    left_out: dict[str, int]
+    choices: dict[str, list[str]]
+
+
+def comparisons(verdict: Verdict, most: int = MOST_ROWS) -> Comparisons:
+    """Return the table of a verdict's comparisons, of so many rows at most."""
+    # By outcome, then by size in margins
+    rank = pl.col("outcome").replace_strict({name: i for i, name in enumerate(MEANINGS)}, default=-1)
+    size = (pl.col("difference").abs() / pl.col("margin")).fill_nan(None)
+    names = pl.col("experiment", "setting", "estimator", "quantity", "method").replace("", None).fill_null("–")
+    found = verdict.comparisons.with_columns(names, rank=rank, size=size)
+    found = found.sort("rank", "size", descending=[False, True], nulls_last=True, maintain_order=True)
+    shown = found.head(most)
+    rows = []
+    for row in shown.iter_rows(named=True):
+        unit, difference = row["unit"], row["difference"]
+        rows.append(
+            [Entry(row["outcome"], "text", sign=row["outcome"]), Entry(row["experiment"], "text"),
+             Entry(row["setting"], "text wrap"), Entry(row["estimator"], "text"), Entry(row["quantity"], "text trend"),
+             _number(signed(difference, unit), difference), Entry(interval(row["low"], row["high"])),
+             _share(difference, row["baseline"]), _number(measure(row["baseline"], unit), row["baseline"]),
+             _number(measure(row["tonight"], unit), row["tonight"]), _number(number(row["margin"]), row["margin"]),
+             _number(number(row["p_holm"], 2), row["p_holm"]), Entry("–" if row["n"] is None else row["n"]),
+             Entry(row["method"], "text")]
+        )  # fmt: skip
+    heads = (
+        "=outcome", "=experiment", "=setting", "=estimator", "=quantity", "difference", "95\u00a0% interval", "share",
+        "baseline", "tonight", "margin", "p (Holm)", "n", "=test",
+    )  # fmt: skip
+    choices = {name: shown[name].unique().sort().to_list() for name in ("experiment", "estimator", "quantity")}
+    choices["outcome"] = shown["outcome"].unique(maintain_order=True).to_list()
+    left = dict(found.slice(most)["outcome"].value_counts(sort=True).iter_rows())
+    return Comparisons(Table("Figures against the baseline", heads, rows), left, choices)
+
+
+def _number(text: str, value: float | None) -> Entry:
+    return Entry(text, value=value)
+
+
+def _share(difference: float | None, baseline: float | None) -> Entry:
+    """Return a difference as a share of the baseline, %."""
+    if difference is None or not baseline:
+        return Entry("–")
+    share = 100 * difference / abs(baseline)
+    if abs(share) >= 1000:
+        return _number(f"{'+' if share > 0 else '−'}×{number(abs(difference / baseline) + 1, 2)}", share)
+    return _number(f"{signed(float(f'{share:.2g}'))}\u00a0%", share)
+
+
+def canaries(run: NightlyRun) -> Table:
+    """Return the canaries, those out of bounds first."""
+    rows = run.figures_of("canary").with_columns(pl.col("passed").fill_null(False)).sort("passed", maintain_order=True)
+    entries = [
+        [Entry("within", "text", sign="passed") if row["passed"] else Entry("out of bounds", "text", sign="worse"),
+         Entry(joined(row["experiment"] or "–", row["setting"] or row["label"]), "text", head=True),
+         Entry(row["quantity"] or "–", "text"), _number(measure(row["value"], row["unit"]), row["value"]),
+         Entry(bounds(row["low"], row["high"])), Entry(row["about"] or "", "text wrap")]
+        for row in rows.iter_rows(named=True)
+    ]  # fmt: skip
+    return Table("Canaries", ("=result", "=canary", "=quantity", "value", "allowed", "=about"), entries)
+
+
+def results(run: NightlyRun, apart: bool = False) -> Table:
+    """Count results, failures, missed and false ones, and how often the 95 % region held the truth, by estimator.
+
+    Experiments are counted together, or `apart`.
+    """
+    true, ok, missed = pl.col("true_id").is_not_null(), pl.col("status") == "ok", pl.col("status") == "missed"
+    # Enumerations sort in the order of their names.
+    by = [pl.col("estimator").cast(pl.Enum(estimator_order(run.rows["estimator"])))]
+    if apart:
+        by.insert(0, pl.col("experiment").cast(pl.Enum(run.rows["experiment"].unique(maintain_order=True))))
+    # Squared Mahalanobis distances of stated regions
+    held = pl.col("mahalanobis2").filter(ok & true).drop_nulls()
+    counts = run.rows.group_by(by).agg(
+        true=true.sum(), ok=(ok & true).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
+        false=(~true).sum(), with_region=held.len(), covered=(held <= COVERED).sum(),
+    )  # fmt: skip
+    names = ("experiment", "estimator")[-len(by) :]
+    entries = []
+    for row in counts.sort(names).iter_rows(named=True):
+        numbers = (
+            row["true"], row["ok"], _percent(row["ok"], row["true"]), row["failed"], row["missed"], row["false"],
+            row["with_region"], _percent(row["covered"], row["with_region"]),
+        )  # fmt: skip
+        texts = [Entry(row[name], f"text {name}", head=name == names[0]) for name in names]
+        entries.append(texts + [Entry(value) for value in numbers])
+    heads = ("true highlights", "answered", "answered\u00a0%", "failed", "missed", "false", "with a region",
+             "held the truth\u00a0%")  # fmt: skip
+    label = f"Failures and coverage by {names[0]}"
+    return Table(label, (*(f"={name}" for name in names), *heads), entries)
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f}" if whole else "–"
+
+
+def failures(run: NightlyRun) -> Table:
+    """Count the failures by reason, the commonest first, and estimator."""
+    failed = run.rows.filter(pl.col("true_id").is_not_null() & ~pl.col("status").is_in(["ok", "missed"]))
+    reasons = failed.group_by("status").len().sort("len", "status", descending=[True, False])["status"].to_list()
+    counts = {(name, reason): count for name, reason, count in failed.group_by("estimator", "status").len().rows()}
+    entries = [
+        [Entry(name, "text estimator", head=True), *(Entry(counts.get((name, reason), "–")) for reason in reasons)]
+        for name in estimator_order(failed["estimator"])
+    ]
+    return Table("Failures by reason", ("=estimator", *(reason.replace("_", " ") for reason in reasons)), entries)
+
+
+def costs(judged: JudgedRun) -> Table:
+    """Return run time and memory, beside the baseline's where the gate compared them."""
+    key = ("experiment", "setting", "estimator", "quantity")
+    before = judged.verdict.comparisons.select(*key, "baseline").unique(key, keep="last")
+    rows = judged.run.figures_of("cost").join(before, on=key, how="left", nulls_equal=True, maintain_order="left")
+    entries = [
+        [Entry(joined(*dict.fromkeys(row[name] for name in key[:3])) or "–", "text", head=True),
+         Entry(row["quantity"] or "–", "text"), _number(measure(row["value"], row["unit"]), row["value"]),
+         Entry(interval(row["low"], row["high"])), Entry(measure(row["baseline"], row["unit"])),
+         Entry(row["about"] or "", "text wrap")]
+        for row in rows.iter_rows(named=True)
+    ]  # fmt: skip
+    return Table("Run time and memory", ("=of", "=quantity", "tonight", "interval", "baseline", "=about"), entries)
+
+
+def provenance(judged: JudgedRun) -> Table:
+    """Return what made the numbers of tonight, and of the baseline where there is one."""
+    records = {"=tonight": judged.run.record, "=baseline": judged.verdict.baseline}
+    texts = {head: flattened(record.to_json()) for head, record in records.items() if record is not None}
+    entries = []
+    # In the order of tonight's record, then of what the baseline's has beside it
+    for name in dict.fromkeys(name for own in texts.values() for name in own):
+        values = [own.get(name, "–") for own in texts.values()]
+        mark = "≠ " if len(set(values)) > 1 else ""
+        codes = [Entry(value, "text wrap-short code") for value in values]
+        entries.append([Entry(mark + name, "text", head=True), *codes])
+    return Table("Provenance", ("=of", *texts), entries)

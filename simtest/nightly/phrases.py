@@ -1,0 +1,144 @@
+"""Numbers, names and sentences of a judged run, for terminal, files and page alike.
+
+The page writes numbers with three digits and typographic signs (`measure`, `signed`, `interval`, `bounds`), the files
+with four digits in plain characters (`plain`).
+"""
+
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from simtest.nightly.records import JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.pages.style import degrees, labelled, number
+
+STATES = {
+    "fine": "Fine: nothing is worse than the baseline.",
+    "no baseline": "No baseline: there is nothing to compare with.",
+}
+MARKS = {"fine": "✓", "regression": "✗", "no baseline": "○"}
+
+MEANINGS = {
+    "worse": "beyond the margin, at the corrected level: a regression",
+    "better": "beyond the margin the other way",
+    "gone": "in the baseline, but not tonight",
+    "new": "tonight, but not in the baseline",
+    "undecided": "neither a change nor equivalence is shown",
+    "equivalent": "the interval lies within the margin",
+    "same": "identical bytes",
+}
+"""Meanings of the outcomes, those first that a reader looks for first."""
+
+_ACCEPT = "simtest nightly accept --reason TEXT"
+
+
+def cell_name(row: Mapping[str, str | None]) -> str:
+    """Return the name of a cell: setting and estimator; the setting begins with its label."""
+    return joined(row["setting"] or row["label"] or row["surface"], row["estimator"])
+
+
+def joined(*names: str | None) -> str:
+    """Join the names that are not empty."""
+    return ", ".join(name for name in names if name)
+
+
+def short_commit(commit: str | None) -> str:
+    """Return a commit's first 12 digits, with "+" where the checkout was changed; "unknown" where there is none."""
+    found = re.fullmatch(r"([0-9a-f]{12})[0-9a-f]*(\+?)", commit or "")
+    return "".join(found.groups()) if found else "unknown"
+
+
+def when(started: str) -> str:
+    """Return a time as date and minute, UTC."""
+    return f"{datetime.fromisoformat(started).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def plain(value: float | None, unit: str | None = None) -> str:
+    """Write a number for a text file, with four digits; an empty one as a dash."""
+    if value is None:
+        return "-"
+    return f"{value:.4g}" + (f" {unit}" if unit else "")
+
+
+def measure(value: float | None, unit: str | None) -> str:
+    """Write a number with its unit."""
+    if unit == "deg":
+        return degrees(value)
+    text = number(value)
+    return text if text == "–" or not unit else f"{text}\u00a0{unit}"
+
+
+def signed(value: float | None, unit: str | None = "") -> str:
+    """Write a difference with its sign."""
+    text = measure(value, unit).replace("-", "−")
+    return "+" + text if value is not None and value > 0 and text != "–" else text
+
+
+def interval(low: float | None, high: float | None) -> str:
+    """Write an interval; a dash where there is none."""
+    return "–" if low is None and high is None else f"{number(low)} to {number(high)}".replace("-", "−")
+
+
+def bounds(low: float | None, high: float | None) -> str:
+    """Write the bounds of a value."""
+    if low is not None and low == high:
+        return f"exactly {number(low)}"
+    if number(high) == "–":
+        return "–" if number(low) == "–" else f"at least {number(low)}"
+    return f"at most {number(high)}" if number(low) == "–" else interval(low, high)
+
+
+def headline(verdict: Verdict) -> str:
+    """Return the verdict in a few words."""
+    worse = verdict.regressions.height
+    if verdict.state == "regression":
+        return f"regression: {worse} figure{'s' * (worse != 1)} worse" if worse else "regression"
+    return "fine, bit-equal" if verdict.state == "fine" and verdict.bit_equal else verdict.state
+
+
+def headline_sentence(judged: JudgedRun) -> str:
+    """Return the verdict in a sentence, with the estimators or canaries to blame."""
+    verdict = judged.verdict
+    if verdict.state != "regression":
+        return STATES[verdict.state]
+    worse, out = verdict.regressions, out_of_bounds(judged.run)
+    if worse.is_empty():
+        verb = "canary is" if len(out) == 1 else "canaries are"
+        why = f"{len(out)} {verb} out of bounds: {labelled(out)}" if out else "the gate says so"
+        return f"Regression: no figure is worse than the baseline, but {why}."
+    named = worse["estimator"].replace("", None).drop_nulls()
+    counted = named.value_counts().sort("count", "estimator", descending=[True, False])
+    names = [f"{name} ({count})" for name, count in counted.iter_rows()]
+    which = f": {labelled(names)}" if names else ""
+    verb = "is" if worse.height == 1 else "are"
+    return f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} worse than the baseline{which}."
+
+
+def out_of_bounds(run: NightlyRun) -> list[str]:
+    """Return the names of the canaries that did not pass."""
+    return run.failed_canaries["experiment"].unique(maintain_order=True).to_list()
+
+
+def verdict_lines(judged: JudgedRun) -> list[tuple[str, str]]:
+    """Return the verdict's further lines as (name, text)."""
+    equal = {
+        None: "not known without a baseline",
+        True: "yes: all rows are identical to the baseline's, byte by byte",
+        False: "no: some rows differ from the baseline's",
+    }[judged.verdict.bit_equal]
+    made = [("Bit-equal", equal), ("Baseline", _baseline(judged.verdict.baseline))]
+    if count := judged.run.figures_of("canary").height:
+        out = out_of_bounds(judged.run)
+        made.append(("Canaries", f"out of bounds: {labelled(out)}" if out else f"all {count} figures within bounds"))
+    return made
+
+
+def _baseline(record: RunRecord | None) -> str:
+    if record is None:
+        return f"none; `{_ACCEPT}` makes this run the baseline"
+    text = f"{when(record.started)}, commit {short_commit(record.commit)}"
+    return f"{text}: {record.reason}" if record.reason else text
+
+
+def counts(verdict: Verdict) -> list[tuple[str, int, str]]:
+    """Return the outcomes that occur as (outcome, count, meaning), those first that a reader looks for first."""
+    return [(name, verdict.counts[name], meaning) for name, meaning in MEANINGS.items() if verdict.counts[name]]

@@ -1,0 +1,215 @@
+"""The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import polars as pl
+from pydantic import BaseModel, ConfigDict
+
+
+class Cell(NamedTuple):
+    """A cell of the results: what an estimator did in one setting of one experiment."""
+
+    experiment: str | None = ""
+    label: str | None = ""
+    surface: str | None = ""
+    setting: str | None = ""
+    estimator: str | None = ""
+
+
+CELL = Cell._fields
+"""Columns that name a cell."""
+
+POOLED = "all"
+"""Stands for label, surface and setting of a comparison over all settings of an experiment, and for the experiment too
+of one over all experiments."""
+
+_CELL_TYPES: dict[str, pl.DataType] = dict.fromkeys(CELL, pl.String())
+
+FIGURES: dict[str, pl.DataType] = {
+    "kind": pl.String(), **_CELL_TYPES, "quantity": pl.String(), "unit": pl.String(),
+    "value": pl.Float64(), "low": pl.Float64(), "high": pl.Float64(), "n": pl.Int64(), "passed": pl.Boolean(),
+    "digest": pl.String(), "about": pl.String(),
+}  # fmt: skip
+"""Columns of a run's figures, a row a number.
+
+`kind` is "setting" (an estimator's figure in a setting; `low`, `high` its 95 % interval, `digest` the hash of the
+cell's results, the same for all figures of a cell), "canary" (`experiment` the canary's name, `low`, `high` its bounds,
+`passed`), "cost" (run time as ratio to the reference kernel, memory) or "ladder" (see `simtest.nightly.ladder`).
+"""
+
+COMPARISONS: dict[str, pl.DataType] = {
+    **_CELL_TYPES, "quantity": pl.String(), "unit": pl.String(), "method": pl.String(),
+    "n": pl.Int64(), "baseline": pl.Float64(), "tonight": pl.Float64(), "difference": pl.Float64(),
+    "low": pl.Float64(), "high": pl.Float64(), "margin": pl.Float64(), "p": pl.Float64(), "p_holm": pl.Float64(),
+    "outcome": pl.String(),
+}  # fmt: skip
+"""Columns of the gate's comparisons, a row a cell and quantity.
+
+`method` is "equal" (the same bytes: no test is made), "paired", "unpaired" or "none"; `difference` is tonight less the
+baseline, `low`, `high` its 95 % interval, `margin` the harmless size of a difference; `p` one-sided for "worse by more
+than the margin", `p_holm` corrected over the family. `outcome` is one of `OUTCOMES`. Rows over many settings (`POOLED`)
+of a quantity with a relative margin have the unit "x": the baseline is 1, the difference the mean share of the
+settings'. Canaries (`experiment` the canary's name, `low`, `high` its bounds) and costs have the method "none".
+"""
+
+OUTCOMES = ("same", "equivalent", "undecided", "better", "worse", "new", "gone")
+"""same: equal bytes; equivalent: the interval, or every single pair, lies within the margin; worse: beyond the margin
+at the corrected level, or a cell, highlights or a canary that tonight lacks (a regression); better: its mirror image;
+undecided: neither shown; new: the baseline lacks it; gone: tonight has nothing to say of the quantity."""
+
+
+class Figure(NamedTuple):
+    """A number that a run measured: a row of `FIGURES`, whose columns the fields are."""
+
+    kind: str
+    cell: Cell
+    quantity: str
+    unit: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    n: int | None = None
+    passed: bool | None = None
+    digest: str | None = None
+    about: str = ""
+
+    def to_row(self) -> tuple[Any, ...]:
+        """Return the values of the columns `FIGURES`."""
+        return (self.kind, *self.cell, *self[2:])
+
+
+def figure_table(figures: Iterable[Figure]) -> pl.DataFrame:
+    """Return figures as a table with the columns `FIGURES`; NaN becomes null."""
+    table = pl.DataFrame([figure.to_row() for figure in figures], schema=FIGURES, orient="row")
+    return table.with_columns(pl.col("value", "low", "high").fill_nan(None))
+
+
+class RunRecord(BaseModel):
+    """A run's record, as run.json holds it: when and where the run was made, of what, and by which versions.
+
+    Fields that a record lacks have their defaults; `to_json` writes those alone that were given. Keys that this version
+    does not know are kept. `definitions` is a hash by experiment (what was run); `reason` and `accepted` are a
+    baseline's.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    id: str = ""
+    profile: str = ""
+    title: str = ""
+    started: str = ""
+    duration_s: float | None = None
+    experiments_s: float | None = None
+    workers: int | None = None
+    definitions: dict[str, str] = {}
+    command: str = ""
+    commit: str | None = None
+    version: str | None = None
+    versions: dict[str, str] = {}
+    python: str | None = None
+    processor: str | None = None
+    system: str | None = None
+    source_hash: str | None = None
+    variant: str | None = None
+    llvm: str | None = None
+    reason: str | None = None
+    accepted: str | None = None
+
+    @property
+    def start(self) -> datetime:
+        """When the run started, UTC."""
+        return datetime.fromisoformat(self.started).astimezone(UTC)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record as run.json and verdict.json hold it."""
+        return self.model_dump(exclude_unset=True)
+
+
+@dataclass(frozen=True)
+class NightlyRun:
+    """What one run of a profile measured."""
+
+    record: RunRecord  # when, where and of what it was made
+    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.results_table.SCHEMA`
+    figures: pl.DataFrame  # columns `FIGURES`
+
+    def figures_of(self, kind: str) -> pl.DataFrame:
+        """Return the figures of a kind."""
+        return self.figures.filter(pl.col("kind") == kind)
+
+    @property
+    def failed_canaries(self) -> pl.DataFrame:
+        """The figures of canaries that are out of bounds, or could not be measured."""
+        return self.figures_of("canary").filter(~pl.col("passed").fill_null(False))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the gate says of a run."""
+
+    state: str  # "fine", "regression" or "no baseline"
+    bit_equal: bool | None  # whether all rows of run and baseline are the same bytes; None without a baseline
+    comparisons: pl.DataFrame  # columns `COMPARISONS`
+    notes: tuple[str, ...]  # versions that differ, pairs that are missing, contours that changed topology
+    baseline: RunRecord | None
+
+    @property
+    def regressions(self) -> pl.DataFrame:
+        """The comparisons that are worse."""
+        return self.comparisons.filter(pl.col("outcome") == "worse")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of comparisons by outcome."""
+        return {name: self.comparisons.filter(pl.col("outcome") == name).height for name in OUTCOMES}
+
+    @property
+    def exit_code(self) -> int:
+        """1 for a regression, else 0: a run without a baseline is fine unless a canary failed."""
+        return 1 if self.state == "regression" else 0
+
+
+@dataclass(frozen=True)
+class JudgedRun:
+    """A run with its verdict and history: all that page and outputs are made of."""
+
+    run: NightlyRun
+    verdict: Verdict
+    history: pl.DataFrame  # columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them
+    gallery: tuple[Path, ...] = ()  # items of the worst cases, the worst first (see `simtest.validation.worst`)
+
+    @property
+    def comparisons(self) -> pl.DataFrame:
+        """The verdict's comparisons without those of canaries, which are judged by their bounds."""
+        # By all names of the figure: a canary may bear the name of the experiment that it watches.
+        key = (*CELL, "quantity")
+        canaries = self.run.figures_of("canary").select(key)
+        return self.verdict.comparisons.join(canaries, on=key, how="anti", nulls_equal=True, maintain_order="left")
+
+    def with_outcome(self, outcome: str) -> pl.DataFrame:
+        """Return the `comparisons` of an outcome, the surest first."""
+        return self.comparisons.filter(pl.col("outcome") == outcome).sort(
+            "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
+        )
+
+    def by_experiment(self) -> pl.DataFrame:
+        """Count by experiment: `rows` (true highlights), those `answered` and `missed`, `false` detections, `OUTCOMES`.
+
+        All estimators are counted together. An experiment that the baseline alone has is counted by its outcomes.
+        """
+        true = pl.col("true_id").is_not_null()
+        counts = self.run.rows.group_by("experiment", maintain_order=True).agg(
+            rows=true.sum(), answered=(true & (pl.col("status") == "ok")).sum(),
+            missed=(true & (pl.col("status") == "missed")).sum(), false=(~true).sum(),
+        )  # fmt: skip
+        # Without a baseline there are no outcomes to count.
+        judged = self.comparisons if self.verdict.baseline is not None else self.comparisons.clear()
+        outcomes = judged.group_by("experiment").agg((pl.col("outcome") == name).sum().alias(name) for name in OUTCOMES)
+        both = counts.join(
+            outcomes.sort("experiment"), on="experiment", how="full", coalesce=True, maintain_order="left_right"
+        )
+        return both.with_columns(pl.col(OUTCOMES).fill_null(0))
