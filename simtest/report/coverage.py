@@ -1,7 +1,6 @@
 """How many true highlights were found, how many detections are false, and how well each highlight meets its law."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import polars as pl
 
@@ -14,38 +13,60 @@ PATH_SHARE = "surface.path_share"
 
 
 @dataclass(frozen=True)
+class FoundRow:
+    """Counts of one setting: true isolated highlights, those missed, and false detections."""
+
+    setting: str
+    true: int
+    missed: int
+    false: int
+
+    @property
+    def found(self) -> int:
+        """True highlights that were found."""
+        return self.true - self.missed
+
+    @property
+    def coverage(self) -> float | None:
+        """Share of the true highlights that were found."""
+        return self.found / self.true if self.true else None
+
+    @property
+    def false_share(self) -> float | None:
+        """Share of the detections that are false."""
+        return self.false / (self.found + self.false) if self.found + self.false else None
+
+
+@dataclass(frozen=True)
+class LawRow:
+    """One measure with a law in one setting: highlights, those within tolerance, and medians in `unit`."""
+
+    setting: str
+    estimator: str
+    measure: str
+    unit: str
+    n: int
+    met: int
+    median: float
+    median_law: float
+    median_gap: float
+
+
+@dataclass(frozen=True)
 class Coverage:
-    """Two tables of a run over views of anatomies.
+    """Two tables of a run over views of anatomies."""
 
-    Parameters
-    ----------
-    found : tuple of dict
-        For each setting: true isolated highlights, found, missed, false, and their shares.
-    laws : tuple of dict
-        For each setting and measure with a law: highlights, those within tolerance, median departure.
-    """
-
-    found: tuple[dict[str, Any], ...]
-    laws: tuple[dict[str, Any], ...]
+    found: tuple[FoundRow, ...]
+    laws: tuple[LawRow, ...]
 
 
 def is_anatomical(run: Run) -> bool:
-    """Tell whether a run is one over views of anatomies."""
+    """Whether a run is one over views of anatomies."""
     return bool({VIEWPOINT, PATH_SHARE} & set(run.results.columns))
 
 
 def coverage(run: Run) -> Coverage | None:
-    """Compute the tables; None for a run that is not over views of anatomies, or has no rows.
-
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    Coverage or None
-    """
+    """Compute the tables; None for a run that is not over views of anatomies, or has no rows."""
     if not is_anatomical(run) or run.results.is_empty():
         return None
     found, laws = [], []
@@ -54,21 +75,12 @@ def coverage(run: Run) -> Coverage | None:
         own = rows.filter(pl.col("estimator") == rows["estimator"][0])
         true = own.filter(pl.col("true_id").is_not_null())
         missed = true.filter(pl.col("status") == "missed").height
-        false = own.height - true.height
-        hits = true.height - missed
-        found.append(
-            {"setting": setting, "true": true.height, "found": hits, "missed": missed, "false": false,
-             "coverage": _share(hits, true.height), "false_share": _share(false, hits + false)}
-        )  # fmt: skip
+        found.append(FoundRow(str(setting), true.height, missed, own.height - true.height))
         laws += _laws(str(setting), rows)
     return Coverage(tuple(found), tuple(laws))
 
 
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
-
-
-def _laws(setting: str, rows: pl.DataFrame) -> list[dict[str, Any]]:
+def _laws(setting: str, rows: pl.DataFrame) -> list[LawRow]:
     """Compare each highlight's measurement with the law at its own exact curvature and light."""
     ok = rows.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
     table = []
@@ -83,9 +95,6 @@ def _laws(setting: str, rows: pl.DataFrame) -> list[dict[str, Any]]:
                 continue
             gap = (both[value] - both[law]).abs()
             allowed = both.select(pl.max_horizontal(pl.lit(floor), TOLERANCE_SHARE * pl.col(law))).to_series()
-            table.append(
-                {"setting": setting, "estimator": name, "measure": measure, "unit": unit, "n": both.height,
-                 "met": int((gap <= allowed).sum()), "median_gap": gap.median(),
-                 "median_law": both[law].median(), "median": both[value].median()}
-            )  # fmt: skip
+            medians = (float(part.median()) for part in (both[value], both[law], gap))  # type: ignore[arg-type]
+            table.append(LawRow(setting, name, measure, unit, both.height, int((gap <= allowed).sum()), *medians))
     return table

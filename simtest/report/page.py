@@ -1,28 +1,81 @@
 """Writes the page of a run: figures as PNG, and one HTML file that needs nothing else."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from simtest.pages import style
-from simtest.pages.html import environment, packed_plotly, picture
-from simtest.report import labels as words
-from simtest.report import static
-from simtest.report import triangle_cost as fineness
-from simtest.report.coverage import coverage, is_anatomical
-from simtest.report.gallery import isophote_colour, isovalues
-from simtest.report.laws.section import laws_section
-from simtest.report.pairs import pairs
-from simtest.report.paper.section import paper_section
+from simtest.pages import pixels, png, style, web
+from simtest.pages.chart import Chart
+from simtest.pages.html import environment
+from simtest.report import sentences
+from simtest.report.coverage import Coverage, coverage, is_anatomical
+from simtest.report.error_laws import LawResult, law_results, sentence
+from simtest.report.figure_files import FigureFiles
+from simtest.report.gallery import draw_gallery, isophote_keys
+from simtest.report.heat_maps import heat_charts, heat_maps
+from simtest.report.law_charts import law_charts, law_colours
+from simtest.report.pairs import Pair, pairs
+from simtest.report.paper.paper_section import PaperSection, paper_section
 from simtest.report.run_folder import Run, read_run
-from simtest.report.series import LineFigure, line_figures
-from simtest.report.surface3d import surface_3d
-from simtest.report.tables import SUMMARY_COLUMNS, heat_maps, summary_rows, surface_figure
+from simtest.report.series import LineFigure, line_chart, line_figures
+from simtest.report.summary_table import COLUMNS, TableRow, table_rows
+from simtest.report.surface_errors import SurfaceErrors, surface_chart, surface_errors
+from simtest.report.triangle_cost import Fineness, fineness_charts, read_study
+from simtest.report.view3d import View3D, view_3d, view_json, view_picture
 from simtest.runtime.files import write_atomically
 
-_IMAGE_BUDGET = 1_350_000
-_FIRST = 9
-_MAX_HEAT_MAPS = 18
+_FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
+
+
+@dataclass(frozen=True)
+class LineSection:
+    """A figure of curves with its chart and its numbers in words."""
+
+    figure: LineFigure
+    chart: Chart
+    measured: list[str]
+
+
+@dataclass(frozen=True)
+class LawsSection:
+    """The laws with their colours by name, and their charts."""
+
+    results: list[LawResult]
+    colours: dict[str, str]
+    charts: list[Chart]
+
+    @property
+    def headline(self) -> str:
+        """How many laws are met."""
+        return sentence(self.results)
+
+
+@dataclass(frozen=True)
+class FinenessSection:
+    """The study of what triangles cost, and its charts."""
+
+    study: Fineness
+    charts: list[Chart]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What the page's template shows of a run, section by section; a section without data is empty or None."""
+
+    headline: list[str]
+    paper: PaperSection | None
+    laws: LawsSection | None
+    lines: list[LineSection]
+    heat: list[tuple[Chart, str]]
+    surfaces: SurfaceErrors | None
+    boxes: Chart | None
+    coverage: Coverage | None
+    fineness: FinenessSection | None
+    pairs: list[Pair]
+    view: View3D | None
+    view_picture: str
+    summary: list[TableRow]
 
 
 def write_report(run: Path) -> Path:
@@ -31,7 +84,7 @@ def write_report(run: Path) -> Path:
     Parameters
     ----------
     run : pathlib.Path
-        Run directory with results.parquet, summary.json and, if there is one, gallery/*.npz.
+        Run folder with results.parquet, summary.json and, if there is one, gallery/*.npz.
 
     Returns
     -------
@@ -45,130 +98,96 @@ def write_report(run: Path) -> Path:
     """
     data = read_run(Path(run))
     folder = data.path / "figures"
-    colours = style.colours(data.estimators)
-    if folder.is_dir():
-        for old in folder.glob("*.png"):
-            old.unlink()
-    with static.settings():
-        sections, charts = _sections(data, colours, folder)
-    html = _render(data, colours, sections, charts)
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob("*.png"):
+        old.unlink()
+    html = _render(data, folder)
     page = data.path / "index.html"
     write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 
-def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Draw everything once: PNG files as a side effect, the page's parts and its plotly figures as the value."""
-    from simtest.report import interactive
-
-    charts: dict[str, str] = {}
-    lines = line_figures(run)
-    for figure in lines:
-        static.save(static.draw_lines(figure, colours), folder / f"{figure.key}.png")
-        charts[figure.key] = interactive.to_json(interactive.lines(figure, colours))
-    sections: dict[str, Any] = {"headline": words.headline(run, lines), "lines": [_line_section(f) for f in lines]}
-    published = paper_section(run, colours, folder, picture)
-    if published:
-        sections["paper"] = published[0]
-        sections["headline"].append(published[0]["headline"])
-        charts |= published[1]
-    laws = laws_section(run, folder)
-    if laws:
-        sections["laws"] = laws[0]
-        sections["headline"].append(laws[0]["headline"])
-        charts |= laws[1]
-    maps = heat_maps(run)[:_MAX_HEAT_MAPS]
-    if maps:
-        static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
-        for i, item in enumerate(maps):
-            charts[f"heatmap_{i}"] = interactive.to_json(interactive.heat_map(item, maps))
-        sections["heat"] = [
-            {"key": f"heatmap_{i}", "title": f"{m.estimator}, {m.label}", "line": words.heat_line(m)}
-            for i, m in enumerate(maps)
-        ]
-    surfaces = surface_figure(run, has_figures=bool(lines or maps or published))
-    if surfaces:
-        sections["surfaces"] = surfaces
-        if surfaces.boxes:
-            static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
-            charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
-    sections["coverage"] = coverage(run)
-    if is_anatomical(run):
-        sections["fineness"] = _fineness_section(folder, charts)
-    sections["pairs"] = pairs(run)
-    paths = static.draw_gallery(run.gallery, colours, folder)
-    sections["gallery"] = _gallery_section(run, paths)
-    view = surface_3d(run)
-    if view:
-        path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
-        charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
-        curved = view.curvature is not None
-        sections["view"] = {"title": view.title, "unit": view.unit, "curved": curved, "picture": picture(path, 120_000)}
-    return sections, charts
-
-
-def _line_section(figure: LineFigure) -> dict[str, Any]:
-    marks = style.symbols(figure.labels)
-    return {
-        "key": figure.key,
-        "title": figure.title,
-        "about": figure.about,
-        "measured": words.measured(figure),
-        "marks": [(marks[label].text, label) for label in figure.labels] if len(figure.labels) > 1 else [],
-        "binned": any(not curve.joined for curve in figure.curves),
-    }
-
-
-def _fineness_section(folder: Path, charts: dict[str, str]) -> dict[str, Any]:
-    from simtest.report import interactive
-
-    study = fineness.read_study()
-    static.save(fineness.draw(study), folder / "fineness.png")
-    charts["fineness"] = interactive.to_json(fineness.interactive(study))
-    marks = style.symbols(study.surfaces)
-    return {
-        "distance": study.distance_mm, "exponent": study.exponent, "sentence": study.sentence(),
-        "marks": [(marks[name].text, name) for name in study.surfaces],
-    }  # fmt: skip
-
-
-def _gallery_section(run: Run, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    share = _IMAGE_BUDGET // max(len(paths), 1)
-    return [
-        {**words.gallery_caption(item), "picture": picture(path, min(share, 130_000)), "file": path.name}
-        for item, path in zip(run.gallery, paths, strict=True)
-    ]
-
-
-def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], charts: Mapping[str, str]) -> str:
-    from markupsafe import Markup
-
-    content = run.experiments.get(run.experiment) or {}
-    template = environment().get_template("template.html.j2")
-    return template.render(
+def _render(run: Run, folder: Path) -> str:
+    colours = style.colours(run.estimators)
+    with ThreadPoolExecutor(2) as pool, png.settings():
+        # Frames are drawn beside the figures: most of their time is spent outside Python.
+        cards = pool.submit(draw_gallery, run.gallery, colours, folder)
+        figures = FigureFiles(folder, pool)
+        content = _content(run, colours, figures)
+        gallery, packed = cards.result(), figures.packed()
+    experiment = run.experiments.get(run.experiment)
+    return environment().get_template("run.html.j2").render(
         experiment=run.experiment,
-        title=content.get("title") or run.experiment,
-        description=content.get("description") or "",
-        headline=sections["headline"],
-        lines=sections["lines"],
-        paper=sections.get("paper"),
-        heat=sections.get("heat", []),
-        surfaces=sections.get("surfaces"),
-        coverage=sections["coverage"],
-        fineness=sections.get("fineness"),
-        laws=sections.get("laws"),
-        pairs=sections["pairs"],
-        gallery=sections["gallery"],
+        title=experiment.title if experiment and experiment.title else run.experiment,
+        description=experiment.description if experiment else "",
+        gallery=gallery,
         gallery_total=run.gallery_total,
-        first=_FIRST,
-        view=sections.get("view"),
-        summary=summary_rows(run),
-        columns=[heading for _, heading in SUMMARY_COLUMNS],
+        first=_FIRST_CARDS,
         length_units=" or ".join(dict.fromkeys(item.length_unit for item in run.gallery)) or "mm",
-        provenance=words.provenance_rows(run),
+        provenance=run.provenance,
+        columns=[heading for _, heading in COLUMNS],
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,
-        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(run.gallery)],
-        charts={key: Markup(text) for key, text in charts.items()},
-        plotly=packed_plotly() if charts else None,
+        isophotes=isophote_keys(run.gallery),
+        figures=packed,
+        plotly=web.packed_plotly() if figures.json else None,
+        **vars(content),
+    )  # fmt: skip
+
+
+def _content(run: Run, colours: Mapping[str, str], figures: FigureFiles) -> Content:
+    """Compute and draw the sections of the page."""
+    curves = line_figures(run)
+    lines = [LineSection(curve, line_chart(curve, colours), sentences.measured(curve)) for curve in curves]
+    for section in lines:
+        figures.add(section.figure.key, [section.chart])
+    paper, laws = paper_section(run, colours, figures), _laws(run, figures)
+    maps = heat_maps(run)[:_MAX_HEAT_MAPS]
+    heat = heat_charts(maps) if maps else []
+    if heat:
+        figures.add("heatmap", heat)
+    surfaces = surface_errors(run, has_figures=bool(lines or maps or paper))
+    boxes = surface_chart(surfaces, colours) if surfaces and surfaces.boxes else None
+    if boxes:
+        figures.add("anatomy", [boxes])
+    view = view_3d(run, colours)
+    more = [section.headline for section in (paper, laws) if section]
+    return Content(
+        headline=[*sentences.headline(run, curves), *more],
+        paper=paper,
+        laws=laws,
+        lines=lines,
+        heat=[(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
+        surfaces=surfaces,
+        boxes=boxes,
+        coverage=coverage(run),
+        fineness=_fineness(figures) if is_anatomical(run) else None,
+        pairs=pairs(run),
+        view=view,
+        view_picture=_still(view, figures) if view else "",
+        summary=table_rows(run),
     )
+
+
+def _laws(run: Run, figures: FigureFiles) -> LawsSection | None:
+    results = law_results(run)
+    if not any(result.settings for result in results):
+        return None
+    section = LawsSection(results, law_colours(results), law_charts(results))
+    figures.add("laws", section.charts)
+    return section
+
+
+def _fineness(figures: FigureFiles) -> FinenessSection:
+    study = read_study()
+    section = FinenessSection(study, fineness_charts(study))
+    figures.add("fineness", section.charts)
+    return section
+
+
+def _still(view: View3D, figures: FigureFiles) -> str:
+    """Draw the 3D view, and return the picture that stands in where a browser draws no 3D."""
+    picture = view_picture(view)
+    figures.write(view.key, picture)
+    figures.json[view.key] = view_json(view)
+    return pixels.data_address(picture)

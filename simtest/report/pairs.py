@@ -71,15 +71,7 @@ class Pair:
 def pairs(run: Run) -> list[Pair]:
     """Compare each two estimators by the errors of their proposed normals.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of Pair
-        Over all settings first, then label by label where there are several; empty for a single estimator.
+    The pairs over all settings come first, then label by label where there are several; a single estimator has none.
     """
     true = run.results.filter(pl.col("true_id").is_not_null())
     names = estimator_order(true["estimator"].drop_nulls().to_list())
@@ -98,7 +90,7 @@ def pairs(run: Run) -> list[Pair]:
 
 
 def _side_by_side(true: pl.DataFrame, names: list[str]) -> pl.DataFrame:
-    """Give a row a true highlight with each estimator's error; null where it did not answer."""
+    """Return a row for each true highlight with each estimator's error; null where it did not answer."""
     error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
     # A highlight may be found twice; the first detection counts for all estimators alike.
     columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]

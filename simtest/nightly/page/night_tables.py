@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from simtest.nightly.gate.records import Night, Verdict
 from simtest.nightly.page.phrases import bounds, interval, measure
 from simtest.pages.style import estimator_order
-from simtest.report.labels import flattened
+from simtest.report.run_folder import flattened
 
 COVERED = float(chi2.ppf(0.95, 2))
 

@@ -12,12 +12,12 @@ from simtest.nightly.page import phrases as words
 from simtest.nightly.page.comparisons import comparisons
 from simtest.nightly.page.error_figures import error_figures
 from simtest.nightly.page.extras import Extras
-from simtest.nightly.page.ladder_figures import ladder, marks_of
+from simtest.nightly.page.ladder_figures import ladder
 from simtest.nightly.page.trends import MEDIAN, NEWEST, Trends, trends
-from simtest.nightly.page.worst_cases import draw_cases, read_cases
-from simtest.pages import style
-from simtest.pages.html import environment, packed_plotly, script_json
-from simtest.report.gallery import isophote_colour, isovalues
+from simtest.nightly.page.worst_cases import read_cases
+from simtest.pages import style, web
+from simtest.pages.html import environment, script_json
+from simtest.report.gallery import draw_gallery, isophote_keys
 from simtest.report.run_folder import GalleryItem
 from simtest.runtime.files import write_atomically
 
@@ -60,15 +60,11 @@ def write_nightly_page(
 
 
 def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extras, figures: Path) -> str:
-    from markupsafe import Markup
-
     items, unread = read_cases(extras)
     past = trends(history, night)
     colours = style.colours(_estimators(night, verdict, items, past))
-    groups, charts = error_figures(night, colours)
-    steps = ladder(night, colours)
-    if steps:
-        charts["ladder"] = steps.chart
+    groups, steps = error_figures(night, colours), ladder(night, colours)
+    charts = [figure.chart for group in groups for figure in group.figures] + ([steps.chart] if steps else [])
     table = comparisons(verdict)
     template = environment().get_template("nightly.html.j2")
     return template.render(
@@ -87,9 +83,8 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         trends=None if past is None else _trends_section(past, verdict, colours),
         groups=groups,
         ladder=steps,
-        ladder_marks=[] if steps is None else marks_of(steps),
-        gallery=draw_cases(items, colours, figures),
-        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(items)],
+        gallery=draw_gallery(items, colours, figures),
+        isophotes=isophote_keys(items),
         truth_colour=style.TRUTH,
         answers=tables.answers(night),
         answers_apart=tables.answers(night, ("experiment",)),
@@ -98,8 +93,8 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         provenance=tables.provenance(night, verdict),
         files=extras.files,
         colours={name: colours[name] for name in style.estimator_order(_names(night.rows["estimator"]))},
-        charts={key: Markup(text) for key, text in charts.items()},
-        plotly=packed_plotly() if charts or past else None,
+        figures=web.packed({chart.key: web.figure(chart) for chart in charts}),
+        plotly=web.packed_plotly() if charts or past else None,
     )
 
 
@@ -111,7 +106,7 @@ def _estimators(night: Night, verdict: Verdict, items: Iterable[GalleryItem], pa
     """Name all that needs a colour."""
     names = [*_names(night.rows["estimator"]), *_names(night.figures["estimator"])]
     names += _names(verdict.comparisons["estimator"])
-    names += [str(estimate.get("estimator")) for item in items for estimate in item.estimates]
+    names += [estimate.estimator for item in items for estimate in item.estimates]
     return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
 
 

@@ -78,7 +78,7 @@ class _Check:
     """Least and largest answered setting that the claim needs."""
 
     def verdict(self, sweep: Sweep, met: bool) -> str:
-        """Give the verdict on a sweep that the test has looked at."""
+        """Return the verdict on a sweep that the test has looked at."""
         answered = np.isfinite(sweep.mean)
         if self.test in _BY_STANDARD_ERROR and not np.isfinite(sweep.standard_error[answered]).all():
             return FEW
@@ -119,7 +119,7 @@ def statements(figures: Sequence[SweepFigure]) -> list[Statement]:
 
 
 def _find(figures: Sequence[SweepFigure], check: _Check) -> Sweep | None:
-    """Give the first sweep of the article's method at the check's settings with two answered ones."""
+    """Return the first sweep of the article's method at the check's settings with two answered ones."""
     wanted = {name: value for name, value in {**DEFAULTS, **check.fixed}.items() if name != check.parameter}
     for figure in figures:
         for sweep in figure.sweeps if figure.parameter.name == check.parameter else ():

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.pages.style import Array, Axis, estimator_order
+from simtest.pages.axes import Axis, finite
+from simtest.pages.style import Array, estimator_order
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
 from simtest.report.run_folder import Run
 
@@ -106,16 +107,14 @@ class SweepFigure:
     def y(self) -> Axis:
         """The errors' axis: from 0 as in the article; logarithmic beside such an x, or where the means differ much."""
         title = "error of the better candidate (deg)"
-        means = np.concatenate([sweep.mean for sweep in self.sweeps])
-        means = means[np.isfinite(means)]
+        means = finite([sweep.mean for sweep in self.sweeps])
         if means.size and means.min() > 0 and (self.x.scale == "log" or means.max() > _WIDE * means.min()):
             return Axis(title, "log")
-        tops = np.concatenate([np.concatenate([sweep.largest, sweep.bound]) for sweep in self.sweeps])
-        tops = tops[np.isfinite(tops)]
+        tops = finite([part for sweep in self.sweeps for part in (sweep.largest, sweep.bound)])
         return Axis(title, "linear", (0.0, 1.06 * float(tops.max())) if tops.size and tops.max() > 0 else None)
 
-    def places(self, index: int) -> Array:
-        """Give where a sweep is drawn: beside the others, so that the bars of several do not hide each other."""
+    def shifted_x(self, index: int) -> Array:
+        """Return the x at which a sweep is drawn: beside the others, so that the bars of several show."""
         x = self.sweeps[index].shown_x
         values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
         is_log = self.x.scale == "log"
@@ -136,22 +135,14 @@ def _unevenness(values: Array) -> float:
 
 
 def is_published(run: Run) -> bool:
-    """Tell whether a run has rows of the published protocol."""
+    """Whether a run has rows of the published protocol."""
     return any(name.startswith(PREFIX) for name in run.results.columns)
 
 
 def sweep_figures(run: Run) -> list[SweepFigure]:
-    """Give the error plots of a run, one a swept parameter, in the article's order.
+    """Return the error plots of a run, one for each swept parameter, in the article's order.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of SweepFigure
-        Empty where the run has no row of the published protocol.
+    A run without rows of the published protocol has none.
     """
     found = list(_sweeps(run)) if is_published(run) else []
     figures = []

@@ -1,4 +1,4 @@
-"""Which law is about which rows, and whether the measurements meet it."""
+"""The error laws: which law is about which rows, and whether the measurements meet it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ BRANCH_SLOPE = 0.5
 
 @dataclass(frozen=True)
 class Law:
-    """A law and where its two sides stand in the results.
+    """A law and the columns of the results that hold its two sides.
 
     Parameters
     ----------
@@ -148,18 +148,7 @@ class LawResult:
 
 
 def law_results(run: Run) -> list[LawResult]:
-    """Judge each law on the settings that the experiment names for it.
-
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of LawResult
-        In the order of `LAWS`; empty where the experiment names no law.
-    """
+    """Judge each law, in the order of `LAWS`, on the settings that the experiment names for it; empty without any."""
     if "laws" not in run.results.columns or run.results["laws"].null_count() == run.results.height:
         return []
     ratio = run.results["axis_ratio"]
@@ -198,28 +187,20 @@ def _slope(rows: pl.DataFrame) -> LawResult | None:
     spread = ok.group_by("noise_sigma").agg(
         share=pl.col("error_oracle_deg").std() / pl.col("error_oracle_deg").mean() / pl.len().sqrt()
     )
-    place = np.log(means["noise_sigma"].to_numpy())
-    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((place - place.mean()) ** 2)))
+    level = np.log(means["noise_sigma"].to_numpy())
+    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((level - level.mean()) ** 2)))
     law = Law(
         "the same: slope of log error over log σ", f"1/2; here ± {number(error, 2)} by the errors' spread",
         "circle_pose", "", "", False,
     )  # fmt: skip
     sigmas = f"σ = {means['noise_sigma'][0]:g} to {means['noise_sigma'][-1]:g}"
     allowed = np.array([TOLERANCE_SHARE * BRANCH_SLOPE + 2 * error])
-    return LawResult(
-        SLOPE,
-        law,
-        (sigmas,),
-        np.array([slope]),
-        np.array([BRANCH_SLOPE]),
-        rows.height,
-        rows.height - ok.height,
-        allowed,
-    )
+    measured, predicted = np.array([slope]), np.array([BRANCH_SLOPE])
+    return LawResult(SLOPE, law, (sigmas,), measured, predicted, rows.height, rows.height - ok.height, allowed)
 
 
 def sentence(results: Sequence[LawResult]) -> str:
-    """Say how many laws are met."""
+    """State how many laws are met."""
     judged = [result for result in results if result.verdict != ABSENT]
     met = sum(result.verdict == MET for result in judged)
     departing = [result.law.title for result in judged if result.verdict != MET]
