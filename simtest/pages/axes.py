@@ -20,22 +20,13 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 class Axis:
     """An axis of a panel.
 
-    Parameters
-    ----------
-    title : str
-        Name and unit.
-    scale : {"linear", "log", "stretched"}
-        "stretched" is asinh(x / 0.01), near-logarithmic on both sides of zero; both media draw at `to_axis(x)`.
-    limits : (float, float), optional
-        Ends in data units, of linear and log axes; the first may be the larger one. Default: from the marks.
-    named : tuple of (float, str), optional
-        Ticks with their texts; empty for none. Default: by the scale.
+    The scale "stretched" is asinh(x / 0.01), near-logarithmic on both sides of zero; both media draw at `to_axis(x)`.
     """
 
-    title: str
+    title: str  # name and unit
     scale: Literal["linear", "log", "stretched"] = "linear"
-    limits: tuple[float, float] | None = None
-    named: tuple[Tick, ...] | None = None
+    limits: tuple[float, float] | None = None  # ends in data units; default: from the marks
+    named: tuple[Tick, ...] | None = None  # ticks with their texts, empty for none; default: by the scale
 
     def to_axis(self, values: npt.ArrayLike) -> Array:
         """Return the drawing coordinates of data values, same shape."""

@@ -5,7 +5,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from simtest.pages import pixels, png, web
+from simtest.pages import chart_png, chart_web, pixels
 from simtest.pages.chart import Chart
 from simtest.pages.pixels import Pixels
 
@@ -16,13 +16,13 @@ class FigureFiles:
 
     folder: Path
     pool: ThreadPoolExecutor
-    json: dict[str, web.PlotlyJson] = field(default_factory=dict)
+    json: dict[str, chart_web.PlotlyJson] = field(default_factory=dict)
     writing: list[Future[None]] = field(default_factory=list)
 
     def add(self, name: str, charts: Sequence[Chart]) -> None:
         """Draw charts into one file and into the page."""
-        self.write(name, png.draw(charts)[0])
-        self.json |= {chart.key: web.figure(chart) for chart in charts}
+        self.write(name, chart_png.draw(charts)[0])
+        self.json |= {chart.key: chart_web.figure(chart) for chart in charts}
 
     def write(self, name: str, picture: Pixels) -> None:
         """Write a picture as a file."""
@@ -32,4 +32,4 @@ class FigureFiles:
         """Wait for the files, and return plotly's JSON of all charts, packed."""
         for file in self.writing:
             file.result()
-        return web.packed(self.json)
+        return chart_web.packed(self.json)

@@ -78,10 +78,19 @@ def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folde
 
 
 def _card(item: GalleryItem, pictures: tuple[CardPicture, ...]) -> Card:
-    found = {estimate.true_id for estimate in item.estimates}
-    errors = tuple(CardError(e.specularity, e.estimator, _result(e)) for e in item.estimates)
-    missed = sum(truth.isolated and truth.id not in found for truth in item.truth)
-    return Card(item.title, item.setting, number(item.sigma), item.why, item.command, errors, missed, pictures)
+    found = {estimate.true_id for estimate in item.meta.estimates}
+    errors = tuple(CardError(e.specularity, e.estimator, _result(e)) for e in item.meta.estimates)
+    missed = sum(truth.isolated and truth.id not in found for truth in item.meta.truth)
+    return Card(
+        item.title,
+        item.meta.setting,
+        number(item.meta.sigma),
+        item.meta.why,
+        item.meta.command,
+        errors,
+        missed,
+        pictures,
+    )
 
 
 def _result(estimate: KeptEstimate) -> str:
@@ -103,7 +112,7 @@ def anchor(item: GalleryItem, estimate: KeptEstimate) -> Array | None:
     """
     truth = item.true_highlight(estimate)
     if truth is not None and truth.position is not None:
-        return truth.position
+        return np.array(truth.position)
     if estimate.bp_px is None:
         return None
     rows, columns = item.position.shape[:2]
@@ -122,7 +131,7 @@ def draw_item(item: GalleryItem, colours: Mapping[str, str]) -> tuple[list[Pixel
     _draw_overlay(whole, item, colours, window is None, _ARROW)
     if not window:
         return [whole.pixels], _legend(item, colours, window)
-    for truth in item.truth:
+    for truth in item.meta.truth:
         if truth.bp_px is not None:
             whole.ring(truth.bp_px, TRUTH, 11)
     part = Canvas(item.frame, window, HEIGHT_PX)
@@ -133,19 +142,21 @@ def draw_item(item: GalleryItem, colours: Mapping[str, str]) -> tuple[list[Pixel
 def _draw_overlay(canvas: Canvas, item: GalleryItem, colours: Mapping[str, str], detailed: bool, reach: float) -> None:
     # Lines first, then the truth, then the estimates on top of it.
     seen: set[tuple[int | None, float]] = set()
-    for estimate in item.estimates:
+    for estimate in item.meta.estimates:
         for isophote in estimate.isophotes:
-            if (estimate.specularity, isophote.t) not in seen:
+            if isophote.points and (estimate.specularity, isophote.t) not in seen:
                 seen.add((estimate.specularity, isophote.t))
                 canvas.line(isophote.points, isophote_colour(isophote.t), 2 if detailed else 1)
         for curve in estimate.curves if detailed else ():
             canvas.line(curve, colours.get(estimate.estimator, NEUTRAL), 1, dashed=True)
-    for truth in item.truth:
+    for truth in item.meta.truth:
         if truth.position is not None and truth.normal is not None:
-            canvas.arrow(_projected(item, truth.position, truth.normal, reach), TRUTH, 3 if detailed else 2)
+            canvas.arrow(
+                _projected(item, np.array(truth.position), np.array(truth.normal), reach), TRUTH, 3 if detailed else 2
+            )
         if truth.bp_px is not None and detailed:
             canvas.cross(truth.bp_px, TRUTH, _TRUTH_EDGE, 26)
-    for estimate in item.estimates:
+    for estimate in item.meta.estimates:
         colour, point = colours.get(estimate.estimator, NEUTRAL), anchor(item, estimate)
         if point is not None:
             for normal in estimate.normals:
@@ -168,16 +179,17 @@ def isophote_colour(isovalue: float) -> str:
 
 def isophote_keys(items: Iterable[GalleryItem]) -> list[tuple[float, str]]:
     """Return the isovalues that gallery items draw, sorted, with their colours."""
-    drawn = {round(part.t, 3) for item in items for estimate in item.estimates for part in estimate.isophotes}
+    drawn = {round(part.t, 3) for item in items for estimate in item.meta.estimates for part in estimate.isophotes}
     return [(t, isophote_colour(t)) for t in sorted(drawn)]
 
 
 def _window(item: GalleryItem) -> Window | None:
     """Return the square about the main highlight; None where it fills the frame or nothing was found."""
     groups: dict[int | None, list[Array]] = {}
-    for estimate in item.estimates:
+    for estimate in item.meta.estimates:
         for isophote in estimate.isophotes:
-            groups.setdefault(estimate.specularity, []).append(isophote.points)
+            if isophote.points:
+                groups.setdefault(estimate.specularity, []).append(np.array(isophote.points))
     if not groups:
         return None
     points = max((np.vstack(group) for group in groups.values()), key=lambda p: float(np.ptp(p, axis=0).max()))
@@ -190,7 +202,7 @@ def _window(item: GalleryItem) -> Window | None:
 
 
 def _legend(item: GalleryItem, colours: Mapping[str, str], window: Window | None) -> list[tuple[str, str]]:
-    names = dict.fromkeys(estimate.estimator for estimate in item.estimates)
+    names = dict.fromkeys(estimate.estimator for estimate in item.meta.estimates)
     entries = [(TRUTH, "truth"), *((colours.get(name, NEUTRAL), _short(name)) for name in names)]
     levels = isophote_keys([item])
     entries += [(colour, f"isophote t = {t:g}") for t, colour in levels[:: -(-len(levels) // _MOST_LEVELS) or 1]]

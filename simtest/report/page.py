@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from simtest.pages import pixels, png, style, web
+from simtest.pages import chart_png, chart_web, pixels, style
 from simtest.pages.chart import Chart
 from simtest.pages.html import environment
 from simtest.report import sentences
@@ -109,7 +109,7 @@ def write_report(run: Path) -> Path:
 
 def _render(run: Run, folder: Path) -> str:
     colours = style.colours(run.estimators)
-    with ThreadPoolExecutor(2) as pool, png.settings():
+    with ThreadPoolExecutor(2) as pool, chart_png.settings():
         # Frames are drawn beside the figures: most of their time is spent outside Python.
         cards = pool.submit(draw_gallery, run.gallery, colours, folder)
         figures = FigureFiles(folder, pool)
@@ -123,14 +123,14 @@ def _render(run: Run, folder: Path) -> str:
         gallery=gallery,
         gallery_total=run.gallery_total,
         first=_FIRST_CARDS,
-        length_units=" or ".join(dict.fromkeys(item.length_unit for item in run.gallery)) or "mm",
+        length_units=" or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
         provenance=run.provenance,
         columns=[heading for _, heading in COLUMNS],
         colours={name: colours[name] for name in style.estimator_order(colours)},
         truth_colour=style.TRUTH,
         isophotes=isophote_keys(run.gallery),
         figures=packed,
-        plotly=web.packed_plotly() if figures.json else None,
+        plotly=chart_web.packed_plotly() if figures.json else None,
         **vars(content),
     )  # fmt: skip
 

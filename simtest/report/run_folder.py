@@ -1,15 +1,15 @@
 """Reads a run folder: results.parquet, summary.json and the gallery."""
 
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
@@ -27,174 +27,152 @@ _FLOAT = (
     "axis_ratio", "axis_ratio_law", "noise_sigma", "peak_snr", "distance_mm",
 )  # fmt: skip
 
-
-@dataclass(frozen=True)
-class KeptTruth:
-    """A true highlight of a kept frame: BP in px, position and normal in the camera frame, curvatures times distance.
-
-    What the run did not write, or is not finite, is None.
-    """
-
-    id: int | None
-    bp_px: Array | None
-    normal: Array | None
-    position: Array | None
-    kd: tuple[float, ...]
-    isolated: bool
+# What a run leaves out is null; it reads as empty.
+Text = Annotated[str, BeforeValidator(lambda value: value or "")]
+Pixel = tuple[float, float]
+Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class KeptIsophote:
-    """An isophote as it was traced: its isovalue and points, px, shape (n, 2)."""
+def _listed(value: object) -> object:
+    return value or ()
+
+
+class KeptTruth(BaseModel):
+    """A true highlight of a kept frame: BP, px, normal and position, camera frame, and curvatures times distance."""
+
+    id: int | None = None
+    bp_px: Pixel | None = None
+    normal: Vector | None = None
+    position: Vector | None = None
+    kd_min: float | None = None
+    kd_max: float | None = None
+    isolated: bool = True
+
+
+class KeptIsophote(BaseModel):
+    """An isophote as it was traced, px."""
 
     t: float
-    points: Array
+    points: list[Pixel]
 
 
-@dataclass(frozen=True)
-class KeptEstimate:
-    """An estimate of a kept frame.
-
-    Parameters
-    ----------
-    estimator, status : str
-        Name, and "ok" or the failure's reason.
-    specularity, true_id : int or None
-        Which detection, and the true highlight that it was matched to.
-    bp_px : ndarray, shape (2,), or None
-        Brightest point that was found.
-    normals : tuple of ndarray, shape (3,)
-        The candidates, the proposed one first; empty where it failed.
-    isophotes, curves : tuple
-        Isophotes, and fitted ellipses as points, px, shape (n, 2).
-    error_deg, error_oracle_deg : float or None
-        Errors of the proposed normal and of the better candidate.
-    """
+class KeptEstimate(BaseModel):
+    """An estimate of a kept frame; without a normal where it failed."""
 
     estimator: str
-    status: str
-    specularity: int | None
-    true_id: int | None
-    bp_px: Array | None
-    normals: tuple[Array, ...]
-    isophotes: tuple[KeptIsophote, ...]
-    curves: tuple[Array, ...]
-    error_deg: float | None
-    error_oracle_deg: float | None
+    status: str  # "ok" or the failure's reason
+    specularity: int | None = None  # which detection
+    true_id: int | None = None  # the true highlight that it was matched to
+    bp_px: Pixel | None = None  # brightest point that was found
+    normal: Vector | None = None
+    candidates: Annotated[tuple[Vector, ...], BeforeValidator(_listed)] = ()
+    isophotes: Annotated[tuple[KeptIsophote, ...], BeforeValidator(_listed)] = ()
+    curves: Annotated[tuple[list[Pixel], ...], BeforeValidator(_listed)] = ()  # fitted ellipses, px
+    error_deg: float | None = None
+    error_oracle_deg: float | None = None
+
+    @property
+    def normals(self) -> list[Array]:
+        """The candidates, or the single normal."""
+        single = () if self.normal is None else (self.normal,)
+        return [np.array(normal) for normal in self.candidates or single]
 
 
-@dataclass(frozen=True)
-class KeptProtocol:
-    """What a realisation of the published protocol keeps beside its frame.
+class GalleryMeta(BaseModel):
+    """What a gallery item holds beside its pictures."""
 
-    `outer` is column, row, width and height of the part of the picture that is used, px; `peak_value` that of the
-    smoothed picture, None where the realisation failed.
-    """
-
-    setting: PaperSetting
-    outer: tuple[int, int, int, int]
-    peak_value: float | None
+    camera: CameraSpec
+    truth: tuple[KeptTruth, ...] = ()
+    estimates: tuple[KeptEstimate, ...] = ()
+    surface: Text = ""
+    label: Text = ""
+    setting: Text = ""
+    sigma: float | None = None  # noise, share of full scale
+    command: Text = ""  # makes the frame again
+    why: Text = ""  # it is kept
+    length_unit: str = "mm"
+    lights: list[Vector] = []  # positions, camera frame
+    paper: PaperSetting | None = None  # of the published protocol, as all that follows
+    outer: tuple[int, int, int, int] = (0, 0, 0, 0)  # column, row, width and height of the picture's used part, px
+    peak_value: float | None = None  # of the smoothed picture; None where the realisation failed
 
 
 @dataclass(frozen=True)
 class GalleryItem:
-    """One frame of the gallery with its truth and estimates.
-
-    Parameters
-    ----------
-    frame : ndarray, shape (H, W) or (H, W, 3)
-        Share of full scale.
-    position, normal : ndarray, shape (h, w, 3)
-        Downsampled truth, camera frame, in `length_unit` and unit; NaN where there is no surface.
-    camera : Camera
-        Calibration of the frame.
-    truth, estimates : tuple
-        True highlights, and estimates, one a specularity and estimator.
-    label, title, setting : str
-        Group of settings, heading and setting; empty where the run names none.
-    sigma : float or None
-        Noise, share of full scale.
-    command, why : str
-        What makes the frame again, and why it is shown.
-    length_unit : str
-        Unit of the positions.
-    lights : ndarray, shape (L, 3)
-        Light positions.
-    protocol : KeptProtocol or None
-        Of the published protocol.
-    pictures : mapping
-        Further pictures by name.
-    """
+    """One frame of the gallery with its truth and estimates."""
 
     name: str
-    frame: npt.NDArray[np.float32]
-    position: npt.NDArray[np.float32]
+    frame: npt.NDArray[np.float32]  # share of full scale, shape (H, W) or (H, W, 3)
+    position: npt.NDArray[np.float32]  # downsampled truth, camera frame, shape (h, w, 3); NaN without a surface
     normal: npt.NDArray[np.float32]
     camera: Camera
-    truth: tuple[KeptTruth, ...]
-    estimates: tuple[KeptEstimate, ...]
-    label: str
-    title: str
-    setting: str
-    sigma: float | None
-    command: str
-    why: str
-    length_unit: str
-    lights: Array
-    protocol: KeptProtocol | None
-    pictures: Mapping[str, npt.NDArray[np.float32]]
+    meta: GalleryMeta
+    pictures: Mapping[str, npt.NDArray[np.float32]]  # further ones by name
+
+    @property
+    def title(self) -> str:
+        """Heading of the item."""
+        return self.meta.label or self.meta.surface or self.name
 
     def true_highlight(self, estimate: KeptEstimate) -> KeptTruth | None:
         """Return the true highlight that an estimate was matched to, if any."""
-        return next((t for t in self.truth if t.id == estimate.true_id is not None), None)
+        return next((t for t in self.meta.truth if t.id == estimate.true_id is not None), None)
 
 
-@dataclass(frozen=True)
-class SummaryRow:
-    """Figures of one setting and estimator in summary.json; `figures` by key, `reasons` counts failures by reason."""
+class EstimatorFigures(BaseModel):
+    """Figures of one setting and estimator in summary.json; errors in deg."""
 
-    setting: str
-    estimator: str
-    figures: Mapping[str, float | None]
-    ci95_deg: tuple[float | None, float | None]
-    reasons: Mapping[str, int]
+    n: int | None = None
+    n_ok: int | None = None
+    n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda value: value or {})] = {}
+    n_missed: int | None = None
+    n_false: int | None = None
+    mean_deg: float | None = None
+    mean_oracle_deg: float | None = None
+    rms_deg: float | None = None
+    std_deg: float | None = None
+    median_deg: float | None = None
+    p95_deg: float | None = None
+    max_deg: float | None = None
+    mean_penalised_deg: float | None = None
+    ci95_deg: tuple[float | None, float | None] | None = None
+    coverage95: float | None = None
 
 
-@dataclass(frozen=True)
-class ExperimentSummary:
-    """An experiment of summary.json; title and description may be empty."""
+class ExperimentSummary(BaseModel):
+    """An experiment of summary.json: figures by setting and estimator."""
 
-    title: str = ""
-    description: str = ""
-    rows: tuple[SummaryRow, ...] = ()
+    title: Text = ""
+    description: Text = ""
+    settings: dict[str, dict[str, EstimatorFigures | None] | None] | None = None
+
+    @property
+    def rows(self) -> list[tuple[str, str, EstimatorFigures]]:
+        """Setting, estimator and figures."""
+        return [
+            (setting, estimator, figures or EstimatorFigures())
+            for setting, by_estimator in (self.settings or {}).items()
+            for estimator, figures in (by_estimator or {}).items()
+        ]
+
+
+class Summary(BaseModel):
+    """summary.json; `run` is the provenance."""
+
+    run: dict[str, Any] | None = None
+    experiments: dict[str, ExperimentSummary] | None = None
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder in memory.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The folder.
-    results : polars.DataFrame
-        results.parquet with every column the report uses; numbers that are not finite are null.
-    experiments : mapping of str to ExperimentSummary
-        Those of summary.json by name.
-    provenance : mapping of str to str
-        What made the run, flattened.
-    gallery : tuple of GalleryItem
-        At most `MAX_GALLERY` items.
-    gallery_total : int
-        Items in the folder.
-    """
+    """A run folder in memory."""
 
     path: Path
-    results: pl.DataFrame
+    results: pl.DataFrame  # with every column the report uses; numbers that are not finite are null
     experiments: Mapping[str, ExperimentSummary] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
-    gallery: tuple[GalleryItem, ...] = ()
-    gallery_total: int = 0
+    gallery: tuple[GalleryItem, ...] = ()  # at most `MAX_GALLERY` items
+    gallery_total: int = 0  # items in the folder
 
     @property
     def experiment(self) -> str:
@@ -206,8 +184,8 @@ class Run:
     def estimators(self) -> list[str]:
         """Estimator names in order of first appearance, from all three sources."""
         names = [str(n) for n in self.results["estimator"].drop_nulls().unique(maintain_order=True)]
-        names += [row.estimator for experiment in self.experiments.values() for row in experiment.rows]
-        names += [estimate.estimator for item in self.gallery for estimate in item.estimates]
+        names += [estimator for experiment in self.experiments.values() for _, estimator, _ in experiment.rows]
+        names += [estimate.estimator for item in self.gallery for estimate in item.meta.estimates]
         return list(dict.fromkeys(names))
 
     @property
@@ -241,16 +219,16 @@ def read_run(path: Path) -> Run:
     files = sorted((path / "gallery").glob("[!.]*.npz"))
     count = min(len(files), MAX_GALLERY)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, count).round().astype(int))] if count else []
-    results = _read_results(path / "results.parquet")
-    experiments, provenance = _read_summary(path / "summary.json")
-    return Run(path, results, experiments, provenance, varied([read_item(file) for file in chosen]), len(files))
+    results, summary = _read_results(path / "results.parquet"), _read_summary(path / "summary.json")
+    gallery = varied([read_item(file) for file in chosen])
+    return Run(path, results, summary.experiments or {}, flattened(summary.run or {}), gallery, len(files))
 
 
 def varied(items: list[GalleryItem]) -> tuple[GalleryItem, ...]:
     """Order frames so that the first ones show every label once: of each label the middle one, then the others."""
     by_label: dict[str, list[GalleryItem]] = {}
     for item in items:
-        by_label.setdefault(item.label, []).append(item)
+        by_label.setdefault(item.meta.label, []).append(item)
     turns: list[tuple[int, int, GalleryItem]] = []
     for index, group in enumerate(by_label.values()):
         group.insert(0, group.pop(len(group) // 2))
@@ -290,35 +268,17 @@ def completed(frame: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _read_summary(path: Path) -> tuple[dict[str, ExperimentSummary], dict[str, str]]:
-    """Read summary.json: the experiments and the provenance."""
+def _read_summary(path: Path) -> Summary:
     if not path.is_file():
         raise InputError(f"{path}: no such file; a run directory has results.parquet and summary.json")
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error})") from error
-    if not isinstance(summary, dict):
-        raise InputError(f"{path}: holds a {type(summary).__name__}; must be an object with run and experiments")
-    experiments = {
-        str(name): ExperimentSummary(
-            content.get("title") or "", content.get("description") or "",
-            tuple(
-                _summary_row(setting, estimator, figures or {})
-                for setting, by_estimator in (content.get("settings") or {}).items()
-                for estimator, figures in (by_estimator or {}).items()
-            ),
-        )
-        for name, content in (summary.get("experiments") or {}).items()
-    }  # fmt: skip
-    return experiments, flattened(summary.get("run") or {})
-
-
-def _summary_row(setting: str, estimator: str, content: Mapping[str, Any]) -> SummaryRow:
-    reasons = {name: count for name, count in (content.get("n_failed_by_reason") or {}).items() if count}
-    low, high = [*(content.get("ci95_deg") or ()), None, None][:2]
-    numbers = {name: value for name, value in content.items() if isinstance(value, int | float)}
-    return SummaryRow(setting, estimator, numbers | {"n_failed": sum(reasons.values())}, (low, high), reasons)
+        return Summary.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        what = error.errors()[0]
+        where = ".".join(str(part) for part in what["loc"])
+        raise InputError(
+            f"{path}: not readable JSON of a run ({where + ': ' if where else ''}{what['msg']})"
+        ) from error
 
 
 def flattened(values: Mapping[str, Any]) -> dict[str, str]:
@@ -338,68 +298,9 @@ def read_item(path: Path) -> GalleryItem:
     """Read one gallery item; raises `InputError` where the file is none."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            meta = json.loads(str(data["meta"][()]))
+            meta = GalleryMeta.model_validate_json(str(data["meta"][()]))
             pictures = {name: np.asarray(data[name], np.float32) for name in data.files if name != "meta"}
         frame, position, normal = (pictures.pop(name) for name in ("frame", "position", "normal"))
-        camera = CameraSpec(**meta["camera"]).model()
-        label, surface = meta.get("label") or "", meta.get("surface") or ""
-        return GalleryItem(
-            name=path.stem, frame=frame, position=position, normal=normal, camera=camera,
-            truth=tuple(_truth(entry) for entry in meta.get("truth") or ()),
-            estimates=tuple(_estimate(entry) for entry in meta.get("estimates") or ()),
-            label=label, title=label or surface or path.stem, setting=meta.get("setting") or "",
-            sigma=meta.get("sigma"), command=meta.get("command") or "", why=str(meta.get("why") or ""),
-            length_unit=str(meta.get("length_unit") or "mm"),
-            lights=np.asarray(meta.get("lights") or [], dtype=float).reshape(-1, 3),
-            protocol=_protocol(meta) if meta.get("paper") else None, pictures=pictures,
-        )  # fmt: skip
+        return GalleryItem(path.stem, frame, position, normal, meta.camera.model(), meta, pictures)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
-
-
-def _truth(entry: Mapping[str, Any]) -> KeptTruth:
-    sizes = (entry.get("kd_min"), entry.get("kd_max"))
-    return KeptTruth(
-        entry.get("id"), _vector(entry.get("bp_px"), 2), _vector(entry.get("normal"), 3),
-        _vector(entry.get("position"), 3), tuple(float(size) for size in sizes if size is not None),
-        bool(entry.get("isolated", True)),
-    )  # fmt: skip
-
-
-def _estimate(entry: Mapping[str, Any]) -> KeptEstimate:
-    candidates, single = entry.get("candidates") or (), [entry.get("normal")]
-    found, alone = (
-        [v for v in (_vector(value, 3) for value in values) if v is not None] for values in (candidates, single)
-    )
-    isophotes = [(part.get("t"), _points(part.get("points"))) for part in entry.get("isophotes") or ()]
-    curves = [_points(curve) for curve in entry.get("curves") or ()]
-    return KeptEstimate(
-        estimator=str(entry.get("estimator")), status=str(entry.get("status")),
-        specularity=entry.get("specularity"), true_id=entry.get("true_id"), bp_px=_vector(entry.get("bp_px"), 2),
-        normals=tuple(found or alone),
-        isophotes=tuple(KeptIsophote(float(t), points) for t, points in isophotes if t is not None and len(points)),
-        curves=tuple(points for points in curves if len(points)),
-        error_deg=entry.get("error_deg"), error_oracle_deg=entry.get("error_oracle_deg"),
-    )  # fmt: skip
-
-
-def _protocol(meta: Mapping[str, Any]) -> KeptProtocol:
-    x, y, width, height = (int(v) for v in meta["outer"])
-    return KeptProtocol(PaperSetting(**meta["paper"]), (x, y, width, height), meta.get("peak_value"))
-
-
-def _vector(value: object, size: int) -> Array | None:
-    """Return a list of numbers of a given length as an array; None where it is missing or not finite."""
-    if value is None:
-        return None
-    try:
-        data = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        return None
-    return data if data.shape == (size,) and np.isfinite(data).all() else None
-
-
-def _points(value: object) -> Array:
-    """Return a list of points as an array, shape (n, 2); empty where it is none."""
-    data = np.asarray(value or [], dtype=float)
-    return data if data.ndim == 2 and data.shape[1] == 2 else np.empty((0, 2))

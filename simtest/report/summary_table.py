@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from simtest.pages.style import number
-from simtest.report.run_folder import Run, SummaryRow
+from simtest.report.run_folder import EstimatorFigures, Run
 
 COLUMNS = (
     ("n", "rows"),
@@ -26,29 +26,29 @@ COLUMNS = (
 
 
 class TableRow(NamedTuple):
-    """A row: `cells` are (text, sort key) in the order of `COLUMNS`."""
+    """A row of the table."""
 
     setting: str
     estimator: str
-    cells: list[tuple[str, float | None]]
-    reasons: str
+    cells: list[tuple[str, float | None]]  # text and sort key, in the order of `COLUMNS`
+    reasons: str  # of failures, counted
 
 
 def table_rows(run: Run) -> list[TableRow]:
     """Return a row for each experiment, setting and estimator of summary.json."""
-    rows = [row for experiment in run.experiments.values() for row in experiment.rows]
     return [
-        TableRow(
-            row.setting, row.estimator, [_cell(row, key) for key, _ in COLUMNS],
-            ", ".join(f"{name} {count}" for name, count in sorted(row.reasons.items())),
-        )
-        for row in rows
+        TableRow(setting, estimator, [_cell(figures, key) for key, _ in COLUMNS], ", ".join(
+            f"{name} {count}" for name, count in sorted(figures.n_failed_by_reason.items()) if count
+        ))
+        for experiment in run.experiments.values()
+        for setting, estimator, figures in experiment.rows
     ]  # fmt: skip
 
 
-def _cell(row: SummaryRow, key: str) -> tuple[str, float | None]:
-    value = row.ci95_deg[0] if key == "ci95_deg" else row.figures.get(key)
+def _cell(figures: EstimatorFigures, key: str) -> tuple[str, float | None]:
+    if key == "ci95_deg":
+        low, high = figures.ci95_deg or (None, None)
+        return ("–", None) if number(low) == "–" else (f"{number(low)} to {number(high)}", low)
+    value = sum(figures.n_failed_by_reason.values()) if key == "n_failed" else getattr(figures, key)
     text = number(value)
-    if text == "–":
-        return text, None
-    return f"{text} to {number(row.ci95_deg[1])}" if key == "ci95_deg" else text, value
+    return text, None if text == "–" else value

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.pages import png
+from simtest.pages import chart_png
 from simtest.pages.chart import Mark
+from simtest.pages.chart_web import PlotlyJson, rounded
 from simtest.pages.pixels import GAMMA, Pixels
 from simtest.pages.style import LIGHT, NEUTRAL, Array
-from simtest.pages.web import PlotlyJson, rounded
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
 
@@ -88,8 +88,10 @@ def view_3d(run: Run, colours: Mapping[str, str]) -> View3D | None:
 
 
 def _interest(item: GalleryItem) -> tuple[int, float]:
-    answered = {estimate.estimator for estimate in item.estimates if estimate.status == "ok"}
-    return len(answered), min(max((abs(size) for truth in item.truth for size in truth.kd), default=0.0), 2.0)
+    answered = {estimate.estimator for estimate in item.meta.estimates if estimate.status == "ok"}
+    return len(answered), min(
+        max((abs(size) for truth in item.meta.truth for size in (truth.kd_min, truth.kd_max) if size), default=0.0), 2.0
+    )
 
 
 def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
@@ -102,14 +104,14 @@ def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
     if not len(triangles):
         return None
     vertices = position[valid]
-    kept = item.pictures.get("curvature")
+    kept, setting = item.pictures.get("curvature"), item.meta.setting
     # Normals as long as the surface is far away.
     reach = 0.12 * float(np.median(np.linalg.norm(vertices, axis=1)))
     segments = _everywhere(position, normal, valid, reach), *_at_highlights(item, 2.5 * reach, colours)
     return View3D(
-        item.setting if item.setting.startswith(item.title) else f"{item.title}: {item.setting}", vertices, triangles,
-        _intensity(item, position.shape[:2], step)[valid], segments, item.length_unit,
-        None if kept is None else kept[::step, ::step].astype(float)[valid], item.lights,
+        setting if setting.startswith(item.title) else f"{item.title}: {setting}", vertices, triangles,
+        _intensity(item, position.shape[:2], step)[valid], segments, item.meta.length_unit,
+        None if kept is None else kept[::step, ::step].astype(float)[valid], np.reshape(np.array(item.meta.lights), (-1, 3)),
     )  # fmt: skip
 
 
@@ -158,9 +160,9 @@ def _everywhere(position: Array, normal: Array, valid: npt.NDArray[np.bool_], re
 
 def _at_highlights(item: GalleryItem, reach: float, colours: Mapping[str, str]) -> list[Segments]:
     """Collect the normals at the highlights: the true ones, then each estimator's with all its candidates."""
-    true = [(t.position, t.normal) for t in item.truth if t.position is not None and t.normal is not None]
+    true = [(np.array(t.position), np.array(t.normal)) for t in item.meta.truth if t.position and t.normal]
     groups: dict[str, list[tuple[Array, Array]]] = {_AT_HIGHLIGHT: true}
-    for estimate in item.estimates:
+    for estimate in item.meta.estimates:
         point = anchor(item, estimate)
         if point is not None:
             groups.setdefault(estimate.estimator, []).extend((point, normal) for normal in estimate.normals)
@@ -262,7 +264,7 @@ def view_picture(data: View3D) -> Pixels:
     ax.view_init(elev=28, azim=-65)
     ax.set_title(data.title)
     figure.legend(*ax.get_legend_handles_labels(), loc="lower center", ncol=3, fontsize=9)
-    return png.pixels(figure)
+    return chart_png.pixels(figure)
 
 
 def _upright(points: Array) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from simtest.pages import pixels, png, web
+from simtest.pages import pixels, chart_png, chart_web
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel, label_keys
 from simtest.pages.style import rgb, symbols
@@ -29,20 +29,19 @@ def inked(picture, colour):
 
 
 def drawn(*charts):
-    with png.settings():
-        return png.draw(charts)
+    return chart_png.draw(charts)
 
 
 def test_the_bundle_is_the_published_one():
-    packed = web.BUNDLE.read_bytes()
+    packed = chart_web.BUNDLE.read_bytes()
     source = zlib.decompress(packed)
-    told = web.BUNDLE.with_name("README.md").read_text(encoding="utf-8")
+    told = chart_web.BUNDLE.with_name("README.md").read_text(encoding="utf-8")
     assert hashlib.sha256(packed).hexdigest() in told
     assert hashlib.sha256(source).hexdigest() in told
     (version,) = set(re.findall(r"plotly\.js-gl3d-dist-min` ([\d.]+)", told))
     assert f"plotly.js (gl3d - minified) v{version}".encode() in source[:200]
-    assert b"Permission is hereby granted, free of charge" in web.BUNDLE.with_name("plotly-gl3d.LICENSE").read_bytes()
-    assert base64.b64decode(web.packed_plotly()) == packed
+    assert b"Permission is hereby granted, free of charge" in chart_web.BUNDLE.with_name("plotly-gl3d.LICENSE").read_bytes()
+    assert base64.b64decode(chart_web.packed_plotly()) == packed
 
 
 def test_a_name_has_one_entry_of_its_first_line_or_symbol():
@@ -54,15 +53,15 @@ def test_a_name_has_one_entry_of_its_first_line_or_symbol():
     )
     assert [mark.name for mark in made.entries] == ["a", "b", "c"]
     assert made.entries[0] is points
-    traces = web.figure(made)["data"]
+    traces = chart_web.figure(made)["data"]
     assert [trace["showlegend"] for trace in traces] == [False, False, True, True, True]
     assert [trace["legendgroup"] for trace in traces] == ["a", "a", "a", "b", "c"]
 
 
 def test_both_media_leave_out_what_a_log_axis_cannot_show():
     made = chart(Mark([1, 2, 3], [0.0, 1.0, 10.0], RED, symbol=DOT, size=12, line="solid", width=3))
-    assert web.figure(made)["data"][0]["y"] == [None, 1.0, 10.0]
-    low, high = web.figure(made)["layout"]["yaxis"]["range"]
+    assert chart_web.figure(made)["data"][0]["y"] == [None, 1.0, 10.0]
+    low, high = chart_web.figure(made)["layout"]["yaxis"]["range"]
     assert low < 0
     assert high > 1
     picture, _ = drawn(made)
@@ -72,7 +71,7 @@ def test_both_media_leave_out_what_a_log_axis_cannot_show():
 def test_texts_are_escaped_in_pages_and_plain_in_files():
     evil = "<b>$x_1$ & $y"
     made = chart(Mark([1], [1], RED, evil, symbol=DOT, words=[evil], hover=[f"{evil}\nline"]))
-    text = json.dumps(web.figure(made))
+    text = json.dumps(chart_web.figure(made))
     assert "<b>$" not in text.replace("<b>&lt;", "")
     assert "&lt;b&gt;$x_1$ &amp; $y" in text
     drawn(made)
@@ -81,7 +80,7 @@ def test_texts_are_escaped_in_pages_and_plain_in_files():
 def test_a_hover_may_hold_the_points_coordinates():
     axis = Axis("x", "stretched")
     mark = Mark([-1.0, 1.0], [1.0, 2.0], RED, line="dash", hover="law {x}: {y}")
-    (trace,) = web.figure(Chart("k", "t", (Panel(axis, Axis("y"), (mark,)),)))["data"]
+    (trace,) = chart_web.figure(Chart("k", "t", (Panel(axis, Axis("y"), (mark,)),)))["data"]
     assert trace["hovertemplate"] == "law %{customdata:.3g}: %{y:.3g}<extra></extra>"
     assert trace["customdata"] == [-1.0, 1.0]
     np.testing.assert_allclose(trace["x"], axis.to_axis([-1.0, 1.0]), rtol=1e-4)
@@ -93,7 +92,7 @@ def test_panels_share_x_and_the_height():
     )
     upper = Panel(Axis("x"), Axis("y"), (Mark([1, 2], [1, 2], BLUE, line="solid"),))
     made = Chart("key", "Title", (upper, lower))
-    layout = web.figure(made)["layout"]
+    layout = chart_web.figure(made)["layout"]
     assert layout["xaxis"]["anchor"] == "y2"
     assert layout["yaxis"]["domain"][0] > layout["yaxis2"]["domain"][1]
     assert layout["yaxis2"]["tickvals"] == []

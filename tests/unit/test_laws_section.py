@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from simtest.errors import InputError
-from simtest.pages import png
+from simtest.pages import chart_png
 from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
 from simtest.report.law_charts import law_charts
 from simtest.report.pairs import ALL, NONE, pairs
@@ -100,8 +100,7 @@ def test_runs_that_name_no_law_have_no_section(tmp_path):
     assert len(results) == len(LAWS)
     charts = law_charts(results)
     assert [chart.key for chart in charts] == ["laws_angles", "laws_departures"]
-    with png.settings():
-        whole, parts = png.draw(charts)
+    whole, parts = chart_png.draw(charts)
     assert len(parts) == 2
     assert whole.shape[1] == sum(part.shape[1] for part in parts)
 

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from simtest.geometry.isocurves import cosine_beta
-from simtest.pages import png, style, web
+from simtest.pages import chart_png, style, chart_web
 from simtest.report import write_report
 from simtest.report.paper.fits import line, offset_inside_window
 from simtest.report.paper.isocurve_figure import KAPPA, OFFSET_LIGHT, isocurve_figure
@@ -126,7 +126,7 @@ def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
     assert failures.bold
     assert "5 of 40 failed: no_closed_isophote 5" in failures.hover[0]
     assert (upper.y.title, lower.x.title) == ("error of the better candidate (deg)", "slant θ (deg)")
-    drawn = web.figure(chart)
+    drawn = chart_web.figure(chart)
     assert drawn["layout"]["yaxis"]["title"]["text"].endswith("(deg)")
     spread = [trace["error_y"] for trace in drawn["data"] if "error_y" in trace]
     np.testing.assert_allclose(spread[0]["array"], sweep.largest - sweep.mean, rtol=1e-4)
@@ -134,8 +134,7 @@ def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
     np.testing.assert_allclose(spread[1]["array"], sweep.std, rtol=1e-4)
     strip = next(trace for trace in drawn["data"] if trace["yaxis"] == "y2")
     assert strip["text"] == ["<b>5</b>"] * 3
-    with png.settings():
-        picture, (part,) = png.draw([chart])
+    picture, (part,) = chart_png.draw([chart])
     assert picture.shape == part.shape
     # Ink of the curve, of the bound and of the failures.
     for colour in (COLOURS["circle_pose"], "#8A6D00", "#D03030"):
@@ -273,7 +272,7 @@ def test_the_pages_sections_and_files(small):
 
 def test_the_kept_realisation_is_that_of_its_row(small):
     run = read_run(small.folder)
-    assert {item.label for item in run.gallery} == {"noise", "steep", "offset", "defaults"}
+    assert {item.meta.label for item in run.gallery} == {"noise", "steep", "offset", "defaults"}
     shown = stages(run)
     assert shown.is_default
     row = small.results.filter((pl.col("label") == "defaults") & (pl.col("estimator") == "circle_pose")).row(
@@ -286,20 +285,20 @@ def test_the_kept_realisation_is_that_of_its_row(small):
     centre = np.mean(shown.ellipse[:-1], axis=0)
     assert shown.extent[0] < centre[0] < shown.extent[1]
     for item in run.gallery:
-        (true,) = item.truth
-        np.testing.assert_allclose(item.camera.project(true.position), true.bp_px)
+        (true,) = item.meta.truth
+        np.testing.assert_allclose(item.camera.project(np.array(true.position)), true.bp_px)
         on_plane = item.position[np.isfinite(item.position).all(axis=-1)]
         np.testing.assert_allclose((on_plane - true.position) @ true.normal, 0, atol=1e-2)
-        failed = item.estimates[0].status != "ok"
-        assert failed == (item.label == "steep")
+        failed = item.meta.estimates[0].status != "ok"
+        assert failed == (item.meta.label == "steep")
 
 
 def test_the_printed_command_makes_the_realisation_again(small, capsys):
     run = read_run(small.folder)
-    item = next(item for item in run.gallery if item.label == "offset")
-    code = re.fullmatch(r'python -c "(.*)"', item.command).group(1)
+    item = next(item for item in run.gallery if item.meta.label == "offset")
+    code = re.fullmatch(r'python -c "(.*)"', item.meta.command).group(1)
     exec(code.replace("print(", "made = (", 1), space := {})
-    np.testing.assert_allclose(space["made"]["circle_pose"][0].normal, item.estimates[0].normals[0], atol=1e-12)
+    np.testing.assert_allclose(space["made"]["circle_pose"][0].normal, item.meta.estimates[0].normals[0], atol=1e-12)
 
 
 def test_another_setting_is_shown_where_no_default_was_run(small, tmp_path):

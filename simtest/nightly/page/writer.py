@@ -15,7 +15,7 @@ from simtest.nightly.page.extras import Extras
 from simtest.nightly.page.ladder_figures import ladder
 from simtest.nightly.page.trends import MEDIAN, NEWEST, Trends, trends
 from simtest.nightly.page.worst_cases import read_cases
-from simtest.pages import style, web
+from simtest.pages import chart_web, style
 from simtest.pages.html import environment, script_json
 from simtest.report.gallery import draw_gallery, isophote_keys
 from simtest.report.run_folder import GalleryItem
@@ -93,8 +93,8 @@ def _render(night: Night, verdict: Verdict, history: pl.DataFrame, extras: Extra
         provenance=tables.provenance(night, verdict),
         files=extras.files,
         colours={name: colours[name] for name in style.estimator_order(_names(night.rows["estimator"]))},
-        figures=web.packed({chart.key: web.figure(chart) for chart in charts}),
-        plotly=web.packed_plotly() if charts or past else None,
+        figures=chart_web.packed({chart.key: chart_web.figure(chart) for chart in charts}),
+        plotly=chart_web.packed_plotly() if charts or past else None,
     )
 
 
@@ -106,7 +106,7 @@ def _estimators(night: Night, verdict: Verdict, items: Iterable[GalleryItem], pa
     """Name all that needs a colour."""
     names = [*_names(night.rows["estimator"]), *_names(night.figures["estimator"])]
     names += _names(verdict.comparisons["estimator"])
-    names += [estimate.estimator for item in items for estimate in item.estimates]
+    names += [estimate.estimator for item in items for estimate in item.meta.estimates]
     return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
 
 

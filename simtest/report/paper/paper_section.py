@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.pages import pixels, png, style
+from simtest.pages import chart_png, pixels, style
 from simtest.pages.chart import Chart
 from simtest.pages.style import degrees, labelled, number
 from simtest.report.figure_files import FigureFiles
@@ -79,7 +79,7 @@ def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> P
 def _stages_part(data: Stages | None, colours: Mapping[str, str], files: FigureFiles) -> StagesPart | None:
     if data is None:
         return None
-    whole, parts = png.draw(stage_charts(data, colours.get("circle_pose", style.NEUTRAL)))
+    whole, parts = chart_png.draw(stage_charts(data, colours.get("circle_pose", style.NEUTRAL)))
     files.write("pipeline", whole)
     for i, part in enumerate(parts, 1):
         files.write(f"pipeline_{i}", part)

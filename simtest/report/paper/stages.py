@@ -11,7 +11,7 @@ from simtest.pages.chart import Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
 from simtest.pages.style import NEUTRAL, TRUTH, Array, Symbol
 from simtest.report.paper.parameters import PARAMETERS
-from simtest.report.run_folder import GalleryItem, KeptEstimate, KeptProtocol, Run
+from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.spec.paper import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
@@ -83,18 +83,18 @@ def stages(run: Run) -> Stages | None:
     Returns None where the run kept no realisation of the published protocol.
     """
     kept = [
-        (item, item.protocol)
+        (item, item.meta.paper)
         for item in run.gallery
-        if item.protocol is not None and all(name in item.pictures for name in PICTURES)
+        if item.meta.paper is not None and all(name in item.pictures for name in PICTURES)
     ]
     if not kept:
         return None
-    return _read(*max(kept, key=lambda pair: (pair[1].setting == PaperSetting(), _answered(pair[0]))))
+    return _read(*max(kept, key=lambda pair: (pair[1] == PaperSetting(), _answered(pair[0]))))
 
 
 def _pose(item: GalleryItem) -> KeptEstimate | None:
     """Return circle pose's estimate, else the first one."""
-    estimates = item.estimates
+    estimates = item.meta.estimates
     return next((e for e in estimates if e.estimator == "circle_pose"), estimates[0] if estimates else None)
 
 
@@ -103,13 +103,12 @@ def _answered(item: GalleryItem) -> bool:
     return estimate is not None and estimate.status == "ok"
 
 
-def _read(item: GalleryItem, protocol: KeptProtocol) -> Stages:
-    setting, estimate = protocol.setting, _pose(item)
-    x, y, width, height = protocol.outer
-    peak = protocol.peak_value or float(np.max(item.pictures["smoothed"])) or 1.0
-    truth = item.truth[0].normal
-    assert truth is not None
-    candidates = estimate.normals if estimate else ()
+def _read(item: GalleryItem, setting: PaperSetting) -> Stages:
+    estimate = _pose(item)
+    x, y, width, height = item.meta.outer
+    peak = item.meta.peak_value or float(np.max(item.pictures["smoothed"])) or 1.0
+    truth = np.array(item.meta.truth[0].normal)
+    candidates = tuple(estimate.normals) if estimate else ()
     names = ("sigma", "theta_deg", "exponent", "isovalue", "eps")
     values = ", ".join(PARAMETERS[name].text(getattr(setting, name)) for name in names)
     return Stages(
@@ -122,8 +121,8 @@ def _read(item: GalleryItem, protocol: KeptProtocol) -> Stages:
         smoothed=item.pictures["smoothed"] / np.float32(peak),
         extent=(x, x + width, y + height, y),
         isovalue=setting.isovalue,
-        isophote=estimate.isophotes[0].points if estimate and estimate.isophotes else None,
-        ellipse=estimate.curves[0] if estimate and estimate.curves else None,
+        isophote=np.array(estimate.isophotes[0].points) if estimate and estimate.isophotes else None,
+        ellipse=np.array(estimate.curves[0]) if estimate and estimate.curves else None,
         truth=truth,
         candidates=candidates,
         errors_deg=tuple(float(angle_deg(candidate, truth)) for candidate in candidates),

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,17 +18,13 @@ if TYPE_CHECKING:
 Pixels = npt.NDArray[np.uint8]
 
 DPI = 150
+PX = 0.78  # points a px of the page
+
+# All in inches: widths of a chart alone and of one of several, of which so many stand in a row; ...
 SINGLE, SEVERAL, COLUMNS = 7.8, 4.8, 3
-"""Widths of a chart alone and of one of several, inches, and how many of these stand in a row."""
-
+# ... margins, a row of the legend, space between panels; width of a letter and of a legend entry's line.
 LEFT, RIGHT, TOP, BOTTOM, ROW, GAP = 0.85, 0.15, 0.36, 0.56, 0.2, 0.12
-"""Margins, a row of the legend and the space between stacked panels, inches."""
-
 LETTER, HANDLE = 0.066, 0.55
-"""Width of a letter and of a legend entry's line, inches."""
-
-PX = 0.78
-"""Points a px of the page."""
 
 DASHES = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":", "": ""}
 _SETTINGS = {
@@ -37,50 +33,50 @@ _SETTINGS = {
 }  # fmt: skip
 
 
+class _Cell(NamedTuple):
+    """The part of a picture that a chart takes, inches, y upwards."""
+
+    left: float
+    low: float
+    width: float
+    height: float
+
+
 @contextmanager
 def settings() -> Iterator[None]:
-    """Draw all figures within alike; not safe to use in several threads at a time."""
+    """Draw all figures within alike; not in several threads at a time."""
     import matplotlib
 
     with matplotlib.rc_context(cast(Any, _SETTINGS)):
         yield
 
 
-def draw(charts: Sequence[Chart], width: float | None = None) -> tuple[Pixels, list[Pixels]]:
-    """Draw charts as one picture.
-
-    Parameters
-    ----------
-    charts : sequence of Chart
-        One, or several in rows of three.
-    width : float, optional
-        Of each, inches.
+def draw(charts: Sequence[Chart]) -> tuple[Pixels, list[Pixels]]:
+    """Draw one chart, or several in rows of three, as one picture.
 
     Returns
     -------
     (ndarray, list of ndarray), uint8, shapes (H, W, 3)
         The picture, RGB, and the part of it that each chart takes.
     """
-    columns = min(COLUMNS, len(charts))
-    width = width or (SINGLE if columns == 1 else SEVERAL)
-    heights = [chart.height / 96 + ROW * _legend_shape(chart, width)[0] for chart in charts]
-    rows = [max(heights[first : first + columns]) for first in range(0, len(charts), columns)]
-    figure = _figure(columns * width, sum(rows))
-    cells = []
-    for index, (chart, height) in enumerate(zip(charts, heights, strict=True)):
-        row, column = divmod(index, columns)
-        below = sum(rows[row:]) - height
-        _draw_chart(figure, chart, (column * width, below, width, height))
-        cells.append((column * width, sum(rows[:row]), width, height))
-    whole = pixels(figure)
-    parts = [np.rint(DPI * np.array(cell)).astype(int) for cell in cells]
-    return whole, [whole[y : y + h, x : x + w] for x, y, w, h in parts]
-
-
-def _figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure
 
-    return Figure((width, height), dpi=DPI)
+    columns = min(COLUMNS, len(charts))
+    # Named ticks of x need room beside each other.
+    named = max(len(panel.x.named or ()) for chart in charts for panel in chart.panels)
+    width = max(SINGLE, 1.0 + 1.1 * named) if columns == 1 else SEVERAL
+    heights = [chart.height / 96 + ROW * _legend_shape(chart, width)[0] for chart in charts]
+    rows = [max(heights[first : first + columns]) for first in range(0, len(charts), columns)]
+    cells = []
+    with settings():
+        figure = Figure((columns * width, sum(rows)), dpi=DPI)
+        for index, (chart, height) in enumerate(zip(charts, heights, strict=True)):
+            row, column = divmod(index, columns)
+            cell = _Cell(column * width, sum(rows[row:]) - height, width, height)
+            _draw_chart(figure, chart, cell)
+            cells.append(np.rint(DPI * np.array([cell.left, sum(rows[:row]), width, height])).astype(int))
+        whole = pixels(figure)
+    return whole, [whole[y : y + h, x : x + w] for x, y, w, h in cells]
 
 
 def pixels(figure: "Figure") -> Pixels:
@@ -102,29 +98,31 @@ def _legend_shape(chart: Chart, width: float) -> tuple[int, int]:
     return -(-len(names) // columns), columns
 
 
-def _draw_chart(figure: "Figure", chart: Chart, cell: tuple[float, float, float, float]) -> None:
-    """Draw a chart into a part of a figure: left, lower edge, width and height, inches."""
-    left, low, width, height = cell
+def _draw_chart(figure: "Figure", chart: Chart, cell: _Cell) -> None:
     size = figure.get_size_inches()
-    rows, columns = _legend_shape(chart, width)
+    rows, columns = _legend_shape(chart, cell.width)
+    # Named ticks of y need room for their texts.
     names = [text for panel in chart.panels for _, text in panel.y.named or ()]
     margin = max(LEFT, 0.4 + LETTER * max((len(text) for text in names), default=0))
-    room = height - TOP - BOTTOM - ROW * rows - GAP * (len(chart.panels) - 1)
-    top = low + height - TOP
+    room = cell.height - TOP - BOTTOM - ROW * rows - GAP * (len(chart.panels) - 1)
+    top = cell.low + cell.height - TOP
     for panel in chart.panels:
-        tall = room * panel.share / sum(each.share for each in chart.panels)
-        box = np.array([left + margin, top - tall, width - margin - RIGHT, tall]) / [*size, *size]
+        height = room * panel.share / sum(each.share for each in chart.panels)
+        box = np.array([cell.left + margin, top - height, cell.width - margin - RIGHT, height]) / [*size, *size]
         ax = figure.add_axes((box[0], box[1], box[2], box[3]))
-        _draw_panel(ax, panel, chart.widths, is_last=panel is chart.panels[-1])
+        _draw_panel(ax, panel, chart.all_x)
         if panel is chart.panels[0]:
-            # A title with a height of its own is not moved about ticks and labels that it has to look for.
+            # A title with a height of its own is not moved about ticks that it would have to look for.
             ax.set_title(chart.title, y=1.0)
-        top -= tall + GAP
+        if panel is chart.panels[-1]:
+            ax.set_xlabel(panel.x.title)
+        else:
+            ax.tick_params(labelbottom=False)
+        top -= height + GAP
     if rows:
-        figure.legend(
-            handles=[_handle(mark) for mark in (*chart.entries, *chart.keys)], ncol=columns, fontsize=8.5,
-            loc="lower center", bbox_to_anchor=((left + width / 2) / size[0], low / size[1]),
-        )  # fmt: skip
+        middle = (cell.left + cell.width / 2) / size[0], cell.low / size[1]
+        handles = [_handle(mark) for mark in (*chart.entries, *chart.keys)]
+        figure.legend(handles=handles, ncol=columns, fontsize=8.5, loc="lower center", bbox_to_anchor=middle)
 
 
 def _handle(mark: Mark) -> Any:
@@ -137,14 +135,10 @@ def _handle(mark: Mark) -> Any:
     )  # fmt: skip
 
 
-def _draw_panel(ax: "Axes", panel: Panel, widths: list[npt.ArrayLike], is_last: bool) -> None:
-    _scale(ax, panel.x, "x", widths)
-    _scale(ax, panel.y, "y", panel.heights)
+def _draw_panel(ax: "Axes", panel: Panel, all_x: list[npt.ArrayLike]) -> None:
+    _scale(ax, panel.x, "x", all_x)
+    _scale(ax, panel.y, "y", panel.all_y)
     ax.set_ylabel(panel.y.title)
-    if is_last:
-        ax.set_xlabel(panel.x.title)
-    else:
-        ax.tick_params(labelbottom=False)
     if panel.picture is not None:
         ax.grid(False)
         ax.imshow(panel.picture.values, cmap="gray", vmin=0, vmax=1, extent=panel.picture.extent, aspect="auto")
@@ -161,13 +155,13 @@ def _scale(ax: "Axes", axis: Axis, which: str, values: list[npt.ArrayLike]) -> N
         getattr(ax, f"set_{which}scale")("log")
     low, high = axis.ends(values)
     getattr(ax, f"set_{which}lim")(low, high)
-    ticks = axis.ticks(min(low, high), max(low, high))
+    ticks = axis.ticks(low, high)
     if ticks is None:
         return
     part = ax.xaxis if which == "x" else ax.yaxis
     part.set_ticks([at for at, _ in ticks], labels=[text for _, text in ticks])
     part.set_minor_locator(NullLocator())
-    minor = axis.minor_ticks(min(low, high), max(low, high))
+    minor = axis.minor_ticks(low, high)
     if minor:
         # One mark: as many ticks of matplotlib's own take longer than all else.
         edge = np.zeros(len(minor))
@@ -181,11 +175,9 @@ def _draw_mark(ax: "Axes", mark: Mark, panel: Panel, order: float) -> None:
     if mark.bars:
         _draw_bars(ax, mark.bars, x, mark.colour, order)
     if mark.head:
-        ax.annotate(
-            "", (x[-1], y[-1]), (x[0], y[0]), zorder=order,
-            arrowprops={"arrowstyle": "-|>", "color": mark.colour, "lw": mark.width * PX, "ls": DASHES[mark.line],
-                        "shrinkA": 0, "shrinkB": 0, "mutation_scale": 12 + 2 * mark.width},
-        )  # fmt: skip
+        look = {"arrowstyle": "-|>", "color": mark.colour, "lw": mark.width * PX, "ls": DASHES[mark.line],
+                "shrinkA": 0, "shrinkB": 0, "mutation_scale": 12 + 2 * mark.width}  # fmt: skip
+        ax.annotate("", (x[-1], y[-1]), (x[0], y[0]), zorder=order, arrowprops=look)
     elif mark.fill:
         ax.fill(x, y, lw=0, color=mark.colour, zorder=order)
     elif mark.line or mark.symbol:
@@ -194,15 +186,14 @@ def _draw_mark(ax: "Axes", mark: Mark, panel: Panel, order: float) -> None:
             marker=mark.symbol.matplotlib if mark.symbol else None, color=mark.colour, alpha=mark.opacity, zorder=order,
         )  # fmt: skip
     for px, py, word in zip(x, y, mark.words, strict=False):
-        ax.text(px, py, word, ha="center", va="center", fontsize=8.5, color=mark.colour,
-                fontweight="bold" if mark.bold else "normal", clip_on=False)  # fmt: skip
+        weight = "bold" if mark.bold else "normal"
+        ax.text(px, py, word, ha="center", va="center", fontsize=8.5, color=mark.colour, fontweight=weight)
 
 
 def _draw_bars(ax: "Axes", bars: Bars, x: Array, colour: str, order: float) -> None:
     # The lower end of a bar that leaves a log axis is drawn at its edge.
     low = np.maximum(bars.low, ax.get_ylim()[0]) if ax.get_yscale() == "log" else bars.low
-    ax.vlines(x, low, bars.high, color=colour, lw=bars.width * PX, alpha=0.4 if bars.is_thick else 1, zorder=order)
+    width = bars.width * PX
+    ax.vlines(x, low, bars.high, color=colour, lw=width, alpha=0.4 if bars.is_thick else 1, zorder=order)
     if not bars.is_thick:
-        ax.plot(
-            np.tile(x, 2), np.concatenate([low, bars.high]), "_", color=colour, ms=6, mew=bars.width * PX, zorder=order
-        )
+        ax.plot(np.tile(x, 2), np.concatenate([low, bars.high]), "_", color=colour, ms=6, mew=width, zorder=order)

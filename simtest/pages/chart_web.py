@@ -14,27 +14,26 @@ import numpy.typing as npt
 
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Bars, Chart, Mark, Panel
-from simtest.pages.style import rgb
+from simtest.pages.style import Array, rgb
 
 PlotlyJson = dict[str, Any]
 """Plotly's own description of a figure or a part of it, as it leaves for the page."""
 
 BUNDLE = Path(__file__).parent / "vendor" / "plotly-gl3d.min.js.zz"
 
-_GAP = 0.03
-"""Half the space between stacked panels, share of the figure's height."""
+_GAP = 0.03  # half the space between stacked panels, share of the figure's height
 
 
 def figure(chart: Chart) -> PlotlyJson:
     """Return plotly's data and layout of a chart; what all charts share of their look is in the page's script."""
     made: PlotlyJson = {"height": chart.height}
     count = len(chart.panels)
-    made["xaxis"] = _axis(chart.panels[0].x, chart.widths) | {"anchor": "y" if count == 1 else f"y{count}"}
+    made["xaxis"] = _axis(chart.panels[0].x, chart.all_x) | {"anchor": "y" if count == 1 else f"y{count}"}
     listed = {id(mark) for mark in chart.entries}
     data = []
     for number, (panel, span) in enumerate(zip(chart.panels, _spans(chart), strict=True), 1):
         name = "y" if number == 1 else f"y{number}"
-        axis = _axis(panel.y, panel.heights) | {"domain": span}
+        axis = _axis(panel.y, panel.all_y) | {"domain": span}
         made[name.replace("y", "yaxis")] = axis | ({"scaleanchor": "x"} if panel.equal else {})
         data += [_trace(mark, panel, id(mark) in listed) | {"yaxis": name} for mark in panel.marks]
     return {"data": data, "layout": made}
@@ -52,16 +51,13 @@ def _spans(chart: Chart) -> list[list[float]]:
 
 def _axis(axis: Axis, values: list[npt.ArrayLike]) -> PlotlyJson:
     low, high = axis.ends(values)
-    ends = np.log10([low, high]) if axis.scale == "log" else [low, high]
-    made: PlotlyJson = {"title": {"text": _text(axis.title)}, "zeroline": False, "automargin": True,
-                        "range": rounded(ends)}  # fmt: skip
+    made: PlotlyJson = {"title": {"text": _text(axis.title)}, "zeroline": False, "automargin": True}
+    made["range"] = rounded(np.log10([low, high]) if axis.scale == "log" else [low, high])
     if axis.scale == "log":
         made["type"] = "log"
-    ticks = axis.ticks(min(low, high), max(low, high))
+    ticks, minor = axis.ticks(low, high), axis.minor_ticks(low, high)
     if ticks is not None:
-        made |= {"tickvals": [float(at) for at, _ in ticks], "ticktext": [_text(text) for _, text in ticks]}
-        made |= {"tickangle": 0}
-    minor = axis.minor_ticks(min(low, high), max(low, high))
+        made |= {"tickvals": [at for at, _ in ticks], "ticktext": [_text(text) for _, text in ticks], "tickangle": 0}
     if minor:
         made["minor"] = {"ticks": "outside", "ticklen": 3, "tickvals": rounded(minor)}
     return made
@@ -71,11 +67,10 @@ def _trace(mark: Mark, panel: Panel, is_entry: bool) -> PlotlyJson:
     x, y = np.asarray(mark.x, float), panel.y.visible(np.asarray(mark.y, float))
     modes = [name for name, on in (("lines", mark.line), ("markers", mark.symbol), ("text", mark.words)) if on]
     made: PlotlyJson = {
-        "type": "scatter", "x": rounded(panel.x.to_axis(x)), "y": rounded(y), "mode": "+".join(modes) or "none",
-        "showlegend": is_entry, "hoverinfo": "text" if mark.hover else "skip",
+        # A legend entry alone has a point nowhere.
+        "type": "scatter", "x": rounded(panel.x.to_axis(x)) or [None], "y": rounded(y) or [None],
+        "mode": "+".join(modes) or "none", "showlegend": is_entry, "hoverinfo": "text" if mark.hover else "skip",
     }  # fmt: skip
-    if not x.size:
-        made |= {"x": [None], "y": [None]}
     if mark.line:
         made["line"] = {"color": mark.colour, "width": mark.width, "dash": mark.line}
     if mark.name:
@@ -101,7 +96,7 @@ def _trace(mark: Mark, panel: Panel, is_entry: bool) -> PlotlyJson:
     return made | (_bars(mark.bars, y, mark.colour, bool(modes)) if mark.bars else {})
 
 
-def _told(hover: str, axis: Axis, x: npt.NDArray[np.float64]) -> PlotlyJson:
+def _told(hover: str, axis: Axis, x: Array) -> PlotlyJson:
     """Return the hover of a text that may hold {x} and {y}."""
     stretched = axis.scale == "stretched"
     at = "%{customdata:.3g}" if stretched else "%{x:.3g}"
@@ -109,13 +104,13 @@ def _told(hover: str, axis: Axis, x: npt.NDArray[np.float64]) -> PlotlyJson:
     return {"hovertemplate": text} | ({"customdata": rounded(x)} if stretched else {})
 
 
-def _bars(bars: Bars, y: npt.NDArray[np.float64], colour: str, is_drawn: bool) -> PlotlyJson:
+def _bars(bars: Bars, y: Array, colour: str, is_drawn: bool) -> PlotlyJson:
+    shade = "rgba({},{},{},0.4)".format(*rgb(colour)) if bars.is_thick else colour
     made: PlotlyJson = {
         "error_y": {
             "type": "data", "symmetric": False, "array": rounded(np.nan_to_num(bars.high - y)),
             "arrayminus": rounded(np.nan_to_num(y - bars.low)), "thickness": bars.width,
-            "width": 0 if bars.is_thick else 3,
-            "color": "rgba({},{},{},0.4)".format(*rgb(colour)) if bars.is_thick else colour,
+            "width": 0 if bars.is_thick else 3, "color": shade,
         }
     }  # fmt: skip
     # Plotly draws bars of markers and lines alone.
