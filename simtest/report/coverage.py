@@ -1,6 +1,6 @@
 """How many true highlights were found, how many detections are false, and how well each highlight meets its law."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import polars as pl
 
@@ -11,53 +11,16 @@ from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"
 
-
-@dataclass(frozen=True)
-class FoundRow:
-    """Counts of one setting: true isolated highlights, those missed, and false detections."""
-
-    setting: str
-    true: int
-    missed: int
-    false: int
-
-    @property
-    def found(self) -> int:
-        """True highlights that were found."""
-        return self.true - self.missed
-
-    @property
-    def coverage(self) -> float | None:
-        """Share of the true highlights that were found."""
-        return self.found / self.true if self.true else None
-
-    @property
-    def false_share(self) -> float | None:
-        """Share of the detections that are false."""
-        return self.false / (self.found + self.false) if self.found + self.false else None
+_MEASURES = (("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG),
+             ("axis ratio", "axis_ratio", "axis_ratio_law", "", 0.0))  # fmt: skip
+"""Name, columns of measurement and law, unit and the least tolerance."""
 
 
-@dataclass(frozen=True)
-class LawRow:
-    """One measure with a law in one setting: highlights, those within tolerance, and medians in `unit`."""
+class Coverage(NamedTuple):
+    """Two tables of a run over views of anatomies, a row for each setting and for each measure of it with a law."""
 
-    setting: str
-    estimator: str
-    measure: str
-    unit: str
-    n: int
-    met: int
-    median: float
-    median_law: float
-    median_gap: float
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Two tables of a run over views of anatomies."""
-
-    found: tuple[FoundRow, ...]
-    laws: tuple[LawRow, ...]
+    found: pl.DataFrame  # setting, true (isolated highlights), missed, found, false, coverage, false_share
+    laws: pl.DataFrame  # setting, estimator, measure, unit, n, met (within tolerance), median, median_law, median_gap
 
 
 def is_anatomical(run: Run) -> bool:
@@ -69,32 +32,40 @@ def coverage(run: Run) -> Coverage | None:
     """Compute the tables; None for a run that is not over views of anatomies, or has no rows."""
     if not is_anatomical(run) or run.results.is_empty():
         return None
-    found, laws = [], []
-    for (setting,), rows in run.results.group_by("setting", maintain_order=True):
-        # Detections are the same for all estimators.
-        own = rows.filter(pl.col("estimator") == rows["estimator"][0])
-        true = own.filter(pl.col("true_id").is_not_null())
-        missed = true.filter(pl.col("status") == "missed").height
-        found.append(FoundRow(str(setting), true.height, missed, own.height - true.height))
-        laws += _laws(str(setting), rows)
-    return Coverage(tuple(found), tuple(laws))
+    true = pl.col("true_id").is_not_null()
+    # Detections are the same for all estimators.
+    own = run.results.filter(pl.col("estimator") == pl.col("estimator").first().over("setting"))
+    counts = own.group_by("setting", maintain_order=True).agg(
+        true=true.sum(), missed=(true & (pl.col("status") == "missed")).sum(), false=(~true).sum()
+    )
+    found = counts.with_columns(found=pl.col("true") - pl.col("missed"))
+    # Shares of nothing are null.
+    detections = pl.col("found") + pl.col("false")
+    found = found.with_columns(
+        coverage=pl.when(pl.col("true") > 0).then(pl.col("found") / pl.col("true")),
+        false_share=pl.when(detections > 0).then(pl.col("false") / detections),
+    )
+    return Coverage(found, _laws(run.results))
 
 
-def _laws(setting: str, rows: pl.DataFrame) -> list[LawRow]:
+def _laws(results: pl.DataFrame) -> pl.DataFrame:
     """Compare each highlight's measurement with the law at its own exact curvature and light."""
-    ok = rows.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
-    table = []
-    for name in estimator_order(ok["estimator"].to_list()):
-        own = ok.filter(pl.col("estimator") == name)
-        for measure, value, law, unit, floor in (
-            ("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG),
-            ("axis ratio", "axis_ratio", "axis_ratio_law", "", 0.0),
-        ):
-            both = own.filter(pl.col(value).is_not_null() & (pl.col(law) > LEAST_LAW))
-            if both.is_empty():
-                continue
-            gap = (both[value] - both[law]).abs()
-            allowed = both.select(pl.max_horizontal(pl.lit(floor), TOLERANCE_SHARE * pl.col(law))).to_series()
-            medians = (float(part.median()) for part in (both[value], both[law], gap))  # type: ignore[arg-type]
-            table.append(LawRow(setting, name, measure, unit, both.height, int((gap <= allowed).sum()), *medians))
-    return table
+    ordered = results.with_row_index("order").with_columns(pl.col("order").min().over("setting"))
+    ok = ordered.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
+    ranks = {name: rank for rank, name in enumerate(estimator_order(ok["estimator"].to_list()))}
+    tables = []
+    for measure, value, law, unit, floor in _MEASURES:
+        gap = (pl.col(value) - pl.col(law)).abs()
+        allowed = pl.max_horizontal(pl.lit(floor), TOLERANCE_SHARE * pl.col(law))
+        tables.append(
+            ok.filter(pl.col(value).is_not_null() & (pl.col(law) > LEAST_LAW))
+            .group_by("setting", "estimator")
+            .agg(
+                pl.col("order").first(), measure=pl.lit(measure), unit=pl.lit(unit), n=pl.len(),
+                met=(gap <= allowed).sum(), median=pl.col(value).median(), median_law=pl.col(law).median(),
+                median_gap=gap.median(),
+            )
+        )  # fmt: skip
+    # Settings in their order, in each the estimators in the report's, of each the error first.
+    rank = pl.col("estimator").replace_strict(ranks, default=0, return_dtype=pl.Int64)
+    return pl.concat(tables).sort("order", rank, maintain_order=True)

@@ -19,36 +19,20 @@ _PHONG_EXPONENT = 50.0
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve: the means of one estimator on one label, with the law that was predicted for them.
+    """One curve: the means of one estimator on one label, with the law that was predicted for them."""
 
-    Parameters
-    ----------
-    estimator, label : str
-        What the colour and the marker stand for.
-    x, y, low, high : ndarray, shape (n,)
-        x and mean of each setting, and the 95 % t interval of the mean (NaN for a single value).
-    law_at : ndarray, shape (n,)
-        The law's mean prediction at each point; NaN where there is none.
-    law_x, law_y : ndarray, shape (m,)
-        The law as a line; empty where there is none.
-    names, counts : tuple of str
-        Setting, and "values of rows" for each point.
-    joined : bool
-        Whether the points follow one sweep; false for bins over many highlights.
-    """
-
-    estimator: str
-    label: str
-    x: Array
-    y: Array
-    low: Array
+    estimator: str  # what the colour stands for
+    label: str  # what the symbol stands for
+    x: Array  # of each setting, shape (n,)
+    y: Array  # mean
+    low: Array  # 95 % t interval of the mean; NaN for a single value
     high: Array
-    law_at: Array
-    law_x: Array
+    law_at: Array  # the law's mean prediction at each point; NaN where there is none
+    law_x: Array  # the law as a line, shape (m,); empty where there is none
     law_y: Array
-    names: tuple[str, ...]
-    counts: tuple[str, ...]
-    joined: bool
+    names: tuple[str, ...]  # setting of each point
+    counts: tuple[str, ...]  # "values of rows" at each point
+    joined: bool  # whether the points follow one sweep; false for bins over many highlights
 
 
 @dataclass(frozen=True)

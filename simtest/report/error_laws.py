@@ -21,26 +21,14 @@ BRANCH_SLOPE = 0.5
 
 @dataclass(frozen=True)
 class Law:
-    """A law and the columns of the results that hold its two sides.
-
-    Parameters
-    ----------
-    title, formula : str
-        In words and in signs.
-    estimator : str
-        Whose rows it is about.
-    measured, predicted : str
-        Columns; of `predicted` the branch point's is made from the row's own axis ratio.
-    is_angle : bool
-        Met within 0.3 deg or 3 %; else a ratio, met within 3 %.
-    """
+    """A law and the columns of the results that hold its two sides."""
 
     title: str
     formula: str
-    estimator: str
-    measured: str
-    predicted: str
-    is_angle: bool = True
+    estimator: str  # whose rows it is about
+    measured: str  # column
+    predicted: str  # column; the branch point's is made from the row's own axis ratio
+    is_angle: bool = True  # met within 0.3 deg or 3 %; else a ratio, met within 3 %
 
 
 LAWS: dict[LawName, Law] = {
@@ -82,32 +70,16 @@ assert set(LAWS) == set(get_args(LawName))
 
 @dataclass(frozen=True)
 class LawResult:
-    """What a run says about one law.
+    """What a run says about one law."""
 
-    Parameters
-    ----------
-    name : str
-        Of `LAWS`, or `SLOPE`.
-    law : Law
-        The law.
-    settings : tuple of str
-        Those with a value.
-    measured, predicted : ndarray, shape (n,)
-        Means over each setting's realisations; deg or ratios.
-    rows, failed : int
-        Rows of the law's estimator, and those without a value on either side.
-    tolerance : ndarray, shape (n,)
-        What each setting may depart by.
-    """
-
-    name: str
+    name: str  # of `LAWS`, or `SLOPE`
     law: Law
-    settings: tuple[str, ...]
-    measured: Array
+    settings: tuple[str, ...]  # those with a value
+    measured: Array  # means over each setting's realisations, deg or ratios, shape (n,)
     predicted: Array
-    rows: int
-    failed: int
-    tolerance: Array
+    rows: int  # of the law's estimator
+    failed: int  # rows without a value on either side
+    tolerance: Array  # what each setting may depart by
 
     @property
     def gap(self) -> Array:
@@ -197,6 +169,11 @@ def _slope(rows: pl.DataFrame) -> LawResult | None:
     allowed = np.array([TOLERANCE_SHARE * BRANCH_SLOPE + 2 * error])
     measured, predicted = np.array([slope]), np.array([BRANCH_SLOPE])
     return LawResult(SLOPE, law, (sigmas,), measured, predicted, rows.height, rows.height - ok.height, allowed)
+
+
+def is_tested(results: Sequence[LawResult]) -> bool:
+    """Whether a run has a value for any law."""
+    return any(result.settings for result in results)
 
 
 def sentence(results: Sequence[LawResult]) -> str:

@@ -1,6 +1,5 @@
 """The figures of a page: each described once, written as a file and packed for the page."""
 
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +18,11 @@ class FigureFiles:
     json: dict[str, chart_web.PlotlyJson] = field(default_factory=dict)
     writing: list[Future[None]] = field(default_factory=list)
 
-    def add(self, name: str, charts: Sequence[Chart]) -> None:
-        """Draw charts into one file and into the page."""
+    def draw(self, name: str, charts: list[Chart]) -> list[Chart]:
+        """Draw charts into one file and into the page; returns them."""
         self.write(name, chart_png.draw(charts)[0])
         self.json |= {chart.key: chart_web.figure(chart) for chart in charts}
+        return charts
 
     def write(self, name: str, picture: Pixels) -> None:
         """Write a picture as a file."""

@@ -20,40 +20,20 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Pair:
-    """Two estimators over the highlights that both answered.
+    """Two estimators over the highlights that both answered; errors in deg."""
 
-    Parameters
-    ----------
-    label : str
-        Which curve's highlights, or `ALL`.
-    first, second : str
-        Names.
-    n : int
-        Highlights that both answered.
-    only_first, only_second : int
-        Those that one alone answered.
-    mean_first, mean_second : float or None
-        Mean errors over the n, deg.
-    difference : float or None
-        Mean of first less second, deg.
-    low, high : float or None
-        Its 95 % interval (Student's t); None with fewer than two.
-    first_better : int
-        Highlights where the first is nearer to the truth.
-    """
-
-    label: str
+    label: str  # which curve's highlights, or `ALL`
     first: str
     second: str
-    n: int
-    only_first: int
+    n: int  # highlights that both answered
+    only_first: int  # highlights that one alone answered
     only_second: int
-    mean_first: float | None
+    mean_first: float | None  # over the n
     mean_second: float | None
-    difference: float | None
-    low: float | None
+    difference: float | None  # mean of first less second
+    low: float | None  # its 95 % interval (Student's t); None with fewer than two
     high: float | None
-    first_better: int
+    first_better: int  # highlights where the first is nearer to the truth
 
     @property
     def better(self) -> str:

@@ -111,7 +111,8 @@ def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
     return View3D(
         setting if setting.startswith(item.title) else f"{item.title}: {setting}", vertices, triangles,
         _intensity(item, position.shape[:2], step)[valid], segments, item.meta.length_unit,
-        None if kept is None else kept[::step, ::step].astype(float)[valid], np.reshape(np.array(item.meta.lights), (-1, 3)),
+        None if kept is None else kept[::step, ::step].astype(float)[valid],
+        np.array(item.meta.lights, dtype=float).reshape(-1, 3),
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from simtest.pages import pixels, chart_png, chart_web
+from simtest.pages import chart_png, chart_web, pixels
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel, label_keys
 from simtest.pages.style import rgb, symbols
@@ -40,7 +40,10 @@ def test_the_bundle_is_the_published_one():
     assert hashlib.sha256(source).hexdigest() in told
     (version,) = set(re.findall(r"plotly\.js-gl3d-dist-min` ([\d.]+)", told))
     assert f"plotly.js (gl3d - minified) v{version}".encode() in source[:200]
-    assert b"Permission is hereby granted, free of charge" in chart_web.BUNDLE.with_name("plotly-gl3d.LICENSE").read_bytes()
+    assert (
+        b"Permission is hereby granted, free of charge"
+        in chart_web.BUNDLE.with_name("plotly-gl3d.LICENSE").read_bytes()
+    )
     assert base64.b64decode(chart_web.packed_plotly()) == packed
 
 

@@ -21,8 +21,8 @@ from simtest.nightly.page.comparisons import comparisons
 from simtest.nightly.page.ladder_figures import FLOOR_DEG, ladder
 from simtest.nightly.page.phrases import bounds, headline, measure, short_commit, signed
 from simtest.nightly.page.trends import COSTS, MEDIAN, NEWEST, trends
-from simtest.pages.style import colours
 from simtest.pages.chart_web import BUNDLE
+from simtest.pages.style import colours
 from simtest.validation.metrics import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from simtest.geometry.isocurves import cosine_beta
-from simtest.pages import chart_png, style, chart_web
+from simtest.pages import chart_png, chart_web, style
 from simtest.report import write_report
 from simtest.report.paper.fits import line, offset_inside_window
 from simtest.report.paper.isocurve_figure import KAPPA, OFFSET_LIGHT, isocurve_figure

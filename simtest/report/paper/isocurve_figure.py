@@ -36,29 +36,15 @@ class Branch:
 
 @dataclass(frozen=True)
 class IsocurveFigure:
-    """The parts of Figure 1; lengths over abs(V_Z).
+    """The parts of Figure 1; lengths over abs(V_Z)."""
 
-    Parameters
-    ----------
-    inner, outer : float
-        r- and r+ at `KAPPA`.
-    together : tuple of Branch
-        With the light at the camera: the two circles.
-    apart : tuple of Branch
-        With the light at `OFFSET_LIGHT`.
-    bp : ndarray, shape (2,)
-        The brightest point of the latter.
-    kappa, inner_of_kappa, outer_of_kappa : ndarray, shape (m,)
-        The radii against kappa.
-    """
-
-    inner: float
-    outer: float
-    together: tuple[Branch, ...]
-    apart: tuple[Branch, ...]
-    bp: Array
-    kappa: Array
-    inner_of_kappa: Array
+    inner: float  # r- at `KAPPA`
+    outer: float  # r+
+    together: tuple[Branch, ...]  # with the light at the camera: the two circles
+    apart: tuple[Branch, ...]  # with the light at `OFFSET_LIGHT`
+    bp: Array  # brightest point of the latter, shape (2,)
+    kappa: Array  # shape (m,)
+    inner_of_kappa: Array  # r- against kappa
     outer_of_kappa: Array
 
 

@@ -9,7 +9,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
-from simtest.pages.style import NEUTRAL, TRUTH, Array, Symbol
+from simtest.pages.style import NEUTRAL, TRUTH, Array, Symbol, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.spec.paper import PaperSetting
@@ -22,54 +22,30 @@ PICTURES = ("texture", "clean", "smoothed")
 
 @dataclass(frozen=True)
 class Stages:
-    """The stages of one realisation; pictures are shares of the noise-free peak.
+    """The stages of one realisation; pictures are shares of the noise-free peak."""
 
-    Parameters
-    ----------
-    setting : str
-        Name of the setting, with the drawn values.
-    theta_deg : float
-        Slant.
-    texture : ndarray, shape (m, m)
-        Over the window of `side` texture units.
-    side : float
-        Side of the texture's window.
-    clean, noisy, smoothed : ndarray, shape (h, w)
-        The part of the camera's picture that is used; `smoothed` normalised to its peak.
-    extent : tuple of float
-        x0, x1, y1, y0 of that part, px.
-    isovalue : float
-        t.
-    isophote, ellipse : ndarray, shape (k, 2), or None
-        px; None where the realisation failed.
-    truth : ndarray, shape (3,)
-        True normal.
-    candidates : tuple of ndarray
-        The proposed one first.
-    errors_deg : tuple of float
-        Of the candidates.
-    status : str
-        "ok" or the failure's reason.
-    is_default : bool
-        Whether the setting is the article's.
-    """
-
-    setting: str
-    theta_deg: float
+    setting: str  # name of the setting, with the drawn values
+    theta_deg: float  # slant
     texture: npt.NDArray[np.float32]
-    side: float
-    clean: npt.NDArray[np.float32]
+    side: float  # of the texture's window, texture units
+    clean: npt.NDArray[np.float32]  # the part of the camera's picture that is used, shape (h, w)
     noisy: npt.NDArray[np.float32]
-    smoothed: npt.NDArray[np.float32]
-    extent: tuple[float, float, float, float]
-    isovalue: float
-    isophote: Array | None
+    smoothed: npt.NDArray[np.float32]  # normalised to its peak
+    extent: tuple[float, float, float, float]  # x0, x1, y1, y0 of that part, px
+    isovalue: float  # t
+    isophote: Array | None  # px, shape (k, 2); None where the realisation failed
     ellipse: Array | None
-    truth: Array
-    candidates: tuple[Array, ...]
-    errors_deg: tuple[float, ...]
-    status: str
-    is_default: bool
+    truth: Array  # true normal
+    candidates: tuple[Array, ...]  # the proposed one first
+    errors_deg: tuple[float, ...]  # of the candidates
+    status: str  # "ok" or the failure's reason
+    is_default: bool  # whether the setting is the article's
+
+    @property
+    def result(self) -> str:
+        """How the realisation came out."""
+        errors = [degrees(error) for error in self.errors_deg]
+        return f"candidates off by {labelled(errors)}" if errors else f"no normal ({self.status})"
 
     @property
     def better(self) -> int:

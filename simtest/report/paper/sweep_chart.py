@@ -26,20 +26,6 @@ _CLOSE, _STAGGER = 0.09, 0.24
 """Failures of settings nearer than this share of the axis stand in two heights, so that narrow pages part them."""
 
 
-def bounds(data: SweepFigure) -> list[Sweep]:
-    """Return the sweeps whose Cramer-Rao bound is drawn: one a label, where it is not 0 everywhere."""
-    seen: dict[str, Sweep] = {}
-    for sweep in data.sweeps:
-        if np.isfinite(sweep.bound).sum() > 1 and np.nanmax(sweep.bound) > 0:
-            seen.setdefault(sweep.label, sweep)
-    return list(seen.values())
-
-
-def laws(data: SweepFigure) -> list[tuple[int, Sweep]]:
-    """Return the sweeps whose law is drawn, with their indices: it is known at two settings, not 0 everywhere."""
-    return [(i, s) for i, s in enumerate(data.sweeps) if np.isfinite(s.law).sum() > 1 and np.nanmax(s.law) > 1e-3]
-
-
 def sweep_chart(data: SweepFigure, colours: Mapping[str, str]) -> Chart:
     """Describe an error plot and its strip of failures."""
     shapes = symbols(data.labels)
@@ -50,10 +36,10 @@ def sweep_chart(data: SweepFigure, colours: Mapping[str, str]) -> Chart:
         colour, symbol = colours[sweep.estimator], shapes[sweep.label]
         marks += _means(sweep, data.shifted_x(index), colour, symbol, floor)
         strip += _failures(data, index, colour, symbol)
-    for sweep in bounds(data):
+    for sweep in data.bounds:
         told = f"{BOUND_NAME}\n{sweep.label}: {{y}}°"
         marks.append(Mark(sweep.shown_x, sweep.bound, _BOUND_COLOUR, BOUND_NAME, line="dashdot", hover=told))
-    for index, sweep in laws(data):
+    for index, sweep in data.laws:
         told = f"{LAW_NAME}\n{sweep.label}: {{y}}°"
         marks.append(Mark(data.shifted_x(index), sweep.law, NEUTRAL, LAW_NAME, line="dash", hover=told))
     rows = len(data.sweeps)
