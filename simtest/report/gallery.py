@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from simtest.pages import pixels
 from simtest.pages.pixels import Canvas, Pixels, Window
-from simtest.pages.style import NEUTRAL, TRUTH, Array, degrees, hexadecimal, number
+from simtest.pages.style import NEUTRAL, TRUTH, Array, hexadecimal
 from simtest.report.run_folder import GalleryItem, KeptEstimate
 
 HEIGHT_PX, PAGE_PX = 400, 300
@@ -30,78 +29,28 @@ _COOL = ((0.0, 1.0, 1.0), (1.0, 0.0, 1.0))
 _LONGEST_NAME, _MOST_LEVELS = 24, 5
 
 
-@dataclass(frozen=True)
-class CardError:
-    """What an estimate came to: an error, a failure's reason or a false detection."""
+class Shown(NamedTuple):
+    """A gallery item with its pictures as the page shows them: data addresses, each with width over height."""
 
-    specularity: int | None
-    estimator: str
-    text: str
+    item: GalleryItem
+    pictures: list[tuple[str, float]]
 
 
-class CardPicture(NamedTuple):
-    """A picture's data address, and its width over its height."""
-
-    address: str
-    aspect: float
-
-
-@dataclass(frozen=True)
-class Card:
-    """A frame as the page shows it, with its enlargement; `missed` counts true highlights that were not found."""
-
-    title: str
-    setting: str
-    noise: str
-    why: str
-    command: str
-    errors: tuple[CardError, ...]
-    missed: int
-    pictures: tuple[CardPicture, ...]
-
-
-def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folder: Path) -> list[Card]:
+def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folder: Path) -> list[Shown]:
     """Write gallery_000.png, ... into a folder, which must exist, and return what the page shows of them."""
 
-    def card(index: int) -> Card:
+    def drawn(index: int) -> Shown:
         parts, legend = draw_item(items[index], colours)
         gap = np.full((HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
         whole = np.hstack([part for each in parts for part in (gap, each)][1:])
         strip = pixels.legend(whole.shape[1], legend)
         pixels.write_png(folder / f"gallery_{index:03d}.png", np.vstack([whole, strip]))
-        shown = (CardPicture(pixels.data_address(part, PAGE_PX), part.shape[1] / part.shape[0]) for part in parts)
-        return _card(items[index], tuple(shown))
+        pictures = [(pixels.data_address(part, PAGE_PX), part.shape[1] / part.shape[0]) for part in parts]
+        return Shown(items[index], pictures)
 
     # OpenCV and the encoders leave Python's lock to others.
     with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(card, range(len(items))))
-
-
-def _card(item: GalleryItem, pictures: tuple[CardPicture, ...]) -> Card:
-    found = {estimate.true_id for estimate in item.meta.estimates}
-    errors = tuple(CardError(e.specularity, e.estimator, _result(e)) for e in item.meta.estimates)
-    missed = sum(truth.isolated and truth.id not in found for truth in item.meta.truth)
-    return Card(
-        item.title,
-        item.meta.setting,
-        number(item.meta.sigma),
-        item.meta.why,
-        item.meta.command,
-        errors,
-        missed,
-        pictures,
-    )
-
-
-def _result(estimate: KeptEstimate) -> str:
-    ok, value = estimate.status == "ok", degrees(estimate.error_deg)
-    if estimate.true_id is None:
-        return "false detection" if ok else f"{estimate.status} (false detection)"
-    if not ok:
-        return estimate.status
-    better = degrees(estimate.error_oracle_deg)
-    told = len(estimate.normals) > 1 and better not in ("–", value)
-    return f"{value} (better candidate {better})" if told else value
+        return list(pool.map(drawn, range(len(items))))
 
 
 def anchor(item: GalleryItem, estimate: KeptEstimate) -> Array | None:

@@ -16,7 +16,7 @@ from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.run_folder import ExperimentSummary, Run, read_run
 from simtest.report.series import line_chart, line_figures
-from simtest.report.summary_table import COLUMNS, table_rows
+from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
 from simtest.report.triangle_cost import fineness_charts, read_study
 from simtest.report.view3d import view_3d, view_json, view_picture
@@ -93,7 +93,7 @@ def _render(run: Run, folder: Path) -> str:
             heat=[(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
             surfaces=surfaces, boxes=boxes, coverage=coverage(run), study=study, fineness=fineness, pairs=pairs(run),
             gallery=cards.result(), first=_FIRST_CARDS, isophotes=isophote_keys(run.gallery), truth_colour=style.TRUTH,
-            view=view, still=still, summary=table_rows(run), columns=[heading for _, heading in COLUMNS],
+            view=view, still=still, summary=table_rows(run), columns=HEADINGS,
             length_units=" or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
             colours={name: colours[name] for name in style.estimator_order(colours)},
             figures=figures.packed(), plotly=chart_web.packed_plotly() if figures.json else None,

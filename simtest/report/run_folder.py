@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from pydantic import BaseModel, BeforeValidator, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.pages.style import Array
+from simtest.pages.style import Array, degrees
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.paper import PaperSetting
 
@@ -72,6 +72,15 @@ class KeptEstimate(BaseModel):
     error_oracle_deg: float | None = None
 
     @property
+    def result(self) -> str:
+        """What the estimate came to: an error, a failure's reason or a false detection."""
+        ok, value, better = self.status == "ok", degrees(self.error_deg), degrees(self.error_oracle_deg)
+        if self.true_id is None:
+            return "false detection" if ok else f"{self.status} (false detection)"
+        told = len(self.normals) > 1 and better not in ("–", value)
+        return self.status if not ok else f"{value} (better candidate {better})" if told else value
+
+    @property
     def normals(self) -> list[Array]:
         """The candidates, or the single normal."""
         single = () if self.normal is None else (self.normal,)
@@ -114,29 +123,35 @@ class GalleryItem:
         """Heading of the item."""
         return self.meta.label or self.meta.surface or self.name
 
+    @property
+    def missed(self) -> int:
+        """True highlights that no detection found."""
+        found = {estimate.true_id for estimate in self.meta.estimates}
+        return sum(truth.isolated and truth.id not in found for truth in self.meta.truth)
+
     def true_highlight(self, estimate: KeptEstimate) -> KeptTruth | None:
         """Return the true highlight that an estimate was matched to, if any."""
         return next((t for t in self.meta.truth if t.id == estimate.true_id is not None), None)
 
 
 class EstimatorFigures(BaseModel):
-    """Figures of one setting and estimator in summary.json; errors in deg."""
+    """Figures of one setting and estimator in summary.json, with their headings; errors in deg."""
 
-    n: int | None = None
-    n_ok: int | None = None
-    n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda value: value or {})] = {}
-    n_missed: int | None = None
-    n_false: int | None = None
-    mean_deg: float | None = None
-    mean_oracle_deg: float | None = None
-    rms_deg: float | None = None
-    std_deg: float | None = None
-    median_deg: float | None = None
-    p95_deg: float | None = None
-    max_deg: float | None = None
-    mean_penalised_deg: float | None = None
-    ci95_deg: tuple[float | None, float | None] | None = None
-    coverage95: float | None = None
+    n: int | None = Field(None, title="rows")
+    n_ok: int | None = Field(None, title="ok")
+    n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda v: v or {})] = Field({}, title="failed")
+    n_missed: int | None = Field(None, title="missed")
+    n_false: int | None = Field(None, title="false")
+    mean_deg: float | None = Field(None, title="mean\u00a0°")
+    mean_oracle_deg: float | None = Field(None, title="mean, better candidate\u00a0°")
+    rms_deg: float | None = Field(None, title="RMS\u00a0°")
+    std_deg: float | None = Field(None, title="std\u00a0°")
+    median_deg: float | None = Field(None, title="median\u00a0°")
+    p95_deg: float | None = Field(None, title="95th pct\u00a0°")
+    max_deg: float | None = Field(None, title="max\u00a0°")
+    mean_penalised_deg: float | None = Field(None, title="mean, failures as\u00a090°")
+    ci95_deg: tuple[float | None, float | None] | None = Field(None, title="95\u00a0% interval\u00a0°")
+    coverage95: float | None = Field(None, title="coverage 95\u00a0%")
 
 
 class ExperimentSummary(BaseModel):

@@ -5,24 +5,7 @@ from typing import NamedTuple
 from simtest.pages.style import number
 from simtest.report.run_folder import EstimatorFigures, Run
 
-COLUMNS = (
-    ("n", "rows"),
-    ("n_ok", "ok"),
-    ("n_failed", "failed"),
-    ("n_missed", "missed"),
-    ("n_false", "false"),
-    ("mean_deg", "mean\u00a0°"),
-    ("mean_oracle_deg", "mean, better candidate\u00a0°"),
-    ("rms_deg", "RMS\u00a0°"),
-    ("std_deg", "std\u00a0°"),
-    ("median_deg", "median\u00a0°"),
-    ("p95_deg", "95th pct\u00a0°"),
-    ("max_deg", "max\u00a0°"),
-    ("mean_penalised_deg", "mean, failures as\u00a090°"),
-    ("ci95_deg", "95\u00a0% interval\u00a0°"),
-    ("coverage95", "coverage 95\u00a0%"),
-)
-"""Keys of summary.json and their headings."""
+HEADINGS = [str(field.title) for field in EstimatorFigures.model_fields.values()]
 
 
 class TableRow(NamedTuple):
@@ -30,25 +13,25 @@ class TableRow(NamedTuple):
 
     setting: str
     estimator: str
-    cells: list[tuple[str, float | None]]  # text and sort key, in the order of `COLUMNS`
+    cells: list[tuple[str, float | None]]  # text and sort key, in the order of `HEADINGS`
     reasons: str  # of failures, counted
 
 
 def table_rows(run: Run) -> list[TableRow]:
     """Return a row for each experiment, setting and estimator of summary.json."""
-    return [
-        TableRow(setting, estimator, [_cell(figures, key) for key, _ in COLUMNS], ", ".join(
-            f"{name} {count}" for name, count in sorted(figures.n_failed_by_reason.items()) if count
-        ))
-        for experiment in run.experiments.values()
-        for setting, estimator, figures in experiment.rows
-    ]  # fmt: skip
+    rows = []
+    for setting, estimator, figures in (row for experiment in run.experiments.values() for row in experiment.rows):
+        reasons = {name: count for name, count in sorted(figures.n_failed_by_reason.items()) if count}
+        cells = [_cell(value) for _, value in figures]
+        rows.append(TableRow(setting, estimator, cells, ", ".join(f"{k} {n}" for k, n in reasons.items())))
+    return rows
 
 
-def _cell(figures: EstimatorFigures, key: str) -> tuple[str, float | None]:
-    if key == "ci95_deg":
-        low, high = figures.ci95_deg or (None, None)
+def _cell(value: float | dict[str, int] | tuple[float | None, float | None] | None) -> tuple[str, float | None]:
+    if isinstance(value, tuple):
+        low, high = value
         return ("–", None) if number(low) == "–" else (f"{number(low)} to {number(high)}", low)
-    value = sum(figures.n_failed_by_reason.values()) if key == "n_failed" else getattr(figures, key)
-    text = number(value)
-    return text, None if text == "–" else value
+    # Failures by reason count together.
+    counted = sum(value.values()) if isinstance(value, dict) else value
+    text = number(counted)
+    return text, None if text == "–" else counted

@@ -1,7 +1,7 @@
 """Errors per surface: boxes with points, and a table with counts."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -20,18 +20,14 @@ STRIP_POINTS = 120
 _DOT = Symbol(".", "circle", "●")
 
 
-@dataclass(frozen=True)
-class Box:
-    """Distribution of the errors of one estimator on one surface, deg; its middle and width on the axis of surfaces.
-
-    `low` and `high` end the whiskers, within 1.5 quartile ranges.
-    """
+class Box(NamedTuple):
+    """Distribution of the errors of one estimator on one surface, deg."""
 
     surface: str
     estimator: str
-    middle: float
+    middle: float  # on the axis of surfaces, as its width
     width: float
-    low: float
+    low: float  # ends of the whiskers, within 1.5 quartile ranges
     q1: float
     median: float
     q3: float
@@ -40,30 +36,12 @@ class Box:
     points_x: Array
 
 
-@dataclass(frozen=True)
-class SurfaceRow:
-    """Counts of one estimator on one surface, and its errors, deg, None where there is none."""
-
-    surface: str
-    estimator: str
-    n: int
-    ok: int
-    failed: int
-    missed: int
-    false: int
-    mean: float | None
-    median: float | None
-    p95: float | None
-    max: float | None
-
-
-@dataclass(frozen=True)
-class SurfaceErrors:
+class SurfaceErrors(NamedTuple):
     """Errors per surface."""
 
-    surfaces: tuple[str, ...]
-    boxes: tuple[Box, ...]
-    table: tuple[SurfaceRow, ...]
+    surfaces: list[str]
+    boxes: list[Box]
+    table: pl.DataFrame  # surface, estimator, n, ok, failed, missed, false (counts), mean, median, p95, max (deg)
 
 
 def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
@@ -71,45 +49,39 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
 
     Returns None where there is nothing to show.
     """
-    rows = run.results.with_columns(ok=(pl.col("status") == "ok").fill_null(False))
-    if rows.is_empty() or (has_figures and not is_anatomical(run)):
+    if run.results.is_empty() or (has_figures and not is_anatomical(run)):
         return None
-    surfaces = [str(s) for s in rows["surface"].unique(maintain_order=True)]
-    names = estimator_order(rows["estimator"].to_list())
-    table, boxes = [], []
-    width = 0.8 / max(len(names), 1)
-    for i, surface in enumerate(surfaces):
-        for j, name in enumerate(names):
-            own = rows.filter((pl.col("surface") == surface) & (pl.col("estimator") == name))
-            if own.is_empty():
-                continue
-            hits = own.filter(pl.col("ok") & pl.col("true_id").is_not_null())["error_oracle_deg"].drop_nulls()
-            table.append(_row(own, hits, surface, name))
-            if hits.len():
-                boxes.append(_box(hits, surface, name, i + (j - (len(names) - 1) / 2) * width, width * 0.8))
-    return SurfaceErrors(tuple(surfaces), tuple(boxes), tuple(table))
-
-
-def _row(own: pl.DataFrame, hits: pl.Series, surface: str, estimator: str) -> SurfaceRow:
-    detected = own.filter(pl.col("true_id").is_not_null())
-    sizes = [hits.mean(), hits.median(), hits.quantile(0.95, "linear"), hits.max()]
-    return SurfaceRow(
-        surface, estimator, detected.height, int(detected["ok"].sum()),
-        detected.filter(~pl.col("ok") & (pl.col("status") != "missed")).height,
-        own.filter(pl.col("status") == "missed").height, own.filter(pl.col("true_id").is_null()).height,
-        *(None if size is None else float(size) for size in sizes),  # type: ignore[arg-type]
+    surfaces = [str(s) for s in run.results["surface"].unique(maintain_order=True)]
+    names = estimator_order(run.results["estimator"].to_list())
+    ok, missed = ((pl.col("status") == which).fill_null(False) for which in ("ok", "missed"))
+    true = pl.col("true_id").is_not_null()
+    errors = pl.col("error_oracle_deg").filter(ok & true).drop_nulls()
+    table = run.results.group_by("surface", "estimator").agg(
+        n=true.sum(), ok=(true & ok).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
+        false=(~true).sum(), mean=errors.mean(), median=errors.median(), p95=errors.quantile(0.95, "linear"),
+        max=errors.max(), errors=errors.sort(),
     )  # fmt: skip
+    ranks = [pl.col(key).replace_strict(order, range(len(order)), return_dtype=pl.Int64)
+             for key, order in (("surface", surfaces), ("estimator", names))]  # fmt: skip
+    table = table.sort(ranks)
+    width = 0.8 / len(names)
+    boxes = []
+    for surface, name, held in table.select("surface", "estimator", "errors").iter_rows():
+        middle = surfaces.index(surface) + (names.index(name) - (len(names) - 1) / 2) * width
+        boxes += [_box(np.array(held), surface, name, middle, 0.8 * width)] if held else []
+    return SurfaceErrors(surfaces, boxes, table.drop("errors"))
 
 
-def _box(hits: pl.Series, surface: str, estimator: str, middle: float, width: float) -> Box:
-    values = np.maximum(np.sort(hits.to_numpy().astype(float)), _LEAST_DEG)
+def _box(errors: Array, surface: str, estimator: str, middle: float, width: float) -> Box:
+    """Describe errors in ascending order."""
+    values = np.maximum(errors, _LEAST_DEG)
     q1, median, q3 = (float(q) for q in np.quantile(values, [0.25, 0.5, 0.75]))
     inside = values[(values >= q1 - 1.5 * (q3 - q1)) & (values <= q3 + 1.5 * (q3 - q1))]
     kept = values[np.linspace(0, values.size - 1, min(values.size, STRIP_POINTS)).round().astype(int)]
     # The golden ratio spreads neighbours in rank evenly across the box, the same way in every run.
     jitter = (np.arange(kept.size) * 0.6180339887 % 1 - 0.5) * width * 0.8
-    ends = float(inside.min()), float(inside.max())
-    return Box(surface, estimator, middle, width, ends[0], q1, median, q3, ends[1], kept, middle + jitter)
+    low, high = float(inside.min()), float(inside.max())
+    return Box(surface, estimator, middle, width, low, q1, median, q3, high, kept, middle + jitter)
 
 
 def surface_chart(data: SurfaceErrors, colours: Mapping[str, str]) -> Chart:
