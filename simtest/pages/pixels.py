@@ -33,16 +33,10 @@ def displayed(frame: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 class Canvas:
-    """A part of a frame, enlarged. All points are pixel coordinates of the frame, shape (n, 2) or (2,).
+    """A part of a frame, enlarged, RGB. All points are pixel coordinates of the frame, shape (n, 2) or (2,).
 
-    Parameters
-    ----------
-    frame : ndarray, shape (H, W) or (H, W, 3)
-        Linear, share of full scale, RGB.
-    window : tuple of float, optional
-        x0, x1, y0, y1 of the part, px. Default: all of it.
-    height : int
-        Of the drawing, px.
+    The frame is linear, share of full scale, shape (H, W) or (H, W, 3); the window is x0, x1, y0, y1 of the part, px,
+    all of the frame by default; the height is that of the drawing, px.
     """
 
     def __init__(self, frame: npt.NDArray[np.float32], window: Window | None, height: int) -> None:

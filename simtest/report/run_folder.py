@@ -214,21 +214,9 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Read a run folder.
+    """Read a run folder: results.parquet, summary.json and, if there is one, gallery/*.npz.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        Folder with results.parquet, summary.json and, if there is one, gallery/*.npz.
-
-    Returns
-    -------
-    Run
-
-    Raises
-    ------
-    InputError
-        If a file is missing or malformed; the message names it.
+    Raises `InputError` if a file is missing or malformed; the message names it.
     """
     path = Path(path)
     files = sorted((path / "gallery").glob("[!.]*.npz"))

@@ -1,14 +1,13 @@
 """What triangles alone cost, from studies/fineness.py: the figures on pages of runs over anatomies."""
 
-import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import Chart, Mark, Panel, label_keys
-from simtest.pages.style import NEUTRAL, Array, symbols
+from simtest.pages.style import NEUTRAL, symbols
 from simtest.surfaces.fineness import EDGES_PER_HALF_WIDTH
 
 DATA = Path(__file__).with_name("triangle_cost.json")
@@ -21,39 +20,36 @@ SHADINGS = {
 """Colour and name of each way to shade, by its name in the data."""
 
 PANELS = (
-    ("normal_deg", "Error of the normal", "error of the normal (deg)", 1e-5),
-    ("axis_ratio_percent", "Error of the axis ratio", "error of the axis ratio (%)", 1e-3),
+    ("normal_deg", "Error of the normal", "error of the normal (deg)", 1, 1e-5),
+    ("axis_ratio", "Error of the axis ratio", "error of the axis ratio (%)", 100, 1e-3),
 )
-"""Field, heading, axis and the least value that is drawn: what is smaller is rounding."""
+"""Field, heading, axis, factor and the least value that is drawn: what is smaller is rounding."""
 
 X_TITLE = "edge length over the highlight's half-width"
 
 
-@dataclass(frozen=True)
-class FinenessCurve:
+class FinenessCurve(BaseModel):
     """Nine in ten errors on one surface with one shading are below these, by edge length."""
 
     surface: str
     shading: str
-    normal_deg: Array
-    axis_ratio_percent: Array
+    normal_deg: list[float]
+    axis_ratio: list[float]  # share of it
 
 
-@dataclass(frozen=True)
-class Fineness:
-    """The study: curves over the edge lengths, in highlights' half-widths, for one distance, mm, and exponent."""
+class Fineness(BaseModel):
+    """The study: curves over the edge lengths, in highlights' half-widths."""
 
-    edges: Array
-    curves: tuple[FinenessCurve, ...]
+    edge_over_half_width: list[float]
     distance_mm: float
     exponent: float
+    curves: list[FinenessCurve]
 
     def sentence(self) -> str:
         """State what the rule of `simtest mesh check` costs on the most curved surface."""
-        at = int(np.argmin(np.abs(self.edges - 1 / EDGES_PER_HALF_WIDTH)))
+        at = int(np.argmin(np.abs(np.array(self.edge_over_half_width) - 1 / EDGES_PER_HALF_WIDTH)))
         worst = [curve for curve in self.curves if curve.shading == "estimated"]
-        normal = max(float(curve.normal_deg[at]) for curve in worst)
-        ratio = max(float(curve.axis_ratio_percent[at]) for curve in worst)
+        normal, ratio = max(c.normal_deg[at] for c in worst), 100 * max(c.axis_ratio[at] for c in worst)
         return (
             f"With {EDGES_PER_HALF_WIDTH:g} edges in a half-width, which simtest mesh check asks for, triangles with "
             f"normals of their own cost at most {normal:.2g}° and {ratio:.2g} % of the axis ratio here."
@@ -62,31 +58,37 @@ class Fineness:
 
 def read_study() -> Fineness:
     """Read the shipped study."""
-    content = json.loads(DATA.read_text(encoding="utf-8"))
-    curves = tuple(
-        FinenessCurve(c["surface"], c["shading"], np.array(c["normal_deg"]), 100 * np.array(c["axis_ratio"]))
-        for c in content["curves"]
-    )
-    return Fineness(np.array(content["edge_over_half_width"]), curves, content["distance_mm"], content["exponent"])
+    return Fineness.model_validate_json(DATA.read_bytes())
 
 
 def fineness_charts(study: Fineness) -> list[Chart]:
     """Describe the study: a chart of normals, one of axis ratios; the dashed line is the rule for meshes."""
     shapes = symbols(curve.surface for curve in study.curves)
-    x = Axis(X_TITLE, "log", named=tuple((float(edge), f"{edge:g}") for edge in study.edges))
+    x = Axis(X_TITLE, "log", named=tuple((float(edge), f"{edge:g}") for edge in study.edge_over_half_width))
     charts = []
-    for key, title, name, least in PANELS:
+    for key, title, name, factor, least in PANELS:
         marks = []
         for curve in study.curves:
             colour, shading = SHADINGS[curve.shading]
-            values = getattr(curve, key)
+            values = factor * np.array(getattr(curve, key))
             hover = [
                 f"{curve.surface}, {shading}\nedge {edge:g}: {name} {value:.2g}"
-                for edge, value in zip(study.edges, values, strict=True)
+                for edge, value in zip(study.edge_over_half_width, values, strict=True)
             ]
             shown = np.maximum(values, least)
             symbol = shapes[curve.surface]
-            marks.append(Mark(study.edges, shown, colour, shading, line="solid", width=1.2, symbol=symbol, hover=hover))
+            marks.append(
+                Mark(
+                    study.edge_over_half_width,
+                    shown,
+                    colour,
+                    shading,
+                    line="solid",
+                    width=1.2,
+                    symbol=symbol,
+                    hover=hover,
+                )
+            )
         ends = log_range([mark.y for mark in marks])
         rule = Mark([1 / EDGES_PER_HALF_WIDTH] * 2, ends, NEUTRAL, line="dash", width=1.2)
         panel = Panel(x, Axis(name, "log", ends), (rule, *marks))

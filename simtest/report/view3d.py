@@ -1,9 +1,9 @@
 """The 3D view: the visible surface of one gallery item with true and estimated normals, for page and file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ _GRID, _NORMALS = 72, 9
 """Samples of the surface along the longer side, and of the normals that are drawn all over it."""
 
 _OCCLUSION = 1.25
-"""Neighbouring samples whose distances differ by a larger factor lie on both sides of an edge."""
+"""Factor between the distances of neighbouring samples beyond which there is an edge."""
 
 _TRUE, _AT_HIGHLIGHT, _SIGHTLINE = "true normals", "true normal at the highlight", "sightline from the camera"
 _COLOURS = {_TRUE: "#5E8FBF", _SIGHTLINE: NEUTRAL, _AT_HIGHLIGHT: "#C9A800"}
@@ -33,33 +33,28 @@ _SIZE_INCHES = (7.2, 6.2)
 _DPI = 110
 
 
-@dataclass(frozen=True)
-class Segments:
-    """Line segments of one kind: `start` and `end` have shape (n, 3), camera frame."""
+class Segments(NamedTuple):
+    """Line segments of one kind, camera frame."""
 
     name: str
     colour: str
     width: float
-    start: Array
+    start: Array  # shape (n, 3)
     end: Array
 
 
 @dataclass(frozen=True)
 class View3D:
-    """A triangle mesh in the camera frame with a grey value per vertex, and normals as segments.
-
-    `curvature`, where the run kept it, is the principal curvature of larger size at the vertices; `lights` are the
-    light positions, shape (L, 3). Key, legend entries and height, px, are those of its figure in the page.
-    """
+    """A triangle mesh in the camera frame, and normals as segments; with key, height (px) and legend of its figure."""
 
     title: str
     vertices: Array
     triangles: npt.NDArray[np.int64]
-    intensity: Array
+    intensity: Array  # grey value at the vertices
     segments: tuple[Segments, ...]
     unit: str
-    curvature: Array | None
-    lights: Array
+    curvature: Array | None  # principal one of larger size, at the vertices, where the run kept it
+    lights: Array  # positions, shape (L, 3)
     key: ClassVar[str] = "surface3d"
     keys: ClassVar[tuple[Mark, ...]] = ()
     height: ClassVar[int] = 560
@@ -89,9 +84,8 @@ def view_3d(run: Run, colours: Mapping[str, str]) -> View3D | None:
 
 def _interest(item: GalleryItem) -> tuple[int, float]:
     answered = {estimate.estimator for estimate in item.meta.estimates if estimate.status == "ok"}
-    return len(answered), min(
-        max((abs(size) for truth in item.meta.truth for size in (truth.kd_min, truth.kd_max) if size), default=0.0), 2.0
-    )
+    sizes = (abs(size) for truth in item.meta.truth for size in (truth.kd_min, truth.kd_max) if size)
+    return len(answered), min(max(sizes, default=0.0), 2.0)
 
 
 def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
@@ -117,19 +111,10 @@ def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
 
 
 def grid_triangles(position: Array, occlusion: float) -> npt.NDArray[np.int64]:
-    """Join neighbouring samples of a surface, but not across occlusions, where the distance jumps.
+    """Join neighbouring samples of a surface, shape (h, w, 3), camera frame, NaN where there is none.
 
-    Parameters
-    ----------
-    position : ndarray, shape (h, w, 3)
-        Camera frame; NaN where there is no surface.
-    occlusion : float
-        Distances within a cell may differ by this factor.
-
-    Returns
-    -------
-    ndarray of int, shape (n, 3)
-        Corners, as indices into the samples that are a surface.
+    Where the distances of neighbours differ by more than the factor `occlusion`, they lie on both sides of an edge and
+    stay apart. Returns the triangles' corners, shape (n, 3), as indices into the samples that are a surface.
     """
     valid = np.isfinite(position).all(axis=-1)
     index = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, -1)
@@ -209,19 +194,14 @@ def view_json(data: View3D) -> PlotlyJson:
         "lighting": {"ambient": 0.9, "diffuse": 0.2, "specular": 0.0},
         "colorbar": {"title": {"text": title, "font": {"size": 12}}, "thickness": 12, "len": 0.6, "x": 1.0},
     }  # fmt: skip
-    made["updatemenus"] = [_choice(("curvature", "picture"))]
-    return {"data": [mesh | picture | {"visible": False}, mesh | curved, *lines, *points], "layout": made}
-
-
-def _choice(names: Sequence[str]) -> PlotlyJson:
-    """Return the buttons that show one of the two surfaces, the traces 1 and 0."""
-    shown = ([False, True], [True, False])
+    # Buttons that show one of the two surfaces, the traces 1 and 0.
     buttons = [
         {"label": name, "method": "restyle", "args": [{"visible": which}, [0, 1]]}
-        for name, which in zip(names, shown, strict=True)
+        for name, which in (("curvature", [False, True]), ("picture", [True, False]))
     ]
-    return {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1, "xanchor": "left",
-            "yanchor": "top", "showactive": True, "font": {"color": "#1b1f24"}}  # fmt: skip
+    made["updatemenus"] = [{"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1,
+                            "xanchor": "left", "yanchor": "top", "font": {"color": "#1b1f24"}}]  # fmt: skip
+    return {"data": [mesh | picture | {"visible": False}, mesh | curved, *lines, *points], "layout": made}
 
 
 def _scatter_json(name: str, points: Array, mode: str) -> PlotlyJson:
@@ -235,6 +215,7 @@ def _lines_json(part: Segments) -> PlotlyJson:
     return _scatter_json(part.name, points, "lines") | {"line": {"color": part.colour, "width": part.width}}
 
 
+@chart_png.settings()
 def view_picture(data: View3D) -> Pixels:
     """Draw the surface seen from beside the camera, by curvature or shaded by the frame, with its normals; RGB."""
     from matplotlib.figure import Figure
