@@ -1,8 +1,7 @@
-"""One place for colours, symbols, number formats and axes, so that both drawing backends agree."""
+"""Colours, symbols and number formats of all pages and figures."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,9 +30,6 @@ LIGHT = "#F2C500"
 TRUTH = "#F5D90A"
 """Yellow of the truth on top of frames."""
 
-SEQUENTIAL = "cividis"
-"""Colour map of heat maps; perceptually uniform and colour-blind-safe."""
-
 
 class Symbol(NamedTuple):
     """One marker, by its name in matplotlib, in plotly and as a character."""
@@ -56,17 +52,9 @@ _SYMBOLS = (
 
 
 def colours(estimators: Iterable[str]) -> dict[str, str]:
-    """Give each estimator its colour; names without a fixed one take further colours in alphabetical order.
+    """Return the colour of each estimator, hexadecimal, by name.
 
-    Parameters
-    ----------
-    estimators : iterable of str
-        Names, in any order.
-
-    Returns
-    -------
-    dict of str to str
-        Hexadecimal colours by name.
+    Names without a fixed colour take further ones in alphabetical order.
     """
     names = list(dict.fromkeys(estimators))
     unknown = sorted(name for name in names if name not in ESTIMATOR_COLOURS)
@@ -75,13 +63,13 @@ def colours(estimators: Iterable[str]) -> dict[str, str]:
 
 
 def estimator_order(names: Iterable[str]) -> list[str]:
-    """Sort estimator names: the known ones in the order of the palette, then the others by name."""
+    """Sort estimator names: those of the palette in its order, then the others by name."""
     known = list(ESTIMATOR_COLOURS)
     return sorted(set(names), key=lambda name: (known.index(name) if name in known else len(known), name))
 
 
 def symbols(labels: Iterable[str]) -> dict[str, Symbol]:
-    """Give each curve label its marker, in order of appearance."""
+    """Return the marker of each label, by order of appearance."""
     return {label: _SYMBOLS[i % len(_SYMBOLS)] for i, label in enumerate(dict.fromkeys(labels))}
 
 
@@ -98,69 +86,20 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def degrees(value: Any) -> str:
-    """Write an angle that is given in degrees."""
+    """Write an angle in degrees."""
     text = number(value)
     return text if text == "–" else f"{text}°"
 
 
-_STRETCH = 0.01
-_TICKS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-
-
-@dataclass(frozen=True)
-class Axis:
-    """An axis of a figure.
-
-    Parameters
-    ----------
-    title : str
-        Name and unit.
-    scale : {"linear", "log", "stretched"}
-        "stretched" is asinh(x / 0.01), near-logarithmic on both sides of zero; both backends draw at `place(x)`.
-    limits : (float, float), optional
-        Range in data units, for linear axes.
-    """
-
-    title: str
-    scale: Literal["linear", "log", "stretched"] = "linear"
-    limits: tuple[float, float] | None = None
-
-    def place(self, values: npt.ArrayLike) -> Array:
-        """Give the drawing coordinates of data values, same shape."""
-        data = np.asarray(values, dtype=float)
-        return np.arcsinh(data / _STRETCH) if self.scale == "stretched" else data
-
-    def unplace(self, places: npt.ArrayLike) -> Array:
-        """Give the data values at drawing coordinates, same shape."""
-        data = np.asarray(places, dtype=float)
-        return np.sinh(data) * _STRETCH if self.scale == "stretched" else data
-
-    def ticks(self, values: npt.ArrayLike) -> tuple[list[float], list[str]] | None:
-        """Give tick places and texts that cover the values of a stretched axis; None leaves them to the backend."""
-        data = np.asarray(values, dtype=float)
-        data = data[np.isfinite(data)]
-        if self.scale != "stretched" or not data.size:
-            return None
-        low, high = float(data.min()) * 1.8, float(data.max()) * 1.8
-        every = sorted({0.0, *(sign * tick for tick in _TICKS[1:] for sign in (-1, 1))})
-        ticks = [tick for tick in every if min(low, 0) <= tick <= max(high, 0)]
-        return [float(p) for p in self.place(ticks)], [f"{t:g}".replace("-", "−") for t in ticks]
-
-
-def curvature_axis(values: npt.ArrayLike, title: str) -> Axis:
-    """Choose the axis for curvature: stretched where the values span more than a factor of ten, else linear.
-
-    The smallest twentieth and the largest do not count: among the many highlights of anatomies there are always some.
-    """
-    size = np.abs(np.asarray(values, dtype=float))
-    size = size[np.isfinite(size) & (size > 1e-9)]
-    wide = size.size > 1 and np.quantile(size, 0.95) / np.quantile(size, 0.05) > 10
-    return Axis(title, "stretched" if wide else "linear")
-
-
 def hexadecimal(colour: Sequence[float]) -> str:
-    """Write a colour, red, green and blue in [0, 1] first."""
+    """Write a colour whose first three parts are red, green and blue in [0, 1]."""
     return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Read a hexadecimal colour: red, green and blue in 0..255."""
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return red, green, blue
 
 
 def labelled(names: Sequence[str]) -> str:

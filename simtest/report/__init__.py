@@ -1,20 +1,11 @@
-"""The report of a run: figures as PNG and one self-contained page. Never imports the renderer."""
+"""The report of a run: figures as PNG and one self-contained page. Never imports the renderer.
 
-from typing import TYPE_CHECKING, Any
+`page` puts the sections together; `run_folder` reads what they are made of. Errors over one quantity are `curves` and
+`series`, over two `heat_maps`, per surface `surface_errors`, against laws `error_laws`. `gallery` draws frames,
+`view3d` surfaces in space. `paper/` holds the sections of the published protocol, `viewer/` the window of `simtest
+view`.
+"""
 
-if TYPE_CHECKING:
-    from simtest.report.page import write_report
+from simtest.report.page import write_report
 
 __all__ = ["write_report"]
-
-
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        from simtest.report import page
-
-        return getattr(page, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

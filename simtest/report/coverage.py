@@ -1,7 +1,6 @@
 """How many true highlights were found, how many detections are false, and how well each highlight meets its law."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import polars as pl
 
@@ -12,80 +11,61 @@ from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"
 
+_MEASURES = (("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG),
+             ("axis ratio", "axis_ratio", "axis_ratio_law", "", 0.0))  # fmt: skip
+"""Name, columns of measurement and law, unit and the least tolerance."""
 
-@dataclass(frozen=True)
-class Coverage:
-    """Two tables of a run over views of anatomies.
 
-    Parameters
-    ----------
-    found : tuple of dict
-        For each setting: true isolated highlights, found, missed, false, and their shares.
-    laws : tuple of dict
-        For each setting and measure with a law: highlights, those within tolerance, median departure.
-    """
+class Coverage(NamedTuple):
+    """Two tables of a run over views of anatomies, a row for each setting and for each measure of it with a law."""
 
-    found: tuple[dict[str, Any], ...]
-    laws: tuple[dict[str, Any], ...]
+    found: pl.DataFrame  # setting, true (isolated highlights), missed, found, false, coverage, false_share
+    laws: pl.DataFrame  # setting, estimator, measure, unit, n, met (within tolerance), median, median_law, median_gap
 
 
 def is_anatomical(run: Run) -> bool:
-    """Tell whether a run is one over views of anatomies."""
+    """Whether a run is one over views of anatomies."""
     return bool({VIEWPOINT, PATH_SHARE} & set(run.results.columns))
 
 
 def coverage(run: Run) -> Coverage | None:
-    """Compute the tables; None for a run that is not over views of anatomies, or has no rows.
-
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    Coverage or None
-    """
+    """Compute the tables; None for a run that is not over views of anatomies, or has no rows."""
     if not is_anatomical(run) or run.results.is_empty():
         return None
-    found, laws = [], []
-    for (setting,), rows in run.results.group_by("setting", maintain_order=True):
-        # Detections are the same for all estimators.
-        own = rows.filter(pl.col("estimator") == rows["estimator"][0])
-        true = own.filter(pl.col("true_id").is_not_null())
-        missed = true.filter(pl.col("status") == "missed").height
-        false = own.height - true.height
-        hits = true.height - missed
-        found.append(
-            {"setting": setting, "true": true.height, "found": hits, "missed": missed, "false": false,
-             "coverage": _share(hits, true.height), "false_share": _share(false, hits + false)}
-        )  # fmt: skip
-        laws += _laws(str(setting), rows)
-    return Coverage(tuple(found), tuple(laws))
+    true = pl.col("true_id").is_not_null()
+    # Detections are the same for all estimators.
+    own = run.results.filter(pl.col("estimator") == pl.col("estimator").first().over("setting"))
+    counts = own.group_by("setting", maintain_order=True).agg(
+        true=true.sum(), missed=(true & (pl.col("status") == "missed")).sum(), false=(~true).sum()
+    )
+    found = counts.with_columns(found=pl.col("true") - pl.col("missed"))
+    # Shares of nothing are null.
+    detections = pl.col("found") + pl.col("false")
+    found = found.with_columns(
+        coverage=pl.when(pl.col("true") > 0).then(pl.col("found") / pl.col("true")),
+        false_share=pl.when(detections > 0).then(pl.col("false") / detections),
+    )
+    return Coverage(found, _laws(run.results))
 
 
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
-
-
-def _laws(setting: str, rows: pl.DataFrame) -> list[dict[str, Any]]:
+def _laws(results: pl.DataFrame) -> pl.DataFrame:
     """Compare each highlight's measurement with the law at its own exact curvature and light."""
-    ok = rows.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
-    table = []
-    for name in estimator_order(ok["estimator"].to_list()):
-        own = ok.filter(pl.col("estimator") == name)
-        for measure, value, law, unit, floor in (
-            ("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG),
-            ("axis ratio", "axis_ratio", "axis_ratio_law", "", 0.0),
-        ):
-            both = own.filter(pl.col(value).is_not_null() & (pl.col(law) > LEAST_LAW))
-            if both.is_empty():
-                continue
-            gap = (both[value] - both[law]).abs()
-            allowed = both.select(pl.max_horizontal(pl.lit(floor), TOLERANCE_SHARE * pl.col(law))).to_series()
-            table.append(
-                {"setting": setting, "estimator": name, "measure": measure, "unit": unit, "n": both.height,
-                 "met": int((gap <= allowed).sum()), "median_gap": gap.median(),
-                 "median_law": both[law].median(), "median": both[value].median()}
-            )  # fmt: skip
-    return table
+    ordered = results.with_row_index("order").with_columns(pl.col("order").min().over("setting"))
+    ok = ordered.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
+    ranks = {name: rank for rank, name in enumerate(estimator_order(ok["estimator"].to_list()))}
+    tables = []
+    for measure, value, law, unit, floor in _MEASURES:
+        gap = (pl.col(value) - pl.col(law)).abs()
+        allowed = pl.max_horizontal(pl.lit(floor), TOLERANCE_SHARE * pl.col(law))
+        tables.append(
+            ok.filter(pl.col(value).is_not_null() & (pl.col(law) > LEAST_LAW))
+            .group_by("setting", "estimator")
+            .agg(
+                pl.col("order").first(), measure=pl.lit(measure), unit=pl.lit(unit), n=pl.len(),
+                met=(gap <= allowed).sum(), median=pl.col(value).median(), median_law=pl.col(law).median(),
+                median_gap=gap.median(),
+            )
+        )  # fmt: skip
+    # Settings in their order, in each the estimators in the report's, of each the error first.
+    rank = pl.col("estimator").replace_strict(ranks, default=0, return_dtype=pl.Int64)
+    return pl.concat(tables).sort("order", rank, maintain_order=True)

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import stdtrit
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
-from simtest.pages.style import Array, Axis, estimator_order
+from simtest.pages.axes import Axis
+from simtest.pages.style import Array, estimator_order
 from simtest.report.run_folder import Run
 from simtest.validation import laws
 
@@ -19,36 +19,20 @@ _PHONG_EXPONENT = 50.0
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve: the means of one estimator on one label, with the law that was predicted for them.
+    """One curve: the means of one estimator on one label, with the law that was predicted for them."""
 
-    Parameters
-    ----------
-    estimator, label : str
-        What the colour and the marker stand for.
-    x, y, low, high : ndarray, shape (n,)
-        Place and mean of each setting, and the 95 % t interval of the mean (NaN for a single value).
-    law_at : ndarray, shape (n,)
-        The law's mean prediction at each point; NaN where there is none.
-    law_x, law_y : ndarray, shape (m,)
-        The law as a line; empty where there is none.
-    names, counts : tuple of str
-        Setting, and "values of rows" for each point.
-    joined : bool
-        Whether the points follow one sweep; false for bins over many highlights.
-    """
-
-    estimator: str
-    label: str
-    x: Array
-    y: Array
-    low: Array
+    estimator: str  # what the colour stands for
+    label: str  # what the symbol stands for
+    x: Array  # of each setting, shape (n,)
+    y: Array  # mean
+    low: Array  # 95 % t interval of the mean; NaN for a single value
     high: Array
-    law_at: Array
-    law_x: Array
+    law_at: Array  # the law's mean prediction at each point; NaN where there is none
+    law_x: Array  # the law as a line, shape (m,); empty where there is none
     law_y: Array
-    names: tuple[str, ...]
-    counts: tuple[str, ...]
-    joined: bool
+    names: tuple[str, ...]  # setting of each point
+    counts: tuple[str, ...]  # "values of rows" at each point
+    joined: bool  # whether the points follow one sweep; false for bins over many highlights
 
 
 @dataclass(frozen=True)
@@ -62,7 +46,7 @@ class Ask:
 
 
 def prepared(run: Run) -> pl.DataFrame:
-    """Give the rows of true highlights, with `kd` (the principal k d of larger size) and `kd_other`."""
+    """Return the rows of true highlights, with `kd` (the principal k d of larger size) and `kd_other`."""
     larger = pl.col("kd_max").abs() >= pl.col("kd_min").abs()
     return run.results.filter(pl.col("true_id").is_not_null()).with_columns(
         kd=pl.when(larger).then("kd_max").otherwise("kd_min"),
@@ -72,7 +56,7 @@ def prepared(run: Run) -> pl.DataFrame:
 
 
 def varies(values: pl.Series) -> bool:
-    """Tell whether per-setting means differ by more than a tenth of the largest (and more than 5e-4)."""
+    """Whether per-setting means differ by more than a tenth of the largest (and more than 5e-4)."""
     values = values.drop_nulls()
     if values.len() < 2:
         return False
@@ -81,7 +65,7 @@ def varies(values: pl.Series) -> bool:
 
 
 def scattered(rows: pl.DataFrame, x: str) -> bool:
-    """Tell whether a quantity changes so much within one setting that rows must be binned by it instead."""
+    """Whether a quantity changes so much within one setting that rows must be binned by it instead."""
     if rows.is_empty():
         return False
     spread = rows.group_by("setting").agg((pl.col(x).max() - pl.col(x).min()).alias("spread"))["spread"].max()
@@ -90,7 +74,7 @@ def scattered(rows: pl.DataFrame, x: str) -> bool:
 
 
 def slices(rows: pl.DataFrame, x: str, hold: str | None) -> Iterator[tuple[str, pl.DataFrame, bool]]:
-    """Give, for each label that sweeps x, its rows and whether they are to be binned.
+    """Yield, for each label that sweeps x, its rows and whether they are to be binned.
 
     Where the other quantity is swept as well (a grid), only the settings at its smallest size remain.
     """
@@ -138,15 +122,15 @@ def _interval(table: pl.DataFrame) -> tuple[Array, Array]:
 
 
 def gather(rows: pl.DataFrame, ask: Ask, axis: Axis) -> tuple[list[Curve], list[str]]:
-    """Gather the curves of a figure, and the places that have no value."""
+    """Gather the curves of a figure, and the settings and bins that have no value."""
     curves, empty = [], []
     for label, part, is_scattered in slices(rows, ask.x, ask.hold):
         table = _aggregate(part, ask, is_scattered)
         for name in estimator_order(table["estimator"].to_list()):
             own = table.filter(pl.col("estimator") == name)
             without = own.filter(pl.col("n") == 0)
-            places = [f"bin around {x:.2g}" for x in without["x"]] if is_scattered else without["group"].to_list()
-            empty += [f"{name}, {place}" for place in places]
+            missing = [f"bin around {x:.2g}" for x in without["x"]] if is_scattered else without["group"].to_list()
+            empty += [f"{name}, {where}" for where in missing]
             law_x, law_y = _law_line(own, ask, name, axis, is_scattered)
             own = own.filter(pl.col("n") > 0)
             if own.is_empty():
@@ -190,19 +174,10 @@ def _law_line(table: pl.DataFrame, ask: Ask, estimator: str, axis: Axis, is_scat
     at_points = closed_form(x, kd, other)
     margin = 0.01 if ask.value == "axis_ratio" else 0.05
     agrees = at_points is not None and bool(np.all(np.abs(at_points - law) <= margin + 0.01 * np.abs(law)))
-    if is_scattered or not agrees or x.size < 2 or np.ptp(axis.place(x)) == 0:
+    if is_scattered or not agrees or x.size < 2 or np.ptp(axis.to_axis(x)) == 0:
         return x, law
-    places = np.unique(np.concatenate([np.linspace(*_ends(axis.place(x)), 120), axis.place(x)]))
-    fine = axis.unplace(places)
+    # Evenly spaced on the axis, and through the settings themselves.
+    at = axis.to_axis(x)
+    fine = axis.from_axis(np.unique(np.concatenate([np.linspace(at.min(), at.max(), 120), at])))
     line = closed_form(fine, np.interp(fine, x, kd), np.interp(fine, x, other))
     return fine, np.asarray(line)
-
-
-def _ends(values: Array) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
-
-
-def finite(values: npt.ArrayLike) -> Array:
-    """Give the finite values, flattened."""
-    data = np.asarray(values, dtype=float).ravel()
-    return data[np.isfinite(data)]

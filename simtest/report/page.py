@@ -1,28 +1,28 @@
 """Writes the page of a run: figures as PNG, and one HTML file that needs nothing else."""
 
-from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-from simtest.pages import style
-from simtest.pages.html import environment, packed_plotly, picture
-from simtest.report import labels as words
-from simtest.report import static
-from simtest.report import triangle_cost as fineness
+from simtest.pages import chart_web, pixels, style
+from simtest.pages.html import environment
+from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
-from simtest.report.gallery import isophote_colour, isovalues
-from simtest.report.laws.section import laws_section
+from simtest.report.error_laws import is_tested, law_results, sentence
+from simtest.report.figure_files import FigureFiles
+from simtest.report.gallery import draw_gallery, isophote_keys
+from simtest.report.heat_maps import heat_charts, heat_maps
+from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
-from simtest.report.paper.section import paper_section
-from simtest.report.run_folder import Run, read_run
-from simtest.report.series import LineFigure, line_figures
-from simtest.report.surface3d import surface_3d
-from simtest.report.tables import SUMMARY_COLUMNS, heat_maps, summary_rows, surface_figure
+from simtest.report.paper.paper_section import paper_section
+from simtest.report.run_folder import ExperimentSummary, Run, read_run
+from simtest.report.series import line_chart, line_figures
+from simtest.report.summary_table import HEADINGS, table_rows
+from simtest.report.surface_errors import surface_chart, surface_errors
+from simtest.report.triangle_cost import fineness_charts, read_study
+from simtest.report.view3d import view_3d, view_json, view_picture
 from simtest.runtime.files import write_atomically
 
-_IMAGE_BUDGET = 1_350_000
-_FIRST = 9
-_MAX_HEAT_MAPS = 18
+_FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
 
 
 def write_report(run: Path) -> Path:
@@ -31,7 +31,7 @@ def write_report(run: Path) -> Path:
     Parameters
     ----------
     run : pathlib.Path
-        Run directory with results.parquet, summary.json and, if there is one, gallery/*.npz.
+        Run folder with results.parquet, summary.json and, if there is one, gallery/*.npz.
 
     Returns
     -------
@@ -45,130 +45,56 @@ def write_report(run: Path) -> Path:
     """
     data = read_run(Path(run))
     folder = data.path / "figures"
-    colours = style.colours(data.estimators)
-    if folder.is_dir():
-        for old in folder.glob("*.png"):
-            old.unlink()
-    with static.settings():
-        sections, charts = _sections(data, colours, folder)
-    html = _render(data, colours, sections, charts)
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob("*.png"):
+        old.unlink()
+    html = _render(data, folder)
     page = data.path / "index.html"
     write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 
-def _sections(run: Run, colours: Mapping[str, str], folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Draw everything once: PNG files as a side effect, the page's parts and its plotly figures as the value."""
-    from simtest.report import interactive
+def _render(run: Run, folder: Path) -> str:
+    """Compute and draw the sections of the page; one without data is empty or None."""
+    colours = style.colours(run.estimators)
+    with ThreadPoolExecutor(2) as pool:
+        # Frames are drawn beside the figures: most of their time is spent outside Python.
+        cards = pool.submit(draw_gallery, run.gallery, colours, folder)
+        figures = FigureFiles(folder, pool)
 
-    charts: dict[str, str] = {}
-    lines = line_figures(run)
-    for figure in lines:
-        static.save(static.draw_lines(figure, colours), folder / f"{figure.key}.png")
-        charts[figure.key] = interactive.to_json(interactive.lines(figure, colours))
-    sections: dict[str, Any] = {"headline": words.headline(run, lines), "lines": [_line_section(f) for f in lines]}
-    published = paper_section(run, colours, folder, picture)
-    if published:
-        sections["paper"] = published[0]
-        sections["headline"].append(published[0]["headline"])
-        charts |= published[1]
-    laws = laws_section(run, folder)
-    if laws:
-        sections["laws"] = laws[0]
-        sections["headline"].append(laws[0]["headline"])
-        charts |= laws[1]
-    maps = heat_maps(run)[:_MAX_HEAT_MAPS]
-    if maps:
-        static.save(static.draw_heat_maps(maps, colours), folder / "heatmap.png")
-        for i, item in enumerate(maps):
-            charts[f"heatmap_{i}"] = interactive.to_json(interactive.heat_map(item, maps))
-        sections["heat"] = [
-            {"key": f"heatmap_{i}", "title": f"{m.estimator}, {m.label}", "line": words.heat_line(m)}
-            for i, m in enumerate(maps)
-        ]
-    surfaces = surface_figure(run, has_figures=bool(lines or maps or published))
-    if surfaces:
-        sections["surfaces"] = surfaces
-        if surfaces.boxes:
-            static.save(static.draw_surfaces(surfaces, colours), folder / "anatomy.png")
-            charts["anatomy"] = interactive.to_json(interactive.surfaces(surfaces, colours))
-    sections["coverage"] = coverage(run)
-    if is_anatomical(run):
-        sections["fineness"] = _fineness_section(folder, charts)
-    sections["pairs"] = pairs(run)
-    paths = static.draw_gallery(run.gallery, colours, folder)
-    sections["gallery"] = _gallery_section(run, paths)
-    view = surface_3d(run)
-    if view:
-        path = static.save(static.draw_surface_3d(view, colours), folder / "surface3d.png", 110)
-        charts["surface3d"] = interactive.to_json(interactive.surface_3d(view, colours))
-        curved = view.curvature is not None
-        sections["view"] = {"title": view.title, "unit": view.unit, "curved": curved, "picture": picture(path, 120_000)}
-    return sections, charts
+        # Errors over one quantity and over two, and against their laws.
+        curves = line_figures(run)
+        lines = [(curve, figures.draw(curve.key, [line_chart(curve, colours)])[0]) for curve in curves]
+        paper, results = paper_section(run, colours, figures), law_results(run)
+        laws = figures.draw("laws", law_charts(results)) if is_tested(results) else []
+        maps = heat_maps(run)[:_MAX_HEAT_MAPS]
+        heat = figures.draw("heatmap", heat_charts(maps)) if maps else []
 
+        # What runs over anatomies show beside, and those without any curve.
+        surfaces = surface_errors(run, has_figures=bool(curves or maps or paper))
+        boxes = figures.draw("anatomy", [surface_chart(surfaces, colours)]) if surfaces and surfaces.boxes else []
+        study = read_study() if is_anatomical(run) else None
+        fineness = figures.draw("fineness", fineness_charts(study)) if study else []
+        view, still = view_3d(run, colours), ""
+        if view is not None:
+            picture = view_picture(view)
+            figures.write(view.key, picture)
+            figures.json[view.key] = view_json(view)
+            still = pixels.data_address(picture)
 
-def _line_section(figure: LineFigure) -> dict[str, Any]:
-    marks = style.symbols(figure.labels)
-    return {
-        "key": figure.key,
-        "title": figure.title,
-        "about": figure.about,
-        "measured": words.measured(figure),
-        "marks": [(marks[label].text, label) for label in figure.labels] if len(figure.labels) > 1 else [],
-        "binned": any(not curve.joined for curve in figure.curves),
-    }
-
-
-def _fineness_section(folder: Path, charts: dict[str, str]) -> dict[str, Any]:
-    from simtest.report import interactive
-
-    study = fineness.read_study()
-    static.save(fineness.draw(study), folder / "fineness.png")
-    charts["fineness"] = interactive.to_json(fineness.interactive(study))
-    marks = style.symbols(study.surfaces)
-    return {
-        "distance": study.distance_mm, "exponent": study.exponent, "sentence": study.sentence(),
-        "marks": [(marks[name].text, name) for name in study.surfaces],
-    }  # fmt: skip
-
-
-def _gallery_section(run: Run, paths: Sequence[Path]) -> list[dict[str, Any]]:
-    share = _IMAGE_BUDGET // max(len(paths), 1)
-    return [
-        {**words.gallery_caption(item), "picture": picture(path, min(share, 130_000)), "file": path.name}
-        for item, path in zip(run.gallery, paths, strict=True)
-    ]
-
-
-def _render(run: Run, colours: Mapping[str, str], sections: Mapping[str, Any], charts: Mapping[str, str]) -> str:
-    from markupsafe import Markup
-
-    content = run.experiments.get(run.experiment) or {}
-    template = environment().get_template("template.html.j2")
-    return template.render(
-        experiment=run.experiment,
-        title=content.get("title") or run.experiment,
-        description=content.get("description") or "",
-        headline=sections["headline"],
-        lines=sections["lines"],
-        paper=sections.get("paper"),
-        heat=sections.get("heat", []),
-        surfaces=sections.get("surfaces"),
-        coverage=sections["coverage"],
-        fineness=sections.get("fineness"),
-        laws=sections.get("laws"),
-        pairs=sections["pairs"],
-        gallery=sections["gallery"],
-        gallery_total=run.gallery_total,
-        first=_FIRST,
-        view=sections.get("view"),
-        summary=summary_rows(run),
-        columns=[heading for _, heading in SUMMARY_COLUMNS],
-        length_units=" or ".join(dict.fromkeys(item.length_unit for item in run.gallery)) or "mm",
-        provenance=words.provenance_rows(run),
-        colours={name: colours[name] for name in style.estimator_order(colours)},
-        truth_colour=style.TRUTH,
-        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(run.gallery)],
-        charts={key: Markup(text) for key, text in charts.items()},
-        plotly=packed_plotly() if charts else None,
-    )
+        headline = sentences.headline(run, curves)
+        headline += ([paper.headline] if paper else []) + ([sentence(results)] if laws else [])
+        summary = run.experiments.get(run.experiment) or ExperimentSummary()
+        template = environment().get_template("run.html.j2")
+        return template.render(
+            run=run, title=summary.title or run.experiment, description=summary.description, headline=headline,
+            paper=paper, laws=laws, law_results=results, law_colours=law_colours(results),
+            lines=[(curve, chart, sentences.measured(curve)) for curve, chart in lines],
+            heat=[(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
+            surfaces=surfaces, boxes=boxes, coverage=coverage(run), study=study, fineness=fineness, pairs=pairs(run),
+            gallery=cards.result(), first=_FIRST_CARDS, isophotes=isophote_keys(run.gallery), truth_colour=style.TRUTH,
+            view=view, still=still, summary=table_rows(run), columns=HEADINGS,
+            length_units=" or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
+            colours={name: colours[name] for name in style.estimator_order(colours)},
+            figures=figures.packed(), plotly=chart_web.packed_plotly() if figures.json else None,
+        )  # fmt: skip

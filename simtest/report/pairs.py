@@ -20,40 +20,20 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Pair:
-    """Two estimators over the highlights that both answered.
+    """Two estimators over the highlights that both answered; errors in deg."""
 
-    Parameters
-    ----------
-    label : str
-        Which curve's highlights, or `ALL`.
-    first, second : str
-        Names.
-    n : int
-        Highlights that both answered.
-    only_first, only_second : int
-        Those that one alone answered.
-    mean_first, mean_second : float or None
-        Mean errors over the n, deg.
-    difference : float or None
-        Mean of first less second, deg.
-    low, high : float or None
-        Its 95 % interval (Student's t); None with fewer than two.
-    first_better : int
-        Highlights where the first is nearer to the truth.
-    """
-
-    label: str
+    label: str  # which curve's highlights, or `ALL`
     first: str
     second: str
-    n: int
-    only_first: int
+    n: int  # highlights that both answered
+    only_first: int  # highlights that one alone answered
     only_second: int
-    mean_first: float | None
+    mean_first: float | None  # over the n
     mean_second: float | None
-    difference: float | None
-    low: float | None
+    difference: float | None  # mean of first less second
+    low: float | None  # its 95 % interval (Student's t); None with fewer than two
     high: float | None
-    first_better: int
+    first_better: int  # highlights where the first is nearer to the truth
 
     @property
     def better(self) -> str:
@@ -71,15 +51,7 @@ class Pair:
 def pairs(run: Run) -> list[Pair]:
     """Compare each two estimators by the errors of their proposed normals.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of Pair
-        Over all settings first, then label by label where there are several; empty for a single estimator.
+    The pairs over all settings come first, then label by label where there are several; a single estimator has none.
     """
     true = run.results.filter(pl.col("true_id").is_not_null())
     names = estimator_order(true["estimator"].drop_nulls().to_list())
@@ -98,7 +70,7 @@ def pairs(run: Run) -> list[Pair]:
 
 
 def _side_by_side(true: pl.DataFrame, names: list[str]) -> pl.DataFrame:
-    """Give a row a true highlight with each estimator's error; null where it did not answer."""
+    """Return a row for each true highlight with each estimator's error; null where it did not answer."""
     error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
     # A highlight may be found twice; the first detection counts for all estimators alike.
     columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]

@@ -1,19 +1,21 @@
-"""Reads a run directory: results.parquet, summary.json and the gallery."""
+"""Reads a run folder: results.parquet, summary.json and the gallery."""
 
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.pages.style import Array, degrees
 from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.paper import PaperSetting
 
 MAX_GALLERY = 24
 """Gallery items that a page shows; of a longer gallery, evenly spaced ones."""
@@ -25,78 +27,167 @@ _FLOAT = (
     "axis_ratio", "axis_ratio_law", "noise_sigma", "peak_snr", "distance_mm",
 )  # fmt: skip
 
+# What a run leaves out is null; it reads as empty.
+Text = Annotated[str, BeforeValidator(lambda value: value or "")]
+Pixel = tuple[float, float]
+Vector = tuple[float, float, float]
+
+
+def _listed(value: object) -> object:
+    return value or ()
+
+
+class KeptTruth(BaseModel):
+    """A true highlight of a kept frame: BP, px, normal and position, camera frame, and curvatures times distance."""
+
+    id: int | None = None
+    bp_px: Pixel | None = None
+    normal: Vector | None = None
+    position: Vector | None = None
+    kd_min: float | None = None
+    kd_max: float | None = None
+    isolated: bool = True
+
+
+class KeptIsophote(BaseModel):
+    """An isophote as it was traced, px."""
+
+    t: float
+    points: list[Pixel]
+
+
+class KeptEstimate(BaseModel):
+    """An estimate of a kept frame; without a normal where it failed."""
+
+    estimator: str
+    status: str  # "ok" or the failure's reason
+    specularity: int | None = None  # which detection
+    true_id: int | None = None  # the true highlight that it was matched to
+    bp_px: Pixel | None = None  # brightest point that was found
+    normal: Vector | None = None
+    candidates: Annotated[tuple[Vector, ...], BeforeValidator(_listed)] = ()
+    isophotes: Annotated[tuple[KeptIsophote, ...], BeforeValidator(_listed)] = ()
+    curves: Annotated[tuple[list[Pixel], ...], BeforeValidator(_listed)] = ()  # fitted ellipses, px
+    error_deg: float | None = None
+    error_oracle_deg: float | None = None
+
+    @property
+    def result(self) -> str:
+        """What the estimate came to: an error, a failure's reason or a false detection."""
+        ok, value, better = self.status == "ok", degrees(self.error_deg), degrees(self.error_oracle_deg)
+        if self.true_id is None:
+            return "false detection" if ok else f"{self.status} (false detection)"
+        told = len(self.normals) > 1 and better not in ("–", value)
+        return self.status if not ok else f"{value} (better candidate {better})" if told else value
+
+    @property
+    def normals(self) -> list[Array]:
+        """The candidates, or the single normal."""
+        single = () if self.normal is None else (self.normal,)
+        return [np.array(normal) for normal in self.candidates or single]
+
+
+class GalleryMeta(BaseModel):
+    """What a gallery item holds beside its pictures."""
+
+    camera: CameraSpec
+    truth: tuple[KeptTruth, ...] = ()
+    estimates: tuple[KeptEstimate, ...] = ()
+    surface: Text = ""
+    label: Text = ""
+    setting: Text = ""
+    sigma: float | None = None  # noise, share of full scale
+    command: Text = ""  # makes the frame again
+    why: Text = ""  # it is kept
+    length_unit: str = "mm"
+    lights: list[Vector] = []  # positions, camera frame
+    paper: PaperSetting | None = None  # of the published protocol, as all that follows
+    outer: tuple[int, int, int, int] = (0, 0, 0, 0)  # column, row, width and height of the picture's used part, px
+    peak_value: float | None = None  # of the smoothed picture; None where the realisation failed
+
 
 @dataclass(frozen=True)
 class GalleryItem:
-    """One frame of the gallery with its truth and estimates.
-
-    Parameters
-    ----------
-    name : str
-        Stem of the file.
-    frame : ndarray, shape (H, W) or (H, W, 3)
-        Share of full scale.
-    position, normal : ndarray, shape (h, w, 3)
-        Downsampled truth, camera frame, mm and unit; NaN where there is no surface.
-    camera : Camera
-        Calibration of the frame.
-    meta : mapping
-        The rest, as written by the run.
-    pictures : mapping
-        Further pictures by name: of the published protocol its stages.
-    """
+    """One frame of the gallery with its truth and estimates."""
 
     name: str
-    frame: npt.NDArray[np.float32]
-    position: npt.NDArray[np.float32]
+    frame: npt.NDArray[np.float32]  # share of full scale, shape (H, W) or (H, W, 3)
+    position: npt.NDArray[np.float32]  # downsampled truth, camera frame, shape (h, w, 3); NaN without a surface
     normal: npt.NDArray[np.float32]
     camera: Camera
-    meta: Mapping[str, Any]
-    pictures: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    meta: GalleryMeta
+    pictures: Mapping[str, npt.NDArray[np.float32]]  # further ones by name
 
     @property
-    def length_unit(self) -> str:
-        """Unit of the positions."""
-        return str(self.meta.get("length_unit") or "mm")
+    def title(self) -> str:
+        """Heading of the item."""
+        return self.meta.label or self.meta.surface or self.name
 
     @property
-    def truth(self) -> list[dict[str, Any]]:
-        """True highlights."""
-        return list(self.meta.get("truth") or [])
+    def missed(self) -> int:
+        """True highlights that no detection found."""
+        found = {estimate.true_id for estimate in self.meta.estimates}
+        return sum(truth.isolated and truth.id not in found for truth in self.meta.truth)
+
+    def true_highlight(self, estimate: KeptEstimate) -> KeptTruth | None:
+        """Return the true highlight that an estimate was matched to, if any."""
+        return next((t for t in self.meta.truth if t.id == estimate.true_id is not None), None)
+
+
+class EstimatorFigures(BaseModel):
+    """Figures of one setting and estimator in summary.json, with their headings; errors in deg."""
+
+    n: int | None = Field(None, title="rows")
+    n_ok: int | None = Field(None, title="ok")
+    n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda v: v or {})] = Field({}, title="failed")
+    n_missed: int | None = Field(None, title="missed")
+    n_false: int | None = Field(None, title="false")
+    mean_deg: float | None = Field(None, title="mean\u00a0°")
+    mean_oracle_deg: float | None = Field(None, title="mean, better candidate\u00a0°")
+    rms_deg: float | None = Field(None, title="RMS\u00a0°")
+    std_deg: float | None = Field(None, title="std\u00a0°")
+    median_deg: float | None = Field(None, title="median\u00a0°")
+    p95_deg: float | None = Field(None, title="95th pct\u00a0°")
+    max_deg: float | None = Field(None, title="max\u00a0°")
+    mean_penalised_deg: float | None = Field(None, title="mean, failures as\u00a090°")
+    ci95_deg: tuple[float | None, float | None] | None = Field(None, title="95\u00a0% interval\u00a0°")
+    coverage95: float | None = Field(None, title="coverage 95\u00a0%")
+
+
+class ExperimentSummary(BaseModel):
+    """An experiment of summary.json: figures by setting and estimator."""
+
+    title: Text = ""
+    description: Text = ""
+    settings: dict[str, dict[str, EstimatorFigures | None] | None] | None = None
 
     @property
-    def estimates(self) -> list[dict[str, Any]]:
-        """Estimates, one a specularity and estimator."""
-        return list(self.meta.get("estimates") or [])
+    def rows(self) -> list[tuple[str, str, EstimatorFigures]]:
+        """Setting, estimator and figures."""
+        return [
+            (setting, estimator, figures or EstimatorFigures())
+            for setting, by_estimator in (self.settings or {}).items()
+            for estimator, figures in (by_estimator or {}).items()
+        ]
 
-    def true_highlight(self, estimate: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Give the true highlight that an estimate was matched to, if any."""
-        return next((t for t in self.truth if t.get("id") == estimate.get("true_id") is not None), None)
+
+class Summary(BaseModel):
+    """summary.json; `run` is the provenance."""
+
+    run: dict[str, Any] | None = None
+    experiments: dict[str, ExperimentSummary] | None = None
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory in memory.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The directory.
-    results : polars.DataFrame
-        results.parquet with every column the report uses; numbers that are not finite are null.
-    summary : dict
-        summary.json.
-    gallery : tuple of GalleryItem
-        At most `MAX_GALLERY` items.
-    gallery_total : int
-        Items in the directory.
-    """
+    """A run folder in memory."""
 
     path: Path
-    results: pl.DataFrame
-    summary: dict[str, Any]
-    gallery: tuple[GalleryItem, ...]
-    gallery_total: int
+    results: pl.DataFrame  # with every column the report uses; numbers that are not finite are null
+    experiments: Mapping[str, ExperimentSummary] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    gallery: tuple[GalleryItem, ...] = ()  # at most `MAX_GALLERY` items
+    gallery_total: int = 0  # items in the folder
 
     @property
     def experiment(self) -> str:
@@ -105,18 +196,11 @@ class Run:
         return str(names[0]) if names else "run"
 
     @property
-    def experiments(self) -> dict[str, dict[str, Any]]:
-        """Experiments of summary.json by name."""
-        return dict(self.summary.get("experiments") or {})
-
-    @property
     def estimators(self) -> list[str]:
         """Estimator names in order of first appearance, from all three sources."""
         names = [str(n) for n in self.results["estimator"].drop_nulls().unique(maintain_order=True)]
-        for experiment in self.experiments.values():
-            for by_estimator in (experiment.get("settings") or {}).values():
-                names += list(by_estimator or {})
-        names += [str(e.get("estimator")) for item in self.gallery for e in item.estimates]
+        names += [estimator for experiment in self.experiments.values() for _, estimator, _ in experiment.rows]
+        names += [estimate.estimator for item in self.gallery for estimate in item.meta.estimates]
         return list(dict.fromkeys(names))
 
     @property
@@ -130,39 +214,28 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Read a run directory.
+    """Read a run folder: results.parquet, summary.json and, if there is one, gallery/*.npz.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        Directory with results.parquet, summary.json and, if there is one, gallery/*.npz.
-
-    Returns
-    -------
-    Run
-
-    Raises
-    ------
-    InputError
-        If a file is missing or malformed; the message names it.
+    Raises `InputError` if a file is missing or malformed; the message names it.
     """
     path = Path(path)
     files = sorted((path / "gallery").glob("[!.]*.npz"))
     count = min(len(files), MAX_GALLERY)
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, count).round().astype(int))] if count else []
-    items = varied([read_item(file) for file in chosen])
-    return Run(path, _read_results(path / "results.parquet"), _read_summary(path / "summary.json"), items, len(files))
+    results, summary = _read_results(path / "results.parquet"), _read_summary(path / "summary.json")
+    gallery = varied([read_item(file) for file in chosen])
+    return Run(path, results, summary.experiments or {}, flattened(summary.run or {}), gallery, len(files))
 
 
 def varied(items: list[GalleryItem]) -> tuple[GalleryItem, ...]:
     """Order frames so that the first ones show every label once: of each label the middle one, then the others."""
     by_label: dict[str, list[GalleryItem]] = {}
     for item in items:
-        by_label.setdefault(str(item.meta.get("label")), []).append(item)
+        by_label.setdefault(item.meta.label, []).append(item)
     turns: list[tuple[int, int, GalleryItem]] = []
-    for place, group in enumerate(by_label.values()):
+    for index, group in enumerate(by_label.values()):
         group.insert(0, group.pop(len(group) // 2))
-        turns += [(turn, place, item) for turn, item in enumerate(group)]
+        turns += [(turn, index, item) for turn, item in enumerate(group)]
     return tuple(item for _, _, item in sorted(turns, key=lambda entry: entry[:2]))
 
 
@@ -177,7 +250,7 @@ def _read_results(path: Path) -> pl.DataFrame:
 
 
 def completed(frame: pl.DataFrame) -> pl.DataFrame:
-    """Give rows of results with every column the report uses; numbers that are not finite become null."""
+    """Add the columns that the report uses and that are missing; numbers that are not finite become null."""
     columns: list[pl.Expr] = []
     types: tuple[tuple[tuple[str, ...], pl.DataType], ...] = (
         (_TEXT, pl.String()), (_WHOLE, pl.Int64()), (_FLOAT, pl.Float64()),
@@ -198,26 +271,39 @@ def completed(frame: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _read_summary(path: Path) -> dict[str, Any]:
+def _read_summary(path: Path) -> Summary:
     if not path.is_file():
         raise InputError(f"{path}: no such file; a run directory has results.parquet and summary.json")
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error})") from error
-    if not isinstance(summary, dict):
-        raise InputError(f"{path}: holds a {type(summary).__name__}; must be an object with run and experiments")
-    return summary
+        return Summary.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        what = error.errors()[0]
+        where = ".".join(str(part) for part in what["loc"])
+        raise InputError(
+            f"{path}: not readable JSON of a run ({where + ': ' if where else ''}{what['msg']})"
+        ) from error
+
+
+def flattened(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the entries of a table, and of tables within it, as text by name."""
+    made: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            made |= {f"{key}: {name}": str(entry) for name, entry in value.items()}
+        elif isinstance(value, list | tuple):
+            made[str(key)] = " ".join(str(entry) for entry in value)
+        else:
+            made[str(key)] = "–" if value is None else str(value)
+    return made
 
 
 def read_item(path: Path) -> GalleryItem:
     """Read one gallery item; raises `InputError` where the file is none."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            meta = json.loads(str(data["meta"][()]))
+            meta = GalleryMeta.model_validate_json(str(data["meta"][()]))
             pictures = {name: np.asarray(data[name], np.float32) for name in data.files if name != "meta"}
         frame, position, normal = (pictures.pop(name) for name in ("frame", "position", "normal"))
-        camera = CameraSpec(**meta["camera"]).model()
+        return GalleryItem(path.stem, frame, position, normal, meta.camera.model(), meta, pictures)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
-    return GalleryItem(path.stem, frame, position, normal, camera, meta, pictures)

@@ -1,11 +1,15 @@
-"""The figures of curves: computed once here, drawn by two thin backends (`static`, `interactive`)."""
+"""The figures of curves: means with intervals and laws over one quantity, as charts."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from simtest.pages.style import Axis, curvature_axis, estimator_order
+from simtest.pages.axes import Axis, curvature_axis, log_range
+from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel, label_keys
+from simtest.pages.style import NEUTRAL, Symbol, estimator_order, number, symbols
 from simtest.report.curves import Ask, Curve, gather, prepared, varies
 from simtest.report.run_folder import Run
 from simtest.spec.describe import describe_key, name_key
@@ -18,7 +22,7 @@ MOST_TITLE = 70
 """Characters of a description that fit under an axis."""
 
 _ERROR_TITLE = "angular error (deg)"
-
+_DASH = Symbol("_", "line-ew-open", "–")
 
 LEAST_LAW = 0.01
 """A law below this (deg, or axis ratio) predicts nothing that noise would leave visible."""
@@ -36,12 +40,21 @@ class LineFigure:
     curves: tuple[Curve, ...]
     empty: tuple[str, ...] = ()
     shared_law: bool = False
-    law_name: str = "law"
 
     @property
-    def labels(self) -> list[str]:
-        """Labels in order of appearance."""
-        return list(dict.fromkeys(curve.label for curve in self.curves))
+    def unit(self) -> str:
+        """Unit of y, as it stands behind a number."""
+        return "" if self.shared_law else "°"
+
+    @property
+    def rule(self) -> str:
+        """Within what a law is met."""
+        return "3 %" if self.shared_law else "0.3° or 3 %"
+
+    @property
+    def binned(self) -> bool:
+        """Whether some points are bins of highlights."""
+        return not all(curve.joined for curve in self.curves)
 
     @property
     def estimators(self) -> list[str]:
@@ -52,15 +65,7 @@ class LineFigure:
 def line_figures(run: Run) -> list[LineFigure]:
     """Compute the figures of curves for which the run has data.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of LineFigure
-        Keys error_vs_curvature, axis_ratio, error_vs_offset and error_vs_<parameter> for other swept parameters.
+    Their keys are error_vs_curvature, axis_ratio, error_vs_offset, and error_vs_<parameter> for other swept parameters.
     """
     rows = prepared(run)
     kd = "curvature times distance, k d"
@@ -91,7 +96,7 @@ def line_figures(run: Run) -> list[LineFigure]:
 
 
 def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigure]:
-    """Error against every other swept parameter whose values do not already show as curvature or offset."""
+    """Compute error against each swept parameter whose values do not already show as curvature or offset."""
     figures: list[LineFigure] = []
     # Sweeps of the published protocol have figures of their own.
     for name in (name for name in run.swept if not name.startswith("paper.")):
@@ -119,36 +124,75 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigu
 
 
 def _axis_title(name: str) -> str:
-    """Name a swept parameter with its unit, or by the start of its description where its name has none."""
+    """Return a swept parameter's name with its unit, or with the start of its description where it has none."""
     short, meaning = name_key(name), describe_key(name).split(";")[0]
     return short if short.endswith(")") or not meaning or len(meaning) > MOST_TITLE else f"{short}: {meaning}"
 
 
-def law_misses(figure: LineFigure) -> dict[str, tuple[int, int, float, str]]:
-    """Count, by estimator, the points of sweeps that meet their law.
+class LawMiss(NamedTuple):
+    """Points that meet their law, of how many; the largest departure, and its setting."""
+
+    met: int
+    total: int
+    worst: float
+    where: str
+
+
+def law_misses(figure: LineFigure) -> dict[str, LawMiss]:
+    """Count, by estimator, the points of sweeps that meet their law: errors in degrees, axis ratios by 3 % alone.
 
     Left out are means over many highlights of unlike curvature, and points where the law is 0: there the noise decides.
-
-    Parameters
-    ----------
-    figure : LineFigure
-        A figure of errors in degrees, or of axis ratios (3 % of the law alone).
-
-    Returns
-    -------
-    dict
-        (points within tolerance, points with a law, largest departure, where), by estimator.
     """
-    result: dict[str, tuple[int, int, float, str]] = {}
+    result: dict[str, LawMiss] = {}
+    floor = 0.0 if figure.shared_law else TOLERANCE_DEG
     for name in figure.estimators:
         gaps: list[tuple[float, bool, str]] = []
         for curve in (c for c in figure.curves if c.estimator == name and c.joined):
-            floor = 0.0 if figure.shared_law else TOLERANCE_DEG
             for y, law, where in zip(curve.y, curve.law_at, curve.names, strict=True):
                 if np.isfinite(law) and law > LEAST_LAW:
                     gap = float(abs(y - law))
                     gaps.append((gap, bool(gap <= max(floor, TOLERANCE_SHARE * law)), where))
         if gaps:
-            worst = max(gaps)
-            result[name] = (sum(met for _, met, _ in gaps), len(gaps), worst[0], worst[2])
+            worst, _, where = max(gaps)
+            result[name] = LawMiss(sum(met for _, met, _ in gaps), len(gaps), worst, where)
     return result
+
+
+def line_chart(data: LineFigure, colours: Mapping[str, str]) -> Chart:
+    """Describe a figure of curves: colour is the estimator, the symbol is the label, dashes are the law."""
+    shapes = symbols(curve.label for curve in data.curves)
+    laws = [_law_mark(data, curve, colours) for curve in data.curves if _has_law(curve, data.y)]
+    marks = [*laws, *(_points_mark(data, curve, colours, shapes[curve.label]) for curve in data.curves)]
+    if laws:
+        colour, width = NEUTRAL, 1.5
+        marks.append(Mark(NOTHING, NOTHING, colour, "law", line="dash", width=width))
+    # Laws may leave the range of what was measured.
+    limits = log_range([part for c in data.curves for part in (c.y, c.low, c.high)])
+    y = replace(data.y, limits=limits) if data.y.scale == "log" else data.y
+    return Chart(data.key, data.title, (Panel(data.x, y, tuple(marks)),), 460, label_keys(shapes))
+
+
+def _has_law(curve: Curve, axis: Axis) -> bool:
+    """Whether a curve's law shows: a law of zero is nowhere on a logarithmic axis."""
+    return bool(np.isfinite(axis.visible(curve.law_y)).any())
+
+
+def _law_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str]) -> Mark:
+    return Mark(
+        curve.law_x, curve.law_y, NEUTRAL if data.shared_law else colours[curve.estimator], curve.estimator,
+        listed=False, line="dash" if curve.joined else "", width=1.5, symbol=None if curve.joined else _DASH, size=9,
+        hover=f"law, {curve.label}\n{{x}}: {{y}}",
+    )  # fmt: skip
+
+
+def _points_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str], symbol: Symbol) -> Mark:
+    columns = (curve.names, curve.x, curve.y, curve.low, curve.high, curve.law_at, curve.counts)
+    hover = [
+        f"{curve.estimator}, {curve.label}\n{name}\nx = {number(x)}, mean {number(y)}{data.unit} "
+        f"[{number(low)}, {number(high)}]\nlaw {number(law)}, {count} rows"
+        for name, x, y, low, high, law, count in zip(*columns, strict=True)
+    ]
+    return Mark(
+        curve.x, curve.y, colours[curve.estimator], curve.estimator, line="solid" if curve.joined else "", width=0.7,
+        symbol=symbol, bars=Bars(curve.low, curve.high, 1.2), hover=hover,
+    )  # fmt: skip

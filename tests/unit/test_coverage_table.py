@@ -29,11 +29,11 @@ ROWS = [
 def test_found_missed_false_and_laws_are_counted():
     schema = {name: pl.Float64 for name in ("error_oracle_deg", "error_law_deg", "axis_ratio", "axis_ratio_law")}
     tables = coverage(SimpleNamespace(results=pl.DataFrame(ROWS, schema_overrides=schema)))
-    (found,) = tables.found
+    (found,) = tables.found.rows(named=True)
     assert (found["true"], found["found"], found["missed"], found["false"]) == (4, 3, 1, 1)
     assert found["coverage"] == 0.75
     assert found["false_share"] == 0.25
-    error, ratio = tables.laws
+    error, ratio = tables.laws.rows(named=True)
     assert (error["measure"], error["n"], error["met"]) == ("error", 2, 1)
     assert error["median_gap"] == pytest.approx(0.55)
     assert (ratio["measure"], ratio["n"], ratio["met"]) == ("axis ratio", 2, 1)

@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 
 from simtest.errors import InputError
-from simtest.report.laws.judge import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
-from simtest.report.laws.section import laws_section
+from simtest.pages import chart_png
+from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
+from simtest.report.law_charts import law_charts
 from simtest.report.pairs import ALL, NONE, pairs
 from simtest.spec import load_experiment
 from simtest.validation import laws
@@ -94,11 +95,14 @@ def test_the_branch_point_is_held_against_the_rows_own_ratio_and_a_slope_of_half
 
 
 def test_runs_that_name_no_law_have_no_section(tmp_path):
-    assert laws_section(run_of(offset("s", 0.3, 0.3, laws=None)), tmp_path) is None
-    section, charts = laws_section(run_of(offset("s", 0.3, 0.3)), tmp_path)
-    assert (tmp_path / "laws.png").is_file()
-    assert len(section["table"]) == len(LAWS)
-    assert set(charts) == {"laws_angles", "laws_departures"}
+    assert law_results(run_of(offset("s", 0.3, 0.3, laws=None))) == []
+    results = law_results(run_of(offset("s", 0.3, 0.3)))
+    assert len(results) == len(LAWS)
+    charts = law_charts(results)
+    assert [chart.key for chart in charts] == ["laws_angles", "laws_departures"]
+    whole, parts = chart_png.draw(charts)
+    assert len(parts) == 2
+    assert whole.shape[1] == sum(part.shape[1] for part in parts)
 
 
 def test_the_experiment_tests_every_law():

@@ -178,7 +178,7 @@ def test_links_lead_to_their_sections(page):
 
 def test_one_experiment_is_shown_at_a_time(page):
     choice = page.locator("[data-switch=curvature]")
-    shown = page.locator("figure[data-of=curvature]:visible")
+    shown = page.locator("[data-of=curvature]:visible")
     assert shown.count() == 1
     last = choice.locator("option").last.get_attribute("value")
     choice.select_option(last)

@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 import polars as pl
 import pytest
-from plotly.offline import get_plotlyjs
 from test_report import EVIL, make_item, make_rows
 
 from benchmarks.nights import history_of, run_of, verdict_of
@@ -22,6 +21,7 @@ from simtest.nightly.page.run_tables import comparisons
 from simtest.nightly.page.trends import COSTS, MEDIAN, NEWEST, trends
 from simtest.nightly.phrases import bounds, headline_sentence, measure, short_commit, signed
 from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.pages.chart_web import BUNDLE
 from simtest.pages.style import colours
 from simtest.validation.results_table import SCHEMA
 
@@ -114,7 +114,7 @@ def test_the_page_stands_alone_and_is_sound_html(whole):
         r'http-equiv|<script type="application/json".*?</script>', "", without_scripts, flags=re.S
     )
     (packed,) = re.findall(r'<script type="application/octet-stream" id="plotly-packed">(.*?)</script>', text)
-    assert zlib.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
+    assert zlib.decompress(base64.b64decode(packed)) == zlib.decompress(BUNDLE.read_bytes())
 
 
 def test_the_page_can_be_read_without_eyes_or_mouse(whole):
@@ -381,8 +381,8 @@ def with_ladder(night, values):
 def test_the_ladder_names_the_step_that_takes_most_away(tmp_path, night):
     made = with_ladder(night, {"as it is": 1.0, "no noise": 0.9, "exact contour": 0.1, "exact pose": 0.0})
     found = ladder(made, colours(["cone_axis"]))
-    assert found.rows[0]["blame"] == "exact contour (80\u00a0%)"
-    drawn = json.loads(found.chart)["data"][0]["y"]
-    assert min(drawn) == FLOOR_DEG
+    assert found.rows[0].blame == "exact contour (80\u00a0%)"
+    (mark,) = found.chart.panels[0].marks
+    assert min(mark.y) == FLOOR_DEG
     _, page = written(tmp_path, made, verdict_of(night))
     assert "about exact contour" in page.text

@@ -7,16 +7,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.pages import style
-from simtest.report import interactive as plotly_base
-from simtest.report import static as base
+from simtest.pages import chart_png, chart_web, style
 from simtest.report import write_report
-from simtest.report.paper import interactive, static
 from simtest.report.paper.fits import line, offset_inside_window
-from simtest.report.paper.isocurves import KAPPA, OFFSET_LIGHT, isocurve_figure
+from simtest.report.paper.isocurve_figure import KAPPA, OFFSET_LIGHT, isocurve_figure
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.paper.stages import stages
 from simtest.report.paper.statements import ABSENT, AGREES, DIFFERS, FEW, PART, statements
+from simtest.report.paper.sweep_chart import BOUND_NAME, LAW_NAME, sweep_chart
 from simtest.report.paper.sweeps import sweep_figures
 from simtest.report.run_folder import read_run
 from simtest.report.series import line_figures
@@ -109,33 +107,38 @@ def test_error_plots_hold_the_rows(tmp_path):
     assert "no_closed_isophote 3" in figures[1].sweeps[0].reasons
 
 
-def test_both_drawings_hold_bars_bound_law_and_failures(tmp_path):
+def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
     rows = rows_of("slant", "theta_deg", MEANS["theta_deg"], failures=5, law=lambda x: 0.01 * x)
     (figure,) = sweep_figures(run_of(tmp_path, rows))
     (sweep,) = figure.sweeps
-    drawn = interactive.sweep(figure, COLOURS)
-    assert json.loads(plotly_base.to_json(drawn))["layout"]["yaxis"]["title"]["text"].endswith("(deg)")
-    bars = {trace.name.rsplit(", ", 1)[-1]: trace for trace in drawn.data if trace.error_y.array is not None}
-    np.testing.assert_allclose(bars["least to largest"].error_y.array, sweep.largest - sweep.mean)
-    np.testing.assert_allclose(bars["least to largest"].error_y.arrayminus, sweep.mean - sweep.least)
-    np.testing.assert_allclose(bars["± std"].error_y.array, sweep.std)
-    assert bars["± std"].error_y.thickness > 3 * bars["least to largest"].error_y.thickness
-    named = {trace.name: trace for trace in drawn.data}
-    np.testing.assert_allclose(named[static.BOUND_NAME].y, sweep.bound)
-    np.testing.assert_allclose(named[static.LAW_NAME].y, 0.01 * sweep.x)
-    strip = next(trace for trace in drawn.data if trace.yaxis == "y2")
-    assert list(strip.text) == ["<b>5</b>"] * 3
-    assert "5 of 40 failed: no_closed_isophote 5" in strip.hovertext[0]
-    with base.settings():
-        picture = static.draw_sweep(figure, COLOURS)
-        upper, lower = picture.axes
-        caps = [array.get_ydata() for array in upper.lines if array.get_marker() in ("_", 2, 3)]
-        assert any(np.allclose(y, sweep.largest) for y in caps)
-        assert any(np.allclose(y, sweep.least) for y in caps)
-        assert [text.get_text() for text in lower.texts] == ["5"] * 3
-        assert upper.get_ylabel() == "error of the better candidate (deg)"
-        assert lower.get_xlabel() == "slant θ (deg)"
-        base.save(picture, tmp_path / "slant.png")
+    chart = sweep_chart(figure, COLOURS)
+    upper, lower = chart.panels
+    thin, thick, means = (mark for mark in upper.marks if mark.name == "circle_pose: slant")
+    np.testing.assert_allclose(thin.bars[:2], [sweep.least, sweep.largest])
+    np.testing.assert_allclose(thick.bars.high - sweep.mean, sweep.std)
+    assert thick.bars.width > 3 * thin.bars.width
+    np.testing.assert_allclose(means.y, sweep.mean)
+    named = {mark.name: mark for mark in upper.marks}
+    np.testing.assert_allclose(named[BOUND_NAME].y, sweep.bound)
+    np.testing.assert_allclose(named[LAW_NAME].y, 0.01 * sweep.x)
+    (failures, *_) = (mark for mark in lower.marks if len(mark.words))
+    assert list(failures.words) == ["5"] * 3
+    assert failures.bold
+    assert "5 of 40 failed: no_closed_isophote 5" in failures.hover[0]
+    assert (upper.y.title, lower.x.title) == ("error of the better candidate (deg)", "slant θ (deg)")
+    drawn = chart_web.figure(chart)
+    assert drawn["layout"]["yaxis"]["title"]["text"].endswith("(deg)")
+    spread = [trace["error_y"] for trace in drawn["data"] if "error_y" in trace]
+    np.testing.assert_allclose(spread[0]["array"], sweep.largest - sweep.mean, rtol=1e-4)
+    np.testing.assert_allclose(spread[0]["arrayminus"], sweep.mean - sweep.least, rtol=1e-4)
+    np.testing.assert_allclose(spread[1]["array"], sweep.std, rtol=1e-4)
+    strip = next(trace for trace in drawn["data"] if trace["yaxis"] == "y2")
+    assert strip["text"] == ["<b>5</b>"] * 3
+    picture, (part,) = chart_png.draw([chart])
+    assert picture.shape == part.shape
+    # Ink of the curve, of the bound and of the failures.
+    for colour in (COLOURS["circle_pose"], "#8A6D00", "#D03030"):
+        assert (np.abs(picture.astype(int) - style.rgb(colour)).max(axis=-1) < 8).sum() > 20, colour
 
 
 def test_a_run_that_agrees_gets_agrees(tmp_path):
@@ -269,7 +272,7 @@ def test_the_pages_sections_and_files(small):
 
 def test_the_kept_realisation_is_that_of_its_row(small):
     run = read_run(small.folder)
-    assert {item.meta["label"] for item in run.gallery} == {"noise", "steep", "offset", "defaults"}
+    assert {item.meta.label for item in run.gallery} == {"noise", "steep", "offset", "defaults"}
     shown = stages(run)
     assert shown.is_default
     row = small.results.filter((pl.col("label") == "defaults") & (pl.col("estimator") == "circle_pose")).row(
@@ -282,20 +285,20 @@ def test_the_kept_realisation_is_that_of_its_row(small):
     centre = np.mean(shown.ellipse[:-1], axis=0)
     assert shown.extent[0] < centre[0] < shown.extent[1]
     for item in run.gallery:
-        (true,) = item.truth
-        np.testing.assert_allclose(item.camera.project(np.array(true["position"])), true["bp_px"])
+        (true,) = item.meta.truth
+        np.testing.assert_allclose(item.camera.project(np.array(true.position)), true.bp_px)
         on_plane = item.position[np.isfinite(item.position).all(axis=-1)]
-        np.testing.assert_allclose((on_plane - true["position"]) @ true["normal"], 0, atol=1e-2)
-        failed = item.estimates[0]["status"] != "ok"
-        assert failed == (item.meta["label"] == "steep")
+        np.testing.assert_allclose((on_plane - true.position) @ true.normal, 0, atol=1e-2)
+        failed = item.meta.estimates[0].status != "ok"
+        assert failed == (item.meta.label == "steep")
 
 
 def test_the_printed_command_makes_the_realisation_again(small, capsys):
     run = read_run(small.folder)
-    item = next(item for item in run.gallery if item.meta["label"] == "offset")
-    code = re.fullmatch(r'python -c "(.*)"', item.meta["command"]).group(1)
+    item = next(item for item in run.gallery if item.meta.label == "offset")
+    code = re.fullmatch(r'python -c "(.*)"', item.meta.command).group(1)
     exec(code.replace("print(", "made = (", 1), space := {})
-    np.testing.assert_allclose(space["made"]["circle_pose"][0].normal, item.estimates[0]["normal"], atol=1e-12)
+    np.testing.assert_allclose(space["made"]["circle_pose"][0].normal, item.meta.estimates[0].normals[0], atol=1e-12)
 
 
 def test_another_setting_is_shown_where_no_default_was_run(small, tmp_path):

@@ -1,7 +1,9 @@
-"""The report of a run, on small synthetic run directories."""
+"""The report of a run, on small synthetic run folders."""
 
+import base64
 import json
 import re
+import zlib
 from html.parser import HTMLParser
 
 import numpy as np
@@ -10,14 +12,13 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.pages.style import Axis, colours, number
+from simtest.pages.axes import Axis
+from simtest.pages.style import colours, number
 from simtest.report import write_report
-from simtest.report.interactive import surface_3d as interactive_surface
+from simtest.report.heat_maps import heat_maps, heat_range
 from simtest.report.run_folder import read_run
 from simtest.report.series import law_misses, line_figures
-from simtest.report.static import heat_range
-from simtest.report.surface3d import surface_3d
-from simtest.report.tables import heat_maps
+from simtest.report.view3d import view_3d, view_json
 from simtest.validation import laws
 
 ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
@@ -223,6 +224,13 @@ def read_page(path):
     return page
 
 
+def charts_of(page):
+    """The page's figures as its script finds them: plotly's JSON by key."""
+    html = page.read_text(encoding="utf-8")
+    (packed,) = re.findall(r'<script type="application/octet-stream" id="figures-packed">(.*?)</script>', html)
+    return json.loads(zlib.decompress(base64.b64decode(packed)))
+
+
 def png_size(path):
     with path.open("rb") as file:
         head = file.read(24)
@@ -253,14 +261,14 @@ def test_overview_page_has_its_sections(overview):
 def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
     path = make_run(tmp_path, items=0)
     make_item(path / "gallery" / "item_00.npz", radius=4.0, curved=True)
-    view = surface_3d(read_run(path))
+    view = view_3d(read_run(path), colours(ESTIMATORS))
     np.testing.assert_allclose(view.curvature, 0.25, rtol=1e-3)
     assert view.curvature.shape == view.intensity.shape
     assert view.curvature_limit == pytest.approx(0.25, rel=1e-3)
-    figure = interactive_surface(view, colours(ESTIMATORS))
-    assert [trace.visible for trace in figure.data if trace.type == "mesh3d"] == [False, True]
-    assert [button.label for button in figure.layout.updatemenus[0].buttons] == ["curvature", "picture"]
-    (light,) = [trace for trace in figure.data if trace.name == "light"]
+    figure = view_json(view)
+    assert [trace.get("visible", True) for trace in figure["data"] if trace["type"] == "mesh3d"] == [False, True]
+    assert [button["label"] for button in figure["layout"]["updatemenus"][0]["buttons"]] == ["curvature", "picture"]
+    (light,) = [trace for trace in figure["data"] if trace["name"] == "light"]
     assert [light[axis][0] for axis in "xyz"] == [1.0, 2.0, 0.0]
     page = write_report(path)
     assert "coloured by its curvature" in page.read_text(encoding="utf-8")
@@ -278,10 +286,9 @@ def test_overview_figures_are_written(overview):
 
 
 def test_overview_charts_are_data_of_both_kinds(overview):
-    html = overview[1].read_text(encoding="utf-8")
-    charts = dict(re.findall(r'<script type="application/json" id="data-(\w+)">(.*?)</script>', html, re.S))
+    charts = charts_of(overview[1])
     assert set(charts) == {"error_vs_curvature", "axis_ratio", "error_vs_offset", "surface3d"}
-    kinds = {trace["type"] for text in charts.values() for trace in json.loads(text)["data"]}
+    kinds = {trace["type"] for chart in charts.values() for trace in chart["data"]}
     assert kinds == {"scatter", "mesh3d", "scatter3d"}
 
 
@@ -446,7 +453,7 @@ def test_surface_without_truth_or_pixels(tmp_path):
     content |= {"meta": json.dumps(meta), "position": content["position"] * np.nan}
     np.savez(tmp_path / "gallery" / "a.npz", **content)
     make_run(tmp_path, "noise", items=0)
-    assert surface_3d(read_run(tmp_path)) is None
+    assert view_3d(read_run(tmp_path), {}) is None
     assert "surface3d" not in read_page(write_report(tmp_path)).ids()
 
 
@@ -457,7 +464,10 @@ def test_style():
     texts = [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)]
     assert texts == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
     axis = Axis("x", "stretched")
-    np.testing.assert_allclose(axis.unplace(axis.place([-0.5, 0, 3])), [-0.5, 0, 3], atol=1e-12)
-    places, texts = axis.ticks([-0.5, 2])
-    assert "0" in texts
-    assert len(places) == len(texts)
+    np.testing.assert_allclose(axis.from_axis(axis.to_axis([-0.5, 0, 3])), [-0.5, 0, 3], atol=1e-12)
+    ends = axis.ends([[-0.5, 2]])
+    assert ends[0] < axis.to_axis(-0.5)
+    assert ends[1] > axis.to_axis(2)
+    ticks = dict(axis.ticks(*ends))
+    assert {"−0.3", "0", "1"} <= set(ticks.values())
+    assert all(ends[0] <= at <= ends[1] for at in ticks)

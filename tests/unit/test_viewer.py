@@ -21,7 +21,7 @@ def test_content_is_the_scene(content):
     np.testing.assert_allclose(content.curvature, 0.2, rtol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(content.vertices - [0, 0, 15.0], axis=1), 5.0, atol=1e-4)
     assert content.faces.max() < len(content.vertices)
-    assert len(content.places) == 1
+    assert len(content.highlights) == 1
     assert set(content.estimator) == {"circle_pose", "brightest_point", "cone_axis"}
     cone = content.estimates[content.estimator == "cone_axis"]
     assert float(cone[0] @ content.normals[0]) > 0.99999

@@ -8,13 +8,13 @@ import polars as pl
 from simtest.nightly import phrases
 from simtest.nightly.page import run_tables as tables
 from simtest.nightly.page.error_figures import error_figures
-from simtest.nightly.page.ladder_figures import ladder, marks_of
+from simtest.nightly.page.ladder_figures import ladder
 from simtest.nightly.page.trends import MEDIAN, NEWEST, Trends, trends
-from simtest.nightly.page.worst_cases import draw_cases, read_cases
+from simtest.nightly.page.worst_cases import read_cases
 from simtest.nightly.records import JudgedRun, Verdict
-from simtest.pages import style
-from simtest.pages.html import environment, packed_plotly, script_json
-from simtest.report.gallery import isophote_colour, isovalues
+from simtest.pages import chart_web, style
+from simtest.pages.html import environment, script_json
+from simtest.report.gallery import draw_gallery, isophote_keys
 from simtest.report.run_folder import GalleryItem
 from simtest.runtime.files import write_atomically
 
@@ -55,10 +55,8 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
     items, unread = read_cases(judged)
     past = trends(judged.history, run)
     colours = style.colours(_estimators(judged, items, past))
-    groups, charts = error_figures(run, colours)
-    steps = ladder(run, colours)
-    if steps:
-        charts["ladder"] = steps.chart
+    groups, steps = error_figures(run, colours), ladder(run, colours)
+    charts = [figure.chart for group in groups for figure in group.figures] + ([steps.chart] if steps else [])
     # Fill in
     return environment().get_template("nightly.html.j2").render(
         title=f"Nightly accuracy, {record.profile} profile",
@@ -78,9 +76,8 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         newest=NEWEST,
         groups=groups,
         ladder=steps,
-        ladder_marks=[] if steps is None else marks_of(steps),
-        gallery=draw_cases(items, colours, figures),
-        isophotes=[(t, style.hexadecimal(isophote_colour(t))) for t in isovalues(items)],
+        gallery=draw_gallery(items, colours, figures),
+        isophotes=isophote_keys(items),
         truth_colour=style.TRUTH,
         results=tables.results(run),
         results_apart=tables.results(run, apart=True),
@@ -89,8 +86,8 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         provenance=tables.provenance(judged),
         files=files,
         colours={name: colours[name] for name in style.estimator_order(_names(run.rows))},
-        charts={key: Markup(text) for key, text in charts.items()},
-        plotly=packed_plotly() if charts or past else None,
+        figures=chart_web.packed({chart.key: chart_web.figure(chart) for chart in charts}),
+        plotly=chart_web.packed_plotly() if charts or past else None,
     )  # fmt: skip
 
 
@@ -101,7 +98,7 @@ def _names(table: pl.DataFrame) -> list[str]:
 def _estimators(judged: JudgedRun, items: Iterable[GalleryItem], past: Trends | None) -> list[str]:
     """Return all names that need a colour."""
     names = [*_names(judged.run.rows), *_names(judged.run.figures), *_names(judged.verdict.comparisons)]
-    names += [str(estimate.get("estimator")) for item in items for estimate in item.estimates]
+    names += [estimate.estimator for item in items for estimate in item.meta.estimates]
     return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
 
 

@@ -8,7 +8,7 @@ from simtest.nightly.gate.quantities import COVERED
 from simtest.nightly.phrases import MEANINGS, bounds, interval, joined, measure, signed
 from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 from simtest.pages.style import estimator_order, number
-from simtest.report.labels import flattened
+from simtest.report.run_folder import flattened
 
 MOST_ROWS = 800
 """Rows of the table; equal and equivalent ones are left out first. verdict.json holds all."""

@@ -46,40 +46,19 @@ _NAMES_BYTES, _NIGHT_BYTES = 45, 50
 
 @dataclass(frozen=True)
 class Trends:
-    """The curves of a page.
+    """The curves of a page."""
 
-    Parameters
-    ----------
-    data : dict
-        What the page's script unpacks.
-    nights, left_out : int
-        How many nights are shown, and how many older ones there was no room for.
-    points : int
-        Most points of a curve; fewer than `nights` where the curves are thinned.
-    """
-
-    data: dict[str, Any]
-    nights: int
-    left_out: int
-    points: int
+    data: dict[str, Any]  # JSON that the page's script unpacks
+    nights: int  # that are shown
+    left_out: int  # older ones that there was no room for
+    points: int  # most points of a curve; fewer than `nights` where the curves are thinned
 
 
 def trends(history: pl.DataFrame, night: NightlyRun, budget: int = BUDGET_BYTES) -> Trends | None:
-    """Pack the history of a night's profile, the night included.
+    """Pack the history of a night's profile, the night included, into a number of bytes.
 
-    Parameters
-    ----------
-    history : polars.DataFrame
-        Rows of the history's files, `HISTORY_COLUMNS` at least; may be empty, and may hold the night already.
-    night : NightlyRun
-        Tonight's.
-    budget : int
-        Bytes for the packed curves.
-
-    Returns
-    -------
-    Trends or None
-        None where no night has a figure.
+    The history holds rows of the history's files, `HISTORY_COLUMNS` at least; it may be empty, and may hold the night
+    already. Returns None where no night has a figure.
     """
     rows = _held(history, night)
     if rows.is_empty():
@@ -97,7 +76,7 @@ def trends(history: pl.DataFrame, night: NightlyRun, budget: int = BUDGET_BYTES)
 
 
 def _held(history: pl.DataFrame, night: NightlyRun) -> pl.DataFrame:
-    """Give the numbers of all nights of the profile, `HISTORY_COLUMNS`, a night's rows together."""
+    """Return the numbers of all nights of the profile, `HISTORY_COLUMNS`, a night's rows together."""
     run = night.record
     parts = []
     if not history.is_empty():
@@ -116,7 +95,7 @@ _TIME = pl.Datetime("us", "UTC")
 
 
 def _numbered(rows: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Add the number of the night, by time, to the rows; gives them and the nights."""
+    """Add the number of the night, by time, to the rows; returns them and the nights."""
     # Runs of equal names are found at a fraction of what a join on millions of names takes.
     stretch = rows["run_id"].rle_id()
     starts = np.flatnonzero(np.diff(stretch.to_numpy(), prepend=-1))
@@ -127,7 +106,7 @@ def _numbered(rows: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
 
 
 def _matrix(rows: pl.DataFrame, nights: int) -> tuple[pl.DataFrame, Array]:
-    """Give the curves' keys and their values, shape (curves, nights); NaN where a night has none."""
+    """Return the curves' keys and their values, shape (curves, nights); NaN where a night has none."""
     groups = rows.group_by(_KEY, maintain_order=True).agg("night", "value")
     values = np.full((groups.height, nights), np.nan)
     index = np.repeat(np.arange(groups.height), groups["night"].list.len().to_numpy())
@@ -136,7 +115,7 @@ def _matrix(rows: pl.DataFrame, nights: int) -> tuple[pl.DataFrame, Array]:
 
 
 def _named(keys: pl.DataFrame) -> pl.DataFrame:
-    """Give what the curves are called: costs stand together, each experiment a curve."""
+    """Name the curves: costs stand together, each experiment a curve."""
     cost = pl.col("kind") == "cost"
     # A name that does not apply is null or empty.
     keys = keys.with_columns(pl.col(pl.String).replace("", None))
@@ -166,7 +145,7 @@ def _with_medians(keys: pl.DataFrame, values: Array) -> tuple[pl.DataFrame, Arra
 
 
 def _median(values: Array) -> Array:
-    """Give the median over rows of each column that has a value."""
+    """Return the median over rows of each column that has a value."""
     made = np.full(values.shape[1], np.nan)
     held = np.isfinite(values).any(axis=0)
     made[held] = np.nanmedian(values[:, held], axis=0)
@@ -174,12 +153,12 @@ def _median(values: Array) -> Array:
 
 
 def _changing(values: Array) -> Mask:
-    """Tell which curves are no level lines: the others need no values."""
+    """Return which curves are no level lines: the others need no values."""
     return np.asarray(np.nanmax(values, axis=1) > np.nanmin(values, axis=1))
 
 
 def _room(values: Array, budget: int) -> int:
-    """Give for how many nights there is room where each curve has the least number of points."""
+    """Return for how many nights there is room where each curve has the least number of points."""
     curves, nights = values.shape
     changing = int(np.count_nonzero(_changing(values)))
     left = budget - curves * _NAMES_BYTES - changing * LEAST_POINTS * 8 / 3
@@ -187,7 +166,7 @@ def _room(values: Array, budget: int) -> int:
 
 
 def _points(values: Array, budget: int) -> int:
-    """Give how many points a curve may have: 2 bytes each, and a bit a night; 4 characters hold 3 bytes."""
+    """Return how many points a curve may have: 2 bytes each, and a bit a night; 4 characters hold 3 bytes."""
     curves, nights = values.shape
     changing = max(int(np.count_nonzero(_changing(values))), 1)
     left = budget - curves * _NAMES_BYTES - changing * nights / 6 - nights * _NIGHT_BYTES

@@ -49,16 +49,10 @@ SMOOTHING = (
 
 
 def exponent_slope(sweep: Sweep, law_slope: float, published: float) -> str:
-    """Say where the slope against the exponent comes from.
+    """Explain where the slope against the exponent comes from.
 
-    Parameters
-    ----------
-    sweep : Sweep
-        The sweep.
-    law_slope : float
-        Slope of the smoothing's predicted bias, deg per unit; NaN where there is no law.
-    published : float
-        Slope that the article reports, deg per unit.
+    `law_slope` is that of the smoothing's predicted bias, NaN where there is no law, `published` that of the article;
+    deg per unit.
     """
     if not law_slope > 0:
         return (

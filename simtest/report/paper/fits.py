@@ -1,43 +1,27 @@
 """Straight lines through means, and where the texture's window begins to cut the isophote."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.geometry.isocurves import isophote_radius
+from simtest.pages.style import Array
+from simtest.report.paper.sweeps import Value
 
-Array = npt.NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Line:
-    """A least-squares line.
-
-    Parameters
-    ----------
-    slope, error : float
-        Slope and its standard error, from the means' standard errors; NaN where one of these is unknown.
-    worst : float
-        Largest distance of a mean from the line.
-    """
+class Line(NamedTuple):
+    """A least-squares line."""
 
     slope: float
-    error: float
-    worst: float
+    error: float  # standard error of the slope, from the means'; NaN where one of these is unknown
+    worst: float  # largest distance of a mean from the line
 
 
 def line(x: Array, y: Array, error: Array | None = None) -> Line:
-    """Fit a line to means by ordinary least squares; points without a finite mean are left out.
+    """Fit a line to means at two x or more by ordinary least squares; `error` are their standard errors, independent.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (n,)
-        At least two of different x.
-    error : ndarray, shape (n,), optional
-        Standard errors of y, independent.
+    Points without a finite mean are left out.
     """
     known = np.isfinite(y)
     x, y = x[known], y[known]
@@ -48,22 +32,13 @@ def line(x: Array, y: Array, error: Array | None = None) -> Line:
     return Line(slope, spread, worst)
 
 
-def offset_inside_window(fixed: Mapping[str, Any]) -> float:
-    """Give the light offset up to which the isophote's circle stays inside a window at the camera's foot.
+def offset_inside_window(fixed: Mapping[str, Value]) -> float:
+    """Return the light offset, texture units, up to which the isophote stays inside a window at the camera's foot.
 
-    The BP lies at most eps V_Z / (2 V_Z - eps / 2) from the foot (the light at its lowest), and the isophote's radius
-    about it is close to r-.
-
-    Parameters
-    ----------
-    fixed : mapping
-        `isovalue`, `exponent`, `height` and `size` of the sweep.
-
-    Returns
-    -------
-    float
-        Texture units.
+    `fixed` are the sweep's parameters: isovalue, exponent, height and size. The BP lies at most
+    eps V_Z / (2 V_Z - eps / 2) from the foot (the light at its lowest), and the isophote's radius about it is close to
+    r-.
     """
-    height = float(fixed["height"])
-    room = fixed["size"] / 2 - isophote_radius(fixed["isovalue"], fixed["exponent"], height)
+    isovalue, exponent, height, size = (float(fixed[name] or 0) for name in ("isovalue", "exponent", "height", "size"))
+    room = size / 2 - isophote_radius(isovalue, exponent, height)
     return max(0.0, 2 * height * room / (height + room / 2))

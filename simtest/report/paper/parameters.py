@@ -9,26 +9,14 @@ PREFIX = "paper."
 
 @dataclass(frozen=True)
 class Parameter:
-    """How a parameter is written.
+    """How a parameter is written."""
 
-    Parameters
-    ----------
-    name : str
-        Its name in `PaperSetting`.
-    symbol, words, unit : str
-        For titles; the unit may be empty.
-    factor : float
-        Shown value over the value in the rows.
-    about : str
-        What its sweep means.
-    """
-
-    name: str
+    name: str  # its name in `PaperSetting`
     symbol: str
     words: str
     unit: str = ""
-    factor: float = 1.0
-    about: str = ""
+    factor: float = 1.0  # shown value over the value in the rows
+    about: str = ""  # what its sweep means
 
     @property
     def axis_title(self) -> str:

@@ -1,72 +1,51 @@
 """Figure 2 of the article: the pipeline in pictures, from one realisation that the run kept."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.vectors import angle_deg
-from simtest.report.gallery import estimated_normals, vector
-from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
-from simtest.report.run_folder import GalleryItem, Run
+from simtest.pages.axes import Axis
+from simtest.pages.chart import Chart, Mark, Panel, Picture
+from simtest.pages.pixels import displayed
+from simtest.pages.style import NEUTRAL, TRUTH, Array, Symbol, degrees, labelled
+from simtest.report.paper.parameters import PARAMETERS
+from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
+from simtest.spec.paper import PaperSetting
 
-Array = npt.NDArray[np.float64]
+_ISOPHOTE, _PLANE = "#00C2D1", "#444444"
+_DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
 
 PICTURES = ("texture", "clean", "smoothed")
 
 
 @dataclass(frozen=True)
 class Stages:
-    """The stages of one realisation; pictures are shares of the noise-free peak.
+    """The stages of one realisation; pictures are shares of the noise-free peak."""
 
-    Parameters
-    ----------
-    setting : str
-        Name of the setting, with the drawn values.
-    theta_deg : float
-        Slant.
-    texture : ndarray, shape (m, m)
-        Over the window of `side` texture units.
-    side : float
-        Side of the texture's window.
-    clean, noisy, smoothed : ndarray, shape (h, w)
-        The part of the camera's picture that is used; `smoothed` normalised to its peak.
-    extent : tuple of float
-        x0, x1, y1, y0 of that part, px.
-    isovalue : float
-        t.
-    isophote, ellipse : ndarray, shape (k, 2), or None
-        px; None where the realisation failed.
-    truth : ndarray, shape (3,)
-        True normal.
-    candidates : tuple of ndarray
-        The proposed one first.
-    errors_deg : tuple of float
-        Of the candidates.
-    status : str
-        "ok" or the failure's reason.
-    is_default : bool
-        Whether the setting is the article's.
-    """
-
-    setting: str
-    theta_deg: float
+    setting: str  # name of the setting, with the drawn values
+    theta_deg: float  # slant
     texture: npt.NDArray[np.float32]
-    side: float
-    clean: npt.NDArray[np.float32]
+    side: float  # of the texture's window, texture units
+    clean: npt.NDArray[np.float32]  # the part of the camera's picture that is used, shape (h, w)
     noisy: npt.NDArray[np.float32]
-    smoothed: npt.NDArray[np.float32]
-    extent: tuple[float, float, float, float]
-    isovalue: float
-    isophote: Array | None
+    smoothed: npt.NDArray[np.float32]  # normalised to its peak
+    extent: tuple[float, float, float, float]  # x0, x1, y1, y0 of that part, px
+    isovalue: float  # t
+    isophote: Array | None  # px, shape (k, 2); None where the realisation failed
     ellipse: Array | None
-    truth: Array
-    candidates: tuple[Array, ...]
-    errors_deg: tuple[float, ...]
-    status: str
-    is_default: bool
+    truth: Array  # true normal
+    candidates: tuple[Array, ...]  # the proposed one first
+    errors_deg: tuple[float, ...]  # of the candidates
+    status: str  # "ok" or the failure's reason
+    is_default: bool  # whether the setting is the article's
+
+    @property
+    def result(self) -> str:
+        """How the realisation came out."""
+        errors = [degrees(error) for error in self.errors_deg]
+        return f"candidates off by {labelled(errors)}" if errors else f"no normal ({self.status})"
 
     @property
     def better(self) -> int:
@@ -77,52 +56,134 @@ class Stages:
 def stages(run: Run) -> Stages | None:
     """Choose the kept realisation at the article's defaults, else one that answered, and read its stages.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    Stages or None
-        None where the run kept no realisation of the published protocol.
+    Returns None where the run kept no realisation of the published protocol.
     """
-    kept = [item for item in run.gallery if item.meta.get("paper") and all(p in item.pictures for p in PICTURES)]
+    kept = [
+        (item, item.meta.paper)
+        for item in run.gallery
+        if item.meta.paper is not None and all(name in item.pictures for name in PICTURES)
+    ]
     if not kept:
         return None
-    return _read(max(kept, key=lambda item: (item.meta["paper"] == DEFAULTS, _pose(item).get("status") == "ok")))
+    return _read(*max(kept, key=lambda pair: (pair[1] == PaperSetting(), _answered(pair[0]))))
 
 
-def _pose(item: GalleryItem) -> Mapping[str, Any]:
-    """Give circle pose's estimate, else the first one."""
-    estimates = item.estimates
-    return next((e for e in estimates if e.get("estimator") == "circle_pose"), estimates[0] if estimates else {})
+def _pose(item: GalleryItem) -> KeptEstimate | None:
+    """Return circle pose's estimate, else the first one."""
+    estimates = item.meta.estimates
+    return next((e for e in estimates if e.estimator == "circle_pose"), estimates[0] if estimates else None)
 
 
-def _read(item: GalleryItem) -> Stages:
-    setting, estimate = item.meta["paper"], _pose(item)
-    x, y, width, height = (int(v) for v in item.meta["outer"])
-    peak = item.meta.get("peak_value") or float(np.max(item.pictures["smoothed"])) or 1.0
-    truth = np.asarray(vector(item.truth[0]["normal"], 3))
-    candidates = tuple(estimated_normals(estimate))
-    contours, curves = estimate.get("isophotes") or [], estimate.get("curves") or []
-    is_default = setting == DEFAULTS
-    values = ", ".join(PARAMETERS[k].text(setting[k]) for k in ("sigma", "theta_deg", "exponent", "isovalue", "eps"))
+def _answered(item: GalleryItem) -> bool:
+    estimate = _pose(item)
+    return estimate is not None and estimate.status == "ok"
+
+
+def _read(item: GalleryItem, setting: PaperSetting) -> Stages:
+    estimate = _pose(item)
+    x, y, width, height = item.meta.outer
+    peak = item.meta.peak_value or float(np.max(item.pictures["smoothed"])) or 1.0
+    truth = np.array(item.meta.truth[0].normal)
+    candidates = tuple(estimate.normals) if estimate else ()
+    names = ("sigma", "theta_deg", "exponent", "isovalue", "eps")
+    values = ", ".join(PARAMETERS[name].text(getattr(setting, name)) for name in names)
     return Stages(
-        setting=f"{values}, smoothing {PARAMETERS['smoothing_px'].text(setting['smoothing_px'])}",
-        theta_deg=float(setting["theta_deg"]),
+        setting=f"{values}, smoothing {PARAMETERS['smoothing_px'].text(setting.smoothing_px)}",
+        theta_deg=setting.theta_deg,
         texture=item.pictures["texture"],
-        side=float(setting["size"]),
+        side=float(setting.size),
         clean=item.pictures["clean"],
         noisy=item.frame[y : y + height, x : x + width],
         smoothed=item.pictures["smoothed"] / np.float32(peak),
         extent=(x, x + width, y + height, y),
-        isovalue=float(setting["isovalue"]),
-        isophote=np.asarray(contours[0]["points"], dtype=float) if contours else None,
-        ellipse=np.asarray(curves[0], dtype=float) if curves else None,
+        isovalue=setting.isovalue,
+        isophote=np.array(estimate.isophotes[0].points) if estimate and estimate.isophotes else None,
+        ellipse=np.array(estimate.curves[0]) if estimate and estimate.curves else None,
         truth=truth,
         candidates=candidates,
         errors_deg=tuple(float(angle_deg(candidate, truth)) for candidate in candidates),
-        status=str(estimate.get("status")),
-        is_default=is_default,
+        status=estimate.status if estimate else "None",
+        is_default=setting == PaperSetting(),
     )
+
+
+def stage_charts(data: Stages, colour: str) -> list[Chart]:
+    """Describe the six pictures of the pipeline; `colour` is the estimator's."""
+    half = data.side / 2
+    plane = tuple(f"{name} on the plane (texture units)" for name in "xy")
+    texture = _picture("1  texture of the specular term", data.texture, (-half, half, half, -half), plane, ())
+    pictures = (
+        ("2  slanted view, no noise", data.clean, ()),
+        ("3  with noise", data.noisy, ()),
+        ("4  smoothed, normalised; isophote, ellipse", data.smoothed, tuple(_fitted(data, colour))),
+    )
+    shown = [_picture(title, values, data.extent, ("x (px)", "y (px)"), marks) for title, values, marks in pictures]
+    return [texture, *shown, _side_view(data, colour), _close_up(data, colour)]
+
+
+def _picture(
+    title: str, values: npt.NDArray[np.float32], extent: tuple[float, float, float, float], titles: tuple[str, ...],
+    marks: tuple[Mark, ...],
+) -> Chart:  # fmt: skip
+    x0, x1, y1, y0 = extent
+    x, y = Axis(titles[0], limits=(x0, x1)), Axis(titles[1], limits=(y1, y0))
+    panel = Panel(x, y, marks, equal=True, picture=Picture(displayed(values), extent))
+    return Chart("", title, (panel,), round(105 + 365 * min((y1 - y0) / (x1 - x0), 1.0)))
+
+
+def _fitted(data: Stages, colour: str) -> list[Mark]:
+    marks = []
+    if data.isophote is not None:
+        x, y = np.vstack([data.isophote, data.isophote[:1]]).T
+        marks.append(Mark(x, y, _ISOPHOTE, f"isophote t = {data.isovalue:g}", line="solid", width=2.8))
+    if data.ellipse is not None:
+        x, y = data.ellipse.T
+        marks.append(Mark(x, y, colour, "fitted ellipse", line="dash", width=2.0))
+    return marks
+
+
+def _side_view(data: Stages, colour: str) -> Chart:
+    """Describe the normals in the plane of the tilt, seen from the side: the camera looks along z."""
+    theta = np.radians(data.theta_deg)
+    end = 0.95 * np.array([np.cos(theta), np.sin(theta)])
+    marks = [
+        Mark([0, 0], [0, -1.12], NEUTRAL, line="dot"),
+        Mark([0], [-1.2], _PLANE, words=["towards the camera"]),
+        Mark([-end[0], end[0]], [-end[1], end[1]], _PLANE, f"plane, slant {data.theta_deg:g}°", line="solid", width=3),
+        _normal(data.truth, TRUTH, "true normal", 7),
+    ]
+    for index, candidate in enumerate(data.candidates):
+        which, dashed = ("better", False) if index == data.better else ("other", True)
+        name = f"{which} candidate, off by {data.errors_deg[index]:.2f}°"
+        marks.append(_normal(candidate, colour, name, 2.4, dashed))
+    if not data.candidates:
+        marks.append(Mark([0], [0.8], _PLANE, words=[f"no normal: {data.status}"]))
+    x, y = Axis("y of the unit normal", limits=(-1.25, 1.25)), Axis("z of the unit normal", limits=(1.05, -1.35))
+    return Chart("", "5  normals from the side", (Panel(x, y, tuple(marks), equal=True),), 460)
+
+
+def _normal(normal: Array, colour: str, name: str, width: float, dashed: bool = False) -> Mark:
+    return Mark(
+        [0, normal[1]], [0, normal[2]], colour, name, line="dash" if dashed else "solid", width=width, head=True
+    )
+
+
+def _close_up(data: Stages, colour: str) -> Chart:
+    """Describe the better candidate about the truth: slant error up, the error across it to the right, deg."""
+    marks, reach = [Mark([0], [0], TRUTH, "true normal", symbol=_DOT, size=15)], 1.0
+    if data.candidates:
+        candidate, error = data.candidates[data.better], data.errors_deg[data.better]
+        across = np.array([1.0, 0.0, 0.0])
+        miss = np.array([candidate @ across, candidate @ np.cross(data.truth, across)])
+        size = np.linalg.norm(miss)
+        miss = miss * (error / size) if size > 0 else miss
+        angle = np.linspace(0, 2 * np.pi, 120)
+        name = f"better candidate, error {error:.2f}°"
+        marks = [
+            Mark(error * np.cos(angle), error * np.sin(angle), NEUTRAL, line="solid", width=1.2), *marks,
+            Mark([0, miss[0]], [0, miss[1]], colour, line="solid", width=2),
+            Mark([miss[0]], [miss[1]], colour, name, symbol=_CROSS, size=14),
+        ]  # fmt: skip
+        reach = 1.35 * error
+    x, y = (Axis(f"error of the {of} (deg)", limits=(-reach, reach)) for of in ("tilt's direction", "slant"))
+    return Chart("", "6  better candidate about the truth", (Panel(x, y, tuple(marks), equal=True),), 460)

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from simtest.pages.style import Array, degrees, number
 from simtest.report.paper import explanations, fits
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
-from simtest.report.paper.sweeps import Sweep, SweepFigure
+from simtest.report.paper.sweeps import Sweep, SweepFigure, Value
 
 AGREES, DIFFERS, ABSENT = "agrees", "differs", "not in this run"
 PART, FEW = "only part of the range", "too few realisations"
+"""What the run holds agrees, but is not the claim's whole range; there is no standard error to judge by."""
 
 ESTIMATOR = "circle_pose"
 """The article's method; only its sweeps are compared."""
@@ -38,28 +38,15 @@ FREE = ("smoothing_px",)
 
 @dataclass(frozen=True)
 class Statement:
-    """A row of the table.
-
-    Parameters
-    ----------
-    sweep, claim, source, rule : str
-        Which sweep; what is stated, by whom, and when it counts as met.
-    measured : str
-        What the run gave; empty where it holds no such sweep.
-    verdict : str
-        `AGREES`, `DIFFERS`, `ABSENT`; `PART` where what the run holds agrees, but is not the whole range that the claim
-        is about; `FEW` where single realisations leave no standard error to judge by.
-    because : str
-        Why it differs; empty otherwise.
-    """
+    """A row of the table."""
 
     sweep: str
-    claim: str
-    source: str
-    rule: str
-    measured: str
-    verdict: str
-    because: str = ""
+    claim: str  # what is stated
+    source: str  # by whom
+    rule: str  # when it counts as met
+    measured: str  # what the run gave; empty where it holds no such sweep
+    verdict: str  # `AGREES`, `DIFFERS`, `ABSENT`, `PART` or `FEW`
+    because: str = ""  # why it differs; empty otherwise
 
 
 @dataclass(frozen=True)
@@ -67,7 +54,7 @@ class _Check:
     """A statement with the sweep it is about and the test of it, which gives the measured text and whether it holds."""
 
     parameter: str
-    fixed: dict[str, Any]
+    fixed: dict[str, Value]
     claim: str
     rule: str
     test: Callable[[Sweep], tuple[str, bool]]
@@ -78,7 +65,7 @@ class _Check:
     """Least and largest answered setting that the claim needs."""
 
     def verdict(self, sweep: Sweep, met: bool) -> str:
-        """Give the verdict on a sweep that the test has looked at."""
+        """Return the verdict on a sweep that the test has looked at."""
         answered = np.isfinite(sweep.mean)
         if self.test in _BY_STANDARD_ERROR and not np.isfinite(sweep.standard_error[answered]).all():
             return FEW
@@ -92,15 +79,7 @@ class _Check:
 def statements(figures: Sequence[SweepFigure]) -> list[Statement]:
     """Judge every statement on the sweeps of a run.
 
-    Parameters
-    ----------
-    figures : sequence of SweepFigure
-        The run's sweeps.
-
-    Returns
-    -------
-    list of Statement
-        The article's first, in its order, then those of this project's own analysis that the run has a sweep for.
+    The article's come first, in its order, then those of this project's own analysis that the run has a sweep for.
     """
     rows = []
     for check in _CHECKS:
@@ -119,7 +98,7 @@ def statements(figures: Sequence[SweepFigure]) -> list[Statement]:
 
 
 def _find(figures: Sequence[SweepFigure], check: _Check) -> Sweep | None:
-    """Give the first sweep of the article's method at the check's settings with two answered ones."""
+    """Return the first sweep of the article's method at the check's settings with two answered ones."""
     wanted = {name: value for name, value in {**DEFAULTS, **check.fixed}.items() if name != check.parameter}
     for figure in figures:
         for sweep in figure.sweeps if figure.parameter.name == check.parameter else ():

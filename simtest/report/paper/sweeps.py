@@ -2,64 +2,72 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import numpy as np
 import polars as pl
 
-from simtest.pages.style import Array, Axis, estimator_order
+from simtest.pages.axes import Axis, finite
+from simtest.pages.style import Array, degrees, estimator_order, number
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
 from simtest.report.run_folder import Run
+
+Value = float | bool | None
+"""What a row holds of a parameter."""
 
 _WIDE = 20.0
 """Means that span more than this factor are drawn on a logarithmic axis."""
 
 _FEWEST = 2
+_LEAST_LAW_DEG = 1e-3  # a smaller prediction is none
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """One estimator's errors over one parameter, all else fixed; the better candidate's error, deg.
+    """One estimator's errors over one parameter, all else fixed; the better candidate's error, deg."""
 
-    Parameters
-    ----------
-    parameter : Parameter
-        What is swept.
-    estimator, label : str
-        Name of the estimator and of the group of settings.
-    fixed : mapping
-        The other parameters' values by name.
-    x : ndarray, shape (n,)
-        Values of the parameter, ascending, as in the rows.
-    mean, std, least, largest : ndarray, shape (n,)
-        Over the answered realisations; NaN where there is none (std: none or one).
-    answered, failed : ndarray of int, shape (n,)
-        Realisations.
-    reasons : tuple of str, length n
-        Reasons of the failures with their counts.
-    bound, law : ndarray, shape (n,)
-        Cramer-Rao bound (RMS angle) and predicted error without noise, deg; NaN where there is none.
-    """
-
-    parameter: Parameter
+    parameter: Parameter  # what is swept
     estimator: str
-    label: str
-    fixed: Mapping[str, Any]
-    x: Array
-    mean: Array
-    std: Array
+    label: str  # of the group of settings
+    fixed: Mapping[str, Value]  # the other parameters' values by name
+    x: Array  # values of the parameter, ascending, as in the rows; shape (n,), as all that follow
+    mean: Array  # over the answered realisations; NaN where there is none
+    std: Array  # NaN where there is none or one
     least: Array
     largest: Array
-    answered: Array
+    answered: Array  # realisations
     failed: Array
-    reasons: tuple[str, ...]
-    bound: Array
-    law: Array
+    reasons: tuple[str, ...]  # of the failures, with their counts
+    bound: Array  # Cramer-Rao bound (RMS angle), deg; NaN where there is none
+    law: Array  # predicted error without noise, deg; NaN where there is none
 
     @property
     def shown_x(self) -> Array:
         """Values of the parameter in the unit of the axis."""
         return self.x * self.parameter.factor
+
+    @property
+    def measured(self) -> str:
+        """The measured numbers in words."""
+        known, other = np.isfinite(self.mean), departures(self.fixed)
+        text = f"{self.estimator}, {self.label}" + (f" ({other}): " if other else ": ")
+        if known.any():
+            low, high, largest = np.nanmin(self.mean), np.nanmax(self.mean), np.nanmax(self.largest)
+            text += f"means from {degrees(float(low))} to {degrees(float(high))}, single errors up to "
+            text += degrees(float(largest))
+        else:
+            text += "no answer"
+        failing = [
+            f"{self.parameter.text(float(x))}: {failed:.0f} of {failed + answered:.0f} ({reasons})"
+            for x, failed, answered, reasons in zip(self.x, self.failed, self.answered, self.reasons, strict=True)
+            if failed
+        ]
+        text += f"; failures at {', '.join(failing)}" if failing else "; no failures"
+        wide = known & np.isfinite(self.law) & (self.law > _LEAST_LAW_DEG)
+        if self.fixed.get("sigma") == 0 and wide.any():
+            ratio = self.mean[wide] / self.law[wide]
+            text += f"; measured over predicted bias {number(float(ratio.min()))} to {number(float(ratio.max()))}"
+        return text + "."
 
     @property
     def standard_error(self) -> Array:
@@ -96,6 +104,21 @@ class SweepFigure:
         return estimator_order(sweep.estimator for sweep in self.sweeps)
 
     @property
+    def bounds(self) -> list[Sweep]:
+        """The sweeps whose Cramer-Rao bound is drawn: one a label, where it is not 0 everywhere."""
+        seen: dict[str, Sweep] = {}
+        for sweep in self.sweeps:
+            if np.isfinite(sweep.bound).sum() > 1 and np.nanmax(sweep.bound) > 0:
+                seen.setdefault(sweep.label, sweep)
+        return list(seen.values())
+
+    @property
+    def laws(self) -> list[tuple[int, Sweep]]:
+        """The sweeps whose law is drawn, with their indices: it is known at two settings, not 0 everywhere."""
+        known = [(i, sweep) for i, sweep in enumerate(self.sweeps) if np.isfinite(sweep.law).sum() > 1]
+        return [(i, sweep) for i, sweep in known if np.nanmax(sweep.law) > _LEAST_LAW_DEG]
+
+    @property
     def x(self) -> Axis:
         """The parameter's axis: logarithmic where the values are evenly spaced in the logarithm."""
         values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
@@ -106,16 +129,14 @@ class SweepFigure:
     def y(self) -> Axis:
         """The errors' axis: from 0 as in the article; logarithmic beside such an x, or where the means differ much."""
         title = "error of the better candidate (deg)"
-        means = np.concatenate([sweep.mean for sweep in self.sweeps])
-        means = means[np.isfinite(means)]
+        means = finite([sweep.mean for sweep in self.sweeps])
         if means.size and means.min() > 0 and (self.x.scale == "log" or means.max() > _WIDE * means.min()):
             return Axis(title, "log")
-        tops = np.concatenate([np.concatenate([sweep.largest, sweep.bound]) for sweep in self.sweeps])
-        tops = tops[np.isfinite(tops)]
+        tops = finite([part for sweep in self.sweeps for part in (sweep.largest, sweep.bound)])
         return Axis(title, "linear", (0.0, 1.06 * float(tops.max())) if tops.size and tops.max() > 0 else None)
 
-    def places(self, index: int) -> Array:
-        """Give where a sweep is drawn: beside the others, so that the bars of several do not hide each other."""
+    def shifted_x(self, index: int) -> Array:
+        """Return the x at which a sweep is drawn: beside the others, so that the bars of several show."""
         x = self.sweeps[index].shown_x
         values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
         is_log = self.x.scale == "log"
@@ -136,22 +157,14 @@ def _unevenness(values: Array) -> float:
 
 
 def is_published(run: Run) -> bool:
-    """Tell whether a run has rows of the published protocol."""
+    """Whether a run has rows of the published protocol."""
     return any(name.startswith(PREFIX) for name in run.results.columns)
 
 
 def sweep_figures(run: Run) -> list[SweepFigure]:
-    """Give the error plots of a run, one a swept parameter, in the article's order.
+    """Return the error plots of a run, one for each swept parameter, in the article's order.
 
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of SweepFigure
-        Empty where the run has no row of the published protocol.
+    A run without rows of the published protocol has none.
     """
     found = list(_sweeps(run)) if is_published(run) else []
     figures = []
@@ -172,14 +185,15 @@ def _sweeps(run: Run) -> Iterator[Sweep]:
             pieces = part.partition_by(others, maintain_order=True) if others else [part]
             kept = [piece for piece in pieces if piece[name].n_unique() >= _FEWEST]
             for piece in kept:
-                fixed = {c[len(PREFIX) :]: piece[c].drop_nulls().first() for c in columns if c != name}
+                held = {c[len(PREFIX) :]: piece[c].drop_nulls().first() for c in columns if c != name}
+                fixed = cast(Mapping[str, Value], held)
                 more = [PARAMETERS[other[len(PREFIX) :]].text(fixed[other[len(PREFIX) :]]) for other in others]
                 for estimator in estimator_order(piece["estimator"].unique().to_list()):
                     own = piece.filter(pl.col("estimator") == estimator)
                     yield _sweep(own, name, estimator, ", ".join([str(label), *more]), fixed)
 
 
-def _sweep(rows: pl.DataFrame, column: str, estimator: str, label: str, fixed: Mapping[str, Any]) -> Sweep:
+def _sweep(rows: pl.DataFrame, column: str, estimator: str, label: str, fixed: Mapping[str, Value]) -> Sweep:
     ok = (pl.col("status") == "ok") & pl.col("error_oracle_deg").is_not_null()
     error = pl.col("error_oracle_deg").filter(ok)
     bound = pl.col("bound_deg") if "bound_deg" in rows.columns else pl.lit(None, pl.Float64)
@@ -211,7 +225,7 @@ def _counted(reasons: list[str]) -> str:
     return ", ".join(f"{name} {reasons.count(name)}" for name in sorted(set(reasons)))
 
 
-def departures(fixed: Mapping[str, Any]) -> str:
+def departures(fixed: Mapping[str, Value]) -> str:
     """Write the fixed parameters that are not the article's defaults; empty where all are."""
     return ", ".join(
         PARAMETERS[name].text(value)

@@ -1,4 +1,4 @@
-"""What the 3D view of a scene shows, as arrays in the camera frame."""
+"""Content of the 3D view of a scene, as arrays in the camera frame."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,6 +11,7 @@ from simtest.calibration import Calibration
 from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.report.view3d import grid_triangles
 from simtest.runtime.arrays import Array, IntArray
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene
@@ -24,38 +25,18 @@ OCCLUSION = 1.15
 
 @dataclass(frozen=True)
 class Content:
-    """A scene's 3D view, camera frame, mm.
+    """A scene's 3D view, camera frame, mm."""
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (V, 3)
-        Samples of the visible surface.
-    faces : ndarray of int, shape (F, 3)
-        Triangles between them.
-    curvature : ndarray, shape (V,)
-        Principal curvature of larger size, 1/mm, convex towards the camera positive.
-    frustum : ndarray, shape (4, 3)
-        Unit sightlines through the corners of the image, in turn.
-    lights : ndarray, shape (L, 3)
-        True places.
-    places, normals : ndarray, shape (N, 3)
-        True isolated highlights and their normals.
-    estimator : ndarray of str, shape (E,)
-        Name of each estimate's estimator.
-    looks, estimates : ndarray, shape (E, 3)
-        Point that an estimate looks at, and the proposed normal.
-    """
-
-    vertices: Array
-    faces: IntArray
-    curvature: Array
-    frustum: Array
-    lights: Array
-    places: Array
-    normals: Array
-    estimator: npt.NDArray[Any]
-    looks: Array
-    estimates: Array
+    vertices: Array  # samples of the visible surface, shape (V, 3)
+    faces: IntArray  # triangles between them, shape (F, 3)
+    curvature: Array  # principal curvature of larger size, 1/mm, convex towards the camera positive, shape (V,)
+    frustum: Array  # unit sightlines through the corners of the image, in turn, shape (4, 3)
+    lights: Array  # true positions, shape (L, 3)
+    highlights: Array  # true isolated ones, shape (N, 3)
+    normals: Array  # at these
+    estimator: npt.NDArray[Any]  # name of each estimate's estimator, shape (E,)
+    looks: Array  # point that each estimate looks at, shape (E, 3)
+    estimates: Array  # proposed normals
 
     def save(self, path: Path) -> None:
         """Write the arrays to a NumPy archive."""
@@ -71,23 +52,7 @@ class Content:
 def make_content(scene: Scene, variant: str | None = None) -> Content:
     """Render a scene, reconstruct the normals at its highlights, and gather what is shown.
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    variant : str, optional
-        Mitsuba variant.
-
-    Returns
-    -------
-    Content
-
-    Raises
-    ------
-    InputError
-        If the camera sees no surface.
-    BackendError
-        If the rendering backend cannot be used.
+    Raises `InputError` if the camera sees no surface, `BackendError` if the rendering backend cannot be used.
     """
     session = Session(scene, variant)
     seen = render_view(session, scene)
@@ -102,7 +67,7 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
         curvature=curvature,
         frustum=np.asarray(camera.unproject(corners)),
         lights=np.asarray(scene.rig.true_mm()),
-        places=np.array([h.position for h in found]).reshape(-1, 3),
+        highlights=np.array([h.position for h in found]).reshape(-1, 3),
         normals=np.array([h.normal for h in found]).reshape(-1, 3),
         estimator=np.array(names, dtype=np.str_),
         looks=looks,
@@ -114,15 +79,7 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     stride = max(1, -(-max(session.camera.width, session.camera.height) // GRID))
     truth = session.truth(stride)
     position, curvature = (np.asarray(part, dtype=float) for part in (truth.position, truth.larger_curvature))
-    valid = np.isfinite(position).all(axis=-1)
-    number = np.where(valid, np.cumsum(valid).reshape(valid.shape) - 1, -1)
-    distance = np.linalg.norm(position, axis=-1)
-    corners = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
-    a, b, c, d = (number[corner].ravel() for corner in corners)
-    depth = np.stack([distance[corner].ravel() for corner in corners])
-    with np.errstate(invalid="ignore"):
-        whole = (np.stack([a, b, c, d]) >= 0).all(axis=0) & (depth.max(axis=0) < OCCLUSION * depth.min(axis=0))
-    faces = np.concatenate([np.stack([a, c, b], axis=1)[whole], np.stack([b, c, d], axis=1)[whole]])
+    faces, valid = grid_triangles(position, OCCLUSION), np.isfinite(position).all(axis=-1)
     if not len(faces):
         raise InputError("the camera sees no surface; move it or choose another viewpoint")
     return position[valid], faces, curvature[valid]
@@ -131,7 +88,7 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
 def _estimates(
     session: Session, frame: npt.NDArray[np.float32], calibration: Calibration
 ) -> tuple[list[str], Array, Array]:
-    """Give names, points looked at and normals of all estimates that look at the surface."""
+    """Return names, points looked at and normals of all estimates that look at the surface."""
     names, pixels, normals = [], [], []
     for specularity in reconstruct(frame, calibration):
         for name, estimate in specularity.estimates.items():

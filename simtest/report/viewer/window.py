@@ -1,4 +1,4 @@
-"""Draws the 3D view, in a process of its own: VTK takes the whole process with it where there is no way to draw.
+"""Draws the 3D view in a process of its own: VTK takes the whole process with it where there is no way to draw.
 
 python -m simtest.report.viewer.window CONTENT.npz [SCREENSHOT.png]
 """
@@ -28,7 +28,7 @@ DONE = "simtest view: drawn"
 
 
 def check_target(path: Path | None) -> None:
-    """Raise `InputError` where it is plain before anything is rendered that a PNG, or a window, cannot be had."""
+    """Raise `InputError` where it is plain, before anything is rendered, that there can be no PNG or no window."""
     if path is None:
         if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             raise InputError("no display (DISPLAY is not set); --screenshot FILE draws without one")
@@ -42,10 +42,8 @@ def check_target(path: Path | None) -> None:
 def save_screenshot(content: Content, path: Path) -> None:
     """Draw to a PNG without a display.
 
-    Raises
-    ------
-    InputError
-        If the suffix is not .png, the file cannot be written, or this machine has no way to draw off-screen.
+    Raises `InputError` if the suffix is not .png, the file cannot be written, or this machine has no way to draw
+    off-screen.
     """
     check_target(path)
     said = ""
@@ -68,13 +66,7 @@ def save_screenshot(content: Content, path: Path) -> None:
 
 
 def show(content: Content) -> None:
-    """Open a window and wait until it is closed.
-
-    Raises
-    ------
-    InputError
-        If no window can be opened.
-    """
+    """Open a window and wait until it is closed; raises `InputError` if none can be opened."""
     check_target(None)
     with tempfile.TemporaryDirectory() as folder:
         stored = Path(folder) / "content.npz"
@@ -85,7 +77,7 @@ def show(content: Content) -> None:
 
 
 def _draw(arguments: list[str], environment: dict[str, str], timeout: float | None) -> tuple[bool, str]:
-    """Run the drawing process; gives whether it ended well, and else the last it said."""
+    """Run the drawing process; returns whether it ended well, and the last line that it wrote."""
     command = [sys.executable, "-m", "simtest.report.viewer.window", *arguments]
     # The child finds the same simtest as this process, wherever that was started.
     here = str(Path(__file__).resolve().parents[3])
@@ -101,7 +93,7 @@ def _draw(arguments: list[str], environment: dict[str, str], timeout: float | No
 
 
 def _plot(content: Content, screenshot: str | None) -> None:
-    """Draw; in this process."""
+    """Draw in this process."""
     import numpy as np
     import pyvista
 
@@ -125,18 +117,18 @@ def _plot(content: Content, screenshot: str | None) -> None:
     _add_camera(plotter, content, 0.5 * near)
     plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
     legend: list[tuple[str, str]] = [("camera", "black"), ("light", LIGHT)]
-    if len(content.places):
+    if len(content.highlights):
         legend.append(("true normal", TRUE))
-    for place, normal in zip(content.places, content.normals, strict=True):
+    for foot, normal in zip(content.highlights, content.normals, strict=True):
         # Longer than the estimates', so that it shows where they lie on it.
-        plotter.add_mesh(pyvista.Line(place, place + 1.3 * reach * normal), color=TRUE, line_width=3)
+        plotter.add_mesh(pyvista.Line(foot, foot + 1.3 * reach * normal), color=TRUE, line_width=3)
     for name, look, normal in zip(content.estimator, content.looks, content.estimates, strict=True):
         colour = COLOURS.get(str(name), OTHER)
         plotter.add_mesh(pyvista.Line(look, look + reach * normal), color=colour, line_width=6)
         if (str(name), colour) not in legend:
             legend.append((str(name), colour))
     plotter.add_legend([list(entry) for entry in legend], bcolor="white", border=True, size=(0.16, 0.032 * len(legend)))
-    _place_viewer(plotter, content)
+    _move_viewer(plotter, content)
     if screenshot is None:
         plotter.show(title="simtest view")
     else:
@@ -154,14 +146,14 @@ def _add_camera(plotter: object, content: Content, reach: float) -> None:
             plotter.add_mesh(pyvista.Line(end, corner), color="black", line_width=2)  # type: ignore[attr-defined]
 
 
-def _place_viewer(plotter: object, content: Content) -> None:
-    """Look from behind the camera and above it, at a place between it and the middle of what it sees."""
+def _move_viewer(plotter: object, content: Content) -> None:
+    """Look from behind the camera and above it, at a point between it and the middle of what it sees."""
     import numpy as np
 
     middle = np.median(content.vertices, axis=0)
     size = float(np.linalg.norm(middle))
-    place, target = (1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist()
-    plotter.camera_position = [place, target, (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
+    viewer, target = (1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist()
+    plotter.camera_position = [viewer, target, (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
     plotter.reset_camera_clipping_range()  # type: ignore[attr-defined]
 
 

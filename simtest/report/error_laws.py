@@ -1,4 +1,4 @@
-"""Which law is about which rows, and whether the measurements meet it."""
+"""The error laws: which law is about which rows, and whether the measurements meet it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,26 +21,14 @@ BRANCH_SLOPE = 0.5
 
 @dataclass(frozen=True)
 class Law:
-    """A law and where its two sides stand in the results.
-
-    Parameters
-    ----------
-    title, formula : str
-        In words and in signs.
-    estimator : str
-        Whose rows it is about.
-    measured, predicted : str
-        Columns; of `predicted` the branch point's is made from the row's own axis ratio.
-    is_angle : bool
-        Met within 0.3 deg or 3 %; else a ratio, met within 3 %.
-    """
+    """A law and the columns of the results that hold its two sides."""
 
     title: str
     formula: str
-    estimator: str
-    measured: str
-    predicted: str
-    is_angle: bool = True
+    estimator: str  # whose rows it is about
+    measured: str  # column
+    predicted: str  # column; the branch point's is made from the row's own axis ratio
+    is_angle: bool = True  # met within 0.3 deg or 3 %; else a ratio, met within 3 %
 
 
 LAWS: dict[LawName, Law] = {
@@ -82,32 +70,16 @@ assert set(LAWS) == set(get_args(LawName))
 
 @dataclass(frozen=True)
 class LawResult:
-    """What a run says about one law.
+    """What a run says about one law."""
 
-    Parameters
-    ----------
-    name : str
-        Of `LAWS`, or `SLOPE`.
-    law : Law
-        The law.
-    settings : tuple of str
-        Those with a value.
-    measured, predicted : ndarray, shape (n,)
-        Means over each setting's realisations; deg or ratios.
-    rows, failed : int
-        Rows of the law's estimator, and those without a value on either side.
-    tolerance : ndarray, shape (n,)
-        What each setting may depart by.
-    """
-
-    name: str
+    name: str  # of `LAWS`, or `SLOPE`
     law: Law
-    settings: tuple[str, ...]
-    measured: Array
+    settings: tuple[str, ...]  # those with a value
+    measured: Array  # means over each setting's realisations, deg or ratios, shape (n,)
     predicted: Array
-    rows: int
-    failed: int
-    tolerance: Array
+    rows: int  # of the law's estimator
+    failed: int  # rows without a value on either side
+    tolerance: Array  # what each setting may depart by
 
     @property
     def gap(self) -> Array:
@@ -148,18 +120,7 @@ class LawResult:
 
 
 def law_results(run: Run) -> list[LawResult]:
-    """Judge each law on the settings that the experiment names for it.
-
-    Parameters
-    ----------
-    run : Run
-        A run directory.
-
-    Returns
-    -------
-    list of LawResult
-        In the order of `LAWS`; empty where the experiment names no law.
-    """
+    """Judge each law, in the order of `LAWS`, on the settings that the experiment names for it; empty without any."""
     if "laws" not in run.results.columns or run.results["laws"].null_count() == run.results.height:
         return []
     ratio = run.results["axis_ratio"]
@@ -198,28 +159,25 @@ def _slope(rows: pl.DataFrame) -> LawResult | None:
     spread = ok.group_by("noise_sigma").agg(
         share=pl.col("error_oracle_deg").std() / pl.col("error_oracle_deg").mean() / pl.len().sqrt()
     )
-    place = np.log(means["noise_sigma"].to_numpy())
-    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((place - place.mean()) ** 2)))
+    level = np.log(means["noise_sigma"].to_numpy())
+    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((level - level.mean()) ** 2)))
     law = Law(
         "the same: slope of log error over log σ", f"1/2; here ± {number(error, 2)} by the errors' spread",
         "circle_pose", "", "", False,
     )  # fmt: skip
     sigmas = f"σ = {means['noise_sigma'][0]:g} to {means['noise_sigma'][-1]:g}"
     allowed = np.array([TOLERANCE_SHARE * BRANCH_SLOPE + 2 * error])
-    return LawResult(
-        SLOPE,
-        law,
-        (sigmas,),
-        np.array([slope]),
-        np.array([BRANCH_SLOPE]),
-        rows.height,
-        rows.height - ok.height,
-        allowed,
-    )
+    measured, predicted = np.array([slope]), np.array([BRANCH_SLOPE])
+    return LawResult(SLOPE, law, (sigmas,), measured, predicted, rows.height, rows.height - ok.height, allowed)
+
+
+def is_tested(results: Sequence[LawResult]) -> bool:
+    """Whether a run has a value for any law."""
+    return any(result.settings for result in results)
 
 
 def sentence(results: Sequence[LawResult]) -> str:
-    """Say how many laws are met."""
+    """State how many laws are met."""
     judged = [result for result in results if result.verdict != ABSENT]
     met = sum(result.verdict == MET for result in judged)
     departing = [result.law.title for result in judged if result.verdict != MET]

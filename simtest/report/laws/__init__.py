@@ -1,1 +1,0 @@
-"""The error laws: what was measured against what they predict."""
