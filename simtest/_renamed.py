@@ -12,6 +12,7 @@ MODULES = {
     "simtest.engines": "simtest.runtime.engines",
     "simtest.estimators.base": "simtest.estimators.protocol",
     "simtest.estimators.peak": "simtest.estimators.extrapolation",
+    "simtest.gate.records": "simtest.nightly.records",
     "simtest.gate": "simtest.nightly.gate",
     "simtest.imaging.depth": "simtest.validation.depth_maps",
     "simtest.imaging": "simtest.reconstruction",
@@ -20,7 +21,7 @@ MODULES = {
 }
 """Old and new name of a module; its submodules follow it. The first that fits counts."""
 
-NAMES = {"simtest.calibration.Known": "simtest.calibration.Priors"}
+NAMES = {"simtest.gate.records.Night": "simtest.nightly.records.NightlyRun"}
 """Old and new full name of what changed its own name."""
 
 

@@ -62,3 +62,6 @@ SPECULAR_DIFFUSE_RATIO = 1.0
 
 SPECULAR_MIN_AREA_PX = 12
 """A highlight of fewer pixels need not be found: no ellipse can be fitted to it."""
+
+EDGES_PER_HALF_WIDTH = 2.0
+"""Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/meshes.md)."""

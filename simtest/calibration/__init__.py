@@ -33,6 +33,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    from simtest._renamed import lookup
+    if name != "Known":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import warnings
 
-    return lookup(__name__, name)
+    warnings.warn(
+        "simtest.calibration.Known is now Priors; the old name goes with the next release", DeprecationWarning, 2
+    )
+    return Priors

@@ -10,8 +10,7 @@ from simtest.calibration.noise_estimate import estimate_noise
 from simtest.calibration.response import Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.errors import Failure
-from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.arrays import Image, Mask
+from simtest.geometry import Camera, Image, Mask, Patch, smooth
 
 Box = tuple[int, int, int, int]
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry.arrays import Mask
+from simtest.geometry import Mask
 
 _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 """Difference of two Laplacians: blind to any quadratic image (Immerkaer 1996); its norm is 6."""

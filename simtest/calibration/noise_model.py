@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from simtest.calibration.response import Response
 from simtest.errors import InputError
-from simtest.geometry.arrays import Array
+from simtest.geometry import Array
 from simtest.geometry.checks import check_integer, check_kind, check_number
 
 MAX_BITS = 32

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry.arrays import Array
+from simtest.geometry import Array
 from simtest.geometry.checks import check_number
 
 MAX_LIGHTS = 32

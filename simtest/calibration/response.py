@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
-from simtest.geometry.arrays import Image
+from simtest.geometry import Image
 from simtest.geometry.checks import check_number, check_numbers
 
 _LEVELS = 2**16  # values that a picture has at most

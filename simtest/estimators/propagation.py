@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Array, Index
+from simtest.runtime.arrays import Image
 
 Rows = npt.NDArray[np.float32]
 
@@ -50,9 +51,7 @@ def conics_by_crossings(
     return by_moment, moments * (by_x * steps[0] + by_y * steps[1])
 
 
-def raw_moves(
-    pixels: Index, moves: Array, width: int, noise: float | npt.NDArray[np.float32], smoothing_px: float
-) -> Rows:
+def raw_moves(pixels: Index, moves: Array, width: int, noise: float | Image, smoothing_px: float) -> Rows:
     """Return how far one standard deviation of noise in each raw pixel moves K quantities, shape (K, P).
 
     The transpose of smoothing carries derivatives by smoothed pixels to raw pixels, whose noise is independent. The

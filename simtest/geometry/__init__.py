@@ -6,7 +6,6 @@ may be (`circle_from_cone`, `pose_region`).
 """
 
 from simtest.geometry.arc_fit import FittedArc, fit_arc
-from simtest.geometry.arrays import Array, Image, Index, Mask
 from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
 from simtest.geometry.conics import Ellipse, cone_of_conic, cone_rays, ellipse_of_conic
@@ -14,6 +13,7 @@ from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
 from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
 from simtest.geometry.gaussian_smoothing import smooth
 from simtest.geometry.patch import Patch
+from simtest.runtime.arrays import Array, Image, Index, Mask
 
 __all__ = [
     "Array",

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
-from simtest.geometry.arrays import Array
 from simtest.geometry.checks import check_number, check_numbers
+from simtest.runtime.arrays import Array
 
 
 @dataclass(frozen=True)

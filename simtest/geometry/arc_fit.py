@@ -11,8 +11,8 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from simtest.errors import Failure, Reason
-from simtest.geometry.arrays import Array
 from simtest.geometry.ellipse_fit import MAX_AXIS_RATIO, FittedConic, fit_ellipse
+from simtest.runtime.arrays import Array
 
 MIN_ARC_RAD = np.radians(120.0)
 """Shorter arcs do not determine the ellipse: at this length the centre is already a hundred times as noisy as that of

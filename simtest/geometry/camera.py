@@ -8,9 +8,9 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.geometry.arrays import Array, Mask
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.distortion import Distortion
+from simtest.runtime.arrays import Array, Mask
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""

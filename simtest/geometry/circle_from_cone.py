@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
-from simtest.geometry.arrays import Array
+from simtest.runtime.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry.arrays import Array
 from simtest.geometry.circle_from_cone import cone_axes
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
+from simtest.runtime.arrays import Array
 
 
 def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -> Array:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.arrays import Array, Mask
 from simtest.geometry.checks import check_number
+from simtest.runtime.arrays import Array, Mask
 
 Curve = Callable[[Array], tuple[Array, Array]]
 

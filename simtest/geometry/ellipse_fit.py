@@ -4,14 +4,13 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.arrays import Array, Index, Mask
 from simtest.geometry.ellipse_pencil import constrained_minimum
+from simtest.runtime.arrays import AnyArray, Array, Index, Mask
 
 MIN_POINTS = 6
 """An ellipse has five parameters; with five points or fewer the fit has no residual."""
@@ -221,7 +220,7 @@ class _Batch:
         """Sum a table over each contour's points, from shape (K, N) to (K, B)."""
         return np.add.reduceat(table, self.first, axis=1)
 
-    def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def spread(self, values: AnyArray) -> AnyArray:
         """Repeat the value of each contour for its points, from shape (..., B) to (..., N)."""
         return np.repeat(values, self.counts, axis=-1)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from simtest.geometry.arrays import Array
+from simtest.runtime.arrays import Array
 
 _NEWTON_STEPS = 2
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from simtest.errors import Failure, Reason
-from simtest.geometry.arrays import Array
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.arrays import Array
 
 FORWARD: Array = np.array([0.0, 0.0, 1.0])
 FORWARD.flags.writeable = False

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry.arrays import Image, Mask
+from simtest.runtime.arrays import Image, Mask
 
 
 def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
-from simtest.geometry.arrays import Array, Mask
+from simtest.runtime.arrays import Array, Mask
 
 
 def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike, tau: npt.ArrayLike) -> Array:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.arrays import Array, Image, Mask
 from simtest.geometry.level_sets import Crossings, LevelSet, crossings, cut_level_set_around, level_set_around
+from simtest.runtime.arrays import Array, Image, Mask
 
 CUT_SIGMAS = 1.5
 """Nearer than this to a cut, over the smoothing's standard deviation, an isophote is left out: smoothing moves it, at

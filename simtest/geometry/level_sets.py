@@ -6,14 +6,12 @@ without it they are found several times faster than by tracing.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from skimage.measure import find_contours
 
-from simtest.geometry.arrays import Array, Image, Index, Mask
+from simtest.runtime.arrays import AnyArray, Array, Image, Index, Mask
 
 LINEAR_INTERPOLATION_PX2 = 1 / 6
 """Variance that linear interpolation between two pixels adds along their axis, px^2, averaged over the gap.
@@ -97,7 +95,7 @@ class Crossings:
         second = -self.share * level
         return Sensitivities(self.vertical, ends, np.array([-level - second, second]).T, level)
 
-    def each(self, table: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+    def each(self, table: AnyArray) -> list[AnyArray]:
         """Cut a table of all points, shape (N, ...), into those of the sets."""
         ends = np.cumsum(self.counts).tolist()
         return [table[start:end] for start, end in zip([0, *ends], ends, strict=False)]

@@ -8,9 +8,9 @@ from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry.arrays import Array, Image, Mask
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.level_sets import LevelSet, Sensitivities
+from simtest.runtime.arrays import Array, Image, Mask
 
 MIN_PLATEAU_PX = 12
 """Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""

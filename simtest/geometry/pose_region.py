@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from simtest.geometry.arrays import Array, Mask
 from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.arrays import Array, Mask
 
 CONFIDENCE = 0.95
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from simtest.geometry.arrays import Array
+from simtest.runtime.arrays import Array
 
 
 def angle_deg(first: Array, second: Array) -> Array:

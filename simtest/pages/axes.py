@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from simtest.pages.style import Array
+from simtest.runtime.arrays import Array
 
 Tick = tuple[float, str]
 

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.pages.axes import Axis
-from simtest.pages.style import NEUTRAL, Array, Symbol, symbols
+from simtest.pages.style import NEUTRAL, Symbol, symbols
+from simtest.runtime.arrays import Array, Image
 
 Line = Literal["solid", "dash", "dashdot", "dot", ""]
 
@@ -53,7 +54,7 @@ class Mark:
 class Picture(NamedTuple):
     """A grey picture in [0, 1] below the marks of a panel; in files only."""
 
-    values: npt.NDArray[np.float32]
+    values: Image
     extent: tuple[float, float, float, float]  # x0, x1, y1, y0
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Bars, Chart, Mark, Panel
-from simtest.pages.style import Array
+from simtest.runtime.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

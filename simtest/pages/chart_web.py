@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Bars, Chart, Mark, Panel
-from simtest.pages.style import Array, rgb
+from simtest.pages.style import rgb
+from simtest.runtime.arrays import Array
 
 PlotlyJson = dict[str, Any]
 """Plotly's own description of a figure or a part of it, as it leaves for the page."""

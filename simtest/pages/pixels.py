@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.pages.style import Array, rgb
+from simtest.pages.style import rgb
+from simtest.runtime.arrays import Array
 
 Pixels = npt.NDArray[np.uint8]
 Window = tuple[float, float, float, float]

@@ -4,9 +4,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-
-Array = npt.NDArray[np.float64]
 
 ESTIMATOR_COLOURS = {
     "cone_axis": "#0072B2",

@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.reconstruction.description import Array, SpecularityRecord
+from simtest.reconstruction.description import SpecularityRecord
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.detection.blobs import Highlight
@@ -18,10 +17,10 @@ from simtest.estimators.protocol import Estimate, drawable
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
 from simtest.runtime import provenance
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
 
-Array = npt.NDArray[np.float64]
 Points = list[list[float]]
 
 FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"

@@ -14,9 +14,8 @@ from PIL import Image as PillowImage
 from PIL import UnidentifiedImageError
 
 from simtest.errors import InputError
+from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
-
-Image = npt.NDArray[np.float32]
 
 MAX_PIXELS = 100_000_000
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction.constraints import Constraints
-from simtest.reconstruction.description import Array, PictureRecord, SpecularityRecord
+from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
+from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
 
 MANY = 10
@@ -35,7 +35,7 @@ FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.pl
 
 
 def write_outputs(
-    out: Path, record: PictureRecord, picture: npt.NDArray[np.float32], depth_mm: Sequence[float] | None = None
+    out: Path, record: PictureRecord, picture: Image, depth_mm: Sequence[float] | None = None
 ) -> list[Path]:
     """Write what was reconstructed in a picture, its overlay and its page; return the files.
 

@@ -4,13 +4,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.pages.style import colours
-from simtest.reconstruction.description import Array, Points, SpecularityRecord
+from simtest.reconstruction.description import Points, SpecularityRecord
+from simtest.runtime.arrays import Array, Image, Picture
 
-Image = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 SHORTEST_PX, CROWDED_PX = 900, 2000
@@ -27,7 +25,7 @@ NUMBER: Colour = (0, 255, 255)
 FRACTION_BITS = 4
 
 
-def draw_overlay(picture: Image, spots: Sequence[SpecularityRecord]) -> Bytes:
+def draw_overlay(picture: Image, spots: Sequence[SpecularityRecord]) -> Picture:
     """Draw a picture with what was reconstructed in it, as the article does: isophote, ellipse, both normals, number.
 
     The picture, shape (H, W) or (H, W, 3), is RGB in [0, 1], as encoded; the drawing is in OpenCV's order of channels,
@@ -54,7 +52,7 @@ def draw_overlay(picture: Image, spots: Sequence[SpecularityRecord]) -> Bytes:
 
 
 def _draw_spot(
-    canvas: Bytes, spot: SpecularityRecord, palette: dict[str, Colour], size: tuple[int, float],
+    canvas: Picture, spot: SpecularityRecord, palette: dict[str, Colour], size: tuple[int, float],
     shown: dict[str, Colour],
 ) -> None:  # fmt: skip
     """Draw the isophote at half height, the ellipses and candidates of circle_pose, and the best normal."""
@@ -75,7 +73,7 @@ def _draw_spot(
                 _arrow(canvas, result.look_px, normal, colour, size, 1 if k else 2)
 
 
-def _polyline(canvas: Bytes, points: Points, colour: Colour, scale: int) -> None:
+def _polyline(canvas: Picture, points: Points, colour: Colour, scale: int) -> None:
     if len(points) < 2:
         return
     # Pixel centres are at + 0.5 here, and integers in OpenCV.
@@ -83,7 +81,7 @@ def _polyline(canvas: Bytes, points: Points, colour: Colour, scale: int) -> None
     cv2.polylines(canvas, [corners.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
-def _arrow(canvas: Bytes, look: Array, normal: Array, colour: Colour, size: tuple[int, float], width: int) -> None:
+def _arrow(canvas: Picture, look: Array, normal: Array, colour: Colour, size: tuple[int, float], width: int) -> None:
     """Draw the part of a normal across the view."""
     scale, reach = size
     start = look * scale - 0.5
@@ -96,12 +94,12 @@ def _arrow(canvas: Bytes, look: Array, normal: Array, colour: Colour, size: tupl
     cv2.arrowedLine(canvas, ends[0], ends[1], colour, width, cv2.LINE_AA, FRACTION_BITS, tip)
 
 
-def _text(canvas: Bytes, text: str, corner: tuple[int, int], colour: Colour, size: float) -> None:
+def _text(canvas: Picture, text: str, corner: tuple[int, int], colour: Colour, size: float) -> None:
     for shade, width in (((0, 0, 0), 3), (colour, 1)):
         cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
 
 
-def _legend(width: int, count: int, shown: dict[str, Colour]) -> Bytes:
+def _legend(width: int, count: int, shown: dict[str, Colour]) -> Picture:
     strip = np.full((30, width, 3), 32, dtype=np.uint8)
     what = "specularity" if count == 1 else "specularities"
     _text(strip, f"{count} {what}", (8, 20), (255, 255, 255), 0.45)

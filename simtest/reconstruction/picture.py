@@ -4,9 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from simtest.calibration import Calibration, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
@@ -16,9 +13,8 @@ from simtest.geometry import Camera
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.image_io import is_coloured
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, SMOOTHING_BY_COLOUR_PX, run_pipeline
+from simtest.runtime.arrays import Image
 from simtest.spec import load_calibration
-
-Image = npt.NDArray[np.float32]
 
 DETECTORS = ("auto", "colour", "peaks")
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
@@ -14,6 +13,7 @@ from simtest.pages.html import write_page
 from simtest.pages.style import colours
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord, deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
+from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
 
 MAX_PICTURE_BYTES = 1_200_000
@@ -22,7 +22,7 @@ LEAST_FRAMES = 3
 """Shorter tracks are counted, not listed."""
 
 
-def write_picture_page(path: Path, record: PictureRecord, picture: npt.NDArray[np.float32]) -> None:
+def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> None:
     """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
     spots = record.specularities
     palette = colours(name for spot in spots for name in spot.estimates)
@@ -54,7 +54,7 @@ def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequ
     write_page(path, "sequence.html.j2", data, count=len(frames), tracks=listed, short=len(tracks) - len(listed))
 
 
-def _data_address(picture: npt.NDArray[np.float32]) -> str:
+def _data_address(picture: Image) -> str:
     """Return the picture as a JPEG's data address, of lower quality where it would be large."""
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
     values = values if values.ndim == 2 else cv2.cvtColor(values, cv2.COLOR_RGB2BGR)

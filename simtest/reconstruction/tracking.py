@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from simtest.reconstruction.description import Array, SpecularityRecord
+from simtest.reconstruction.description import SpecularityRecord
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 
 REACH_SHARE = 0.03

@@ -6,18 +6,18 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.rendering import backend
-from simtest.rendering.frames import FloatImage
+from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
 
 
-def write_exr(path: Path, image: FloatImage, variant: str | None = None) -> None:
+def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
     """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
     mi = backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
     bitmap.write(str(path))
 
 
-def read_bitmap(path: Path, variant: str | None = None) -> FloatImage:
+def read_bitmap(path: Path, variant: str | None = None) -> Image:
     """Read an OpenEXR file as float32, shape (H, W) or (H, W, C).
 
     Raises

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from simtest.rendering import emission
-from simtest.rendering.frames import Array
+from simtest.runtime.arrays import Array
 from simtest.spec.rig import Rig, is_at_camera
 
 

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering.frames import Array, TruthMaps
+from simtest.rendering.frames import TruthMaps
+from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
 
 _OF_POINTS = ("position", "normal", "k_min", "k_max", "direction_min", "direction_max")

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-FloatImage = npt.NDArray[np.float32]
-Array = npt.NDArray[np.float64]
+from simtest.runtime.arrays import Array, Image, Mask
 
 
 @dataclass(frozen=True)
@@ -20,12 +19,12 @@ class Radiance:
         Two dimensions in mono variants.
     """
 
-    specular: FloatImage
-    diffuse: FloatImage
-    indirect: FloatImage
+    specular: Image
+    diffuse: Image
+    indirect: Image
 
     @property
-    def total(self) -> FloatImage:
+    def total(self) -> Image:
         """Sum of the parts, shape (H, W) or (H, W, 3)."""
         return self.specular + self.diffuse + self.indirect
 
@@ -35,7 +34,7 @@ class Radiance:
         return 1 if self.specular.ndim == 2 else self.specular.shape[2]
 
     @property
-    def intensity(self) -> FloatImage:
+    def intensity(self) -> Image:
         """Mean of the channels, shape (H, W): what estimators see."""
         return self.total if self.channels == 1 else self.total.mean(axis=2, dtype=np.float32)
 
@@ -63,17 +62,17 @@ class Labels:
         Triangle of a mesh, 0 for other shapes; -1 where there is none.
     """
 
-    depth: FloatImage
-    position: FloatImage
-    normal: FloatImage
-    geometric_normal: FloatImage
-    k_min: FloatImage
-    k_max: FloatImage
+    depth: Image
+    position: Image
+    normal: Image
+    geometric_normal: Image
+    k_min: Image
+    k_max: Image
     instance: npt.NDArray[np.int32]
     face: npt.NDArray[np.int32]
 
     @property
-    def mask(self) -> npt.NDArray[np.bool_]:
+    def mask(self) -> Mask:
         """Where there is a surface, shape (H, W)."""
         return self.instance >= 0
 
@@ -123,7 +122,7 @@ class TruthMaps:
     k_max: Array
     direction_min: Array
     direction_max: Array
-    mask: npt.NDArray[np.bool_]
+    mask: Mask
 
     @property
     def larger_curvature(self) -> Array:

@@ -12,7 +12,8 @@ import numpy as np
 
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.rendering.frames import Array, HighlightPoint, Radiance
+from simtest.rendering.frames import HighlightPoint, Radiance
+from simtest.runtime.arrays import Array
 from simtest.spec.scene import Scene
 from simtest.surfaces.model import SurfacePoints
 

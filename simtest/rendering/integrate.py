@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import FloatImage, Radiance
+from simtest.rendering.frames import Radiance
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
 from simtest.rendering.shape_labels import ShapeLabels
+from simtest.runtime.arrays import Image
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
@@ -82,7 +83,7 @@ class Tracer:
 
     def centres(
         self, bounces: Bounces | None, radiance: bool, labels: ShapeLabels | None, progress: Progress | None = None
-    ) -> tuple[list[FloatImage], list[FloatImage]]:
+    ) -> tuple[list[Image], list[Image]]:
         """Trace the ray through each pixel's centre; `progress` is called after each launch.
 
         Returns
@@ -92,7 +93,7 @@ class Tracer:
         """
         camera = self.sightlines.camera
         pixels = camera.width * camera.height
-        rows: list[list[FloatImage]] = []
+        rows: list[list[Image]] = []
         count_of_parts = 0
         for block, (first, count) in enumerate(_blocks(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
@@ -113,16 +114,14 @@ class Tracer:
 
     # Several samples ---------------------------------------------------------------------------------------------
 
-    def mean(
-        self, samples: int, seed: int, bounces: Bounces | None, progress: Progress | None = None
-    ) -> list[FloatImage]:
+    def mean(self, samples: int, seed: int, bounces: Bounces | None, progress: Progress | None = None) -> list[Image]:
         """Compute the channels, shape (H, W) each, of the mean radiance over the pixels' area.
 
         `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
         """
         height, width = self.sightlines.tiled_size
         camera, total = self.sightlines.camera, height * width * samples
-        blocks: list[npt.NDArray[np.float32]] = []
+        blocks: list[Image] = []
         # Trace: sums over the samples of each block of pixels.
         for block, (first, count) in enumerate(_blocks(height * width)):
             lanes = self.sightlines.lanes(first, count, True, seed)
@@ -182,7 +181,7 @@ def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
         yield first, min(LANES, pixels - first)
 
 
-def _evaluate(values: list[Any], count: int) -> list[FloatImage]:
+def _evaluate(values: list[Any], count: int) -> list[Image]:
     """Compute all channels in one kernel; a constant one is broadcast."""
     import drjit as dr
 
@@ -191,11 +190,11 @@ def _evaluate(values: list[Any], count: int) -> list[FloatImage]:
     return [np.broadcast_to(np.array(value, dtype=np.float32), (count,)) for value in values]
 
 
-def as_radiance(parts: list[FloatImage]) -> Radiance:
+def as_radiance(parts: list[Image]) -> Radiance:
     """Make a `Radiance` from the channels of the lobe, of the base and, if there are any, of further bounces."""
     width = 1 if len(parts) in (2, 3) else 3
 
-    def image(first: int) -> FloatImage:
+    def image(first: int) -> Image:
         own = parts[first * width : (first + 1) * width]
         if not own:
             own = [np.zeros_like(parts[0])] * width

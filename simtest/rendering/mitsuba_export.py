@@ -13,11 +13,11 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.rendering import backend, phong
-from simtest.rendering.frames import Array
 from simtest.rendering.materials import bsdf_dict
 from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.shapes import make_shape
 from simtest.runtime import provenance
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec import Scene
 from simtest.spec.reflectance import PhongReflectance

@@ -3,7 +3,7 @@
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering.frames import Array
+from simtest.runtime.arrays import Array
 from simtest.spec.rig import Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel

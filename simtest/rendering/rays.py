@@ -10,7 +10,7 @@ import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera
-from simtest.rendering.frames import Array
+from simtest.runtime.arrays import Array
 
 TILE = 4
 """Pixels along a side of the tiles in which several samples a pixel are traced: neighbours hit the same triangles."""

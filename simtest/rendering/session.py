@@ -13,7 +13,7 @@ import numpy as np
 from simtest.rendering import backend, emission, highlights, phong
 from simtest.rendering import exact_points as exact
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import Array, FloatImage, Frame, HighlightPoint, Radiance, TruthMaps
+from simtest.rendering.frames import Frame, HighlightPoint, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
@@ -22,6 +22,7 @@ from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.shapes import make_shape
+from simtest.runtime.arrays import Array, Image
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
@@ -133,7 +134,7 @@ class Session:
 
     def _forget(self) -> None:
         self._truth: TruthMaps | None = None
-        self._centre: list[FloatImage] = []
+        self._centre: list[Image] = []
 
     def _structure(self) -> tuple[Any, ...]:
         """Return everything of the scene that is compiled into the kernels."""
@@ -230,7 +231,7 @@ class Session:
         refinement = Refinement(self.mi, self._shape)
         return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
 
-    def _centre_hits(self) -> list[FloatImage]:
+    def _centre_hits(self) -> list[Image]:
         """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""
         if not self._centre:
             labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from simtest.rendering.exact_points import pack_hits
-from simtest.rendering.frames import Array, FloatImage, Labels
+from simtest.rendering.frames import Labels
 from simtest.rendering.rays import Rays
+from simtest.runtime.arrays import Array, Image
 from simtest.surfaces import RayHits
 
 CHANNELS = (
@@ -106,12 +107,12 @@ class ShapeLabels:
         return form(first, first), form(first, second), form(second, second)
 
 
-def as_labels(channels: list[FloatImage]) -> Labels:
+def as_labels(channels: list[Image]) -> Labels:
     """Arrange the channels of `CHANNELS`, each of shape (H, W)."""
     named = dict(zip(CHANNELS, channels, strict=True))
     seen = np.isfinite(named["depth"])
 
-    def vector(*names: str) -> FloatImage:
+    def vector(*names: str) -> Image:
         # The components stay separate in memory, which saves a copy from pixel to pixel.
         return np.moveaxis(np.stack([named[name] for name in names]), 0, -1)
 
@@ -127,7 +128,7 @@ def as_labels(channels: list[FloatImage]) -> Labels:
     )
 
 
-def as_hits(channels: list[FloatImage]) -> tuple[RayHits, Array, Array]:
+def as_hits(channels: list[Image]) -> tuple[RayHits, Array, Array]:
     """Return the hits that the exact truth starts from, and shading and geometric normals, camera frame, (N, 3)."""
     named = {name: channel.ravel() for name, channel in zip(CHANNELS, channels, strict=True)}
     barycentric = np.stack([named["second"], named["third"]], axis=1)

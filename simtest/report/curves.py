@@ -9,8 +9,9 @@ from scipy.special import stdtrit
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.pages.axes import Axis
-from simtest.pages.style import Array, estimator_order
+from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
+from simtest.runtime.arrays import Array
 from simtest.validation import laws
 
 _BINS = 12

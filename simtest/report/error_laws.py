@@ -7,9 +7,10 @@ from typing import get_args
 import numpy as np
 import polars as pl
 
-from simtest.pages.style import Array, degrees, number
+from simtest.pages.style import degrees, number
 from simtest.report.run_folder import Run
 from simtest.report.series import TOLERANCE_DEG, TOLERANCE_SHARE
+from simtest.runtime.arrays import Array
 from simtest.spec.experiment import LawName
 from simtest.validation import laws
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from simtest.pages import pixels
 from simtest.pages.pixels import Canvas, Pixels, Window
-from simtest.pages.style import NEUTRAL, TRUTH, Array, hexadecimal
+from simtest.pages.style import NEUTRAL, TRUTH, hexadecimal
 from simtest.report.run_folder import GalleryItem, KeptEstimate
+from simtest.runtime.arrays import Array
 
 HEIGHT_PX, PAGE_PX = 400, 300
 """Height of a picture in its file and in the page."""

@@ -8,9 +8,10 @@ import polars as pl
 
 from simtest.pages.axes import Axis, finite
 from simtest.pages.chart import NOTHING, Chart, Mark, Panel
-from simtest.pages.style import Array, Symbol, estimator_order, hexadecimal, number
+from simtest.pages.style import Symbol, estimator_order, hexadecimal, number
 from simtest.report.curves import prepared, scattered, varies
 from simtest.report.run_folder import Run
+from simtest.runtime.arrays import Array
 
 _COLOURS = "cividis"
 """Colour map; perceptually uniform and colour-blind-safe."""

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.pages.style import Array, degrees
+from simtest.pages.style import degrees
+from simtest.runtime.arrays import Array, Image
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.paper import PaperSetting
 
@@ -111,12 +111,12 @@ class GalleryItem:
     """One frame of the gallery with its truth and estimates."""
 
     name: str
-    frame: npt.NDArray[np.float32]  # share of full scale, shape (H, W) or (H, W, 3)
-    position: npt.NDArray[np.float32]  # downsampled truth, camera frame, shape (h, w, 3); NaN without a surface
-    normal: npt.NDArray[np.float32]
+    frame: Image  # share of full scale, shape (H, W) or (H, W, 3)
+    position: Image  # downsampled truth, camera frame, shape (h, w, 3); NaN without a surface
+    normal: Image
     camera: Camera
     meta: GalleryMeta
-    pictures: Mapping[str, npt.NDArray[np.float32]]  # further ones by name
+    pictures: Mapping[str, Image]  # further ones by name
 
     @property
     def title(self) -> str:

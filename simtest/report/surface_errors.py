@@ -8,9 +8,10 @@ import polars as pl
 
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import Array, Symbol, degrees, estimator_order
+from simtest.pages.style import Symbol, degrees, estimator_order
 from simtest.report.coverage import is_anatomical
 from simtest.report.run_folder import Run
+from simtest.runtime.arrays import Array
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
 

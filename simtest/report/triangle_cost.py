@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
+from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import Chart, Mark, Panel, label_keys
 from simtest.pages.style import NEUTRAL, symbols
-from simtest.surfaces.fineness import EDGES_PER_HALF_WIDTH
 
 DATA = Path(__file__).with_name("triangle_cost.json")
 

@@ -6,16 +6,16 @@ from html import escape
 from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.pages import chart_png
 from simtest.pages.chart import Mark
 from simtest.pages.chart_web import PlotlyJson, rounded
 from simtest.pages.pixels import GAMMA, Pixels
-from simtest.pages.style import LIGHT, NEUTRAL, Array
+from simtest.pages.style import LIGHT, NEUTRAL
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
+from simtest.runtime.arrays import Array, IntArray, Mask
 
 _GRID, _NORMALS = 72, 9
 """Samples of the surface along the longer side, and of the normals that are drawn all over it."""
@@ -49,7 +49,7 @@ class View3D:
 
     title: str
     vertices: Array
-    triangles: npt.NDArray[np.int64]
+    triangles: IntArray
     intensity: Array  # grey value at the vertices
     segments: tuple[Segments, ...]
     unit: str
@@ -110,7 +110,7 @@ def _build(item: GalleryItem, colours: Mapping[str, str]) -> View3D | None:
     )  # fmt: skip
 
 
-def grid_triangles(position: Array, occlusion: float) -> npt.NDArray[np.int64]:
+def grid_triangles(position: Array, occlusion: float) -> IntArray:
     """Join neighbouring samples of a surface, shape (h, w, 3), camera frame, NaN where there is none.
 
     Where the distances of neighbours differ by more than the factor `occlusion`, they lie on both sides of an edge and
@@ -135,7 +135,7 @@ def _intensity(item: GalleryItem, shape: tuple[int, int], step: int) -> Array:
     return np.clip(frame[np.ix_(y, x)], 0, 1).astype(float)
 
 
-def _everywhere(position: Array, normal: Array, valid: npt.NDArray[np.bool_], reach: float) -> Segments:
+def _everywhere(position: Array, normal: Array, valid: Mask, reach: float) -> Segments:
     rows, columns = (np.linspace(0, n - 1, min(n, _NORMALS + 2)).round().astype(int)[1:-1] for n in position.shape[:2])
     kept = np.zeros_like(valid)
     kept[np.ix_(rows, columns)] = True

@@ -16,6 +16,9 @@ Picture = npt.NDArray[np.uint8]
 
 Mask = npt.NDArray[np.bool_]
 
+Index = npt.NDArray[np.intp]
+"""Positions in other arrays, as NumPy returns them."""
+
 IntArray = npt.NDArray[np.int64]
 """Indices, faces, counts."""
 

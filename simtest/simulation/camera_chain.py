@@ -4,14 +4,12 @@
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import srgb_encode
 from simtest.calibration.calibration import falloff_map
 from simtest.geometry import Camera, smooth
+from simtest.runtime.arrays import Image, Picture
 from simtest.spec.sensor import Sensor
-
-Image = npt.NDArray[np.float32]
 
 MAX_COUNT = 1e15
 """Beyond this many electrons shot noise is below the resolution of a float32 frame, and no Poisson numbers exist."""
@@ -59,7 +57,7 @@ def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Gene
     return encode(frame, sensor) if sensor.clips else frame
 
 
-def encode(frame: npt.NDArray[np.float32], sensor: Sensor) -> Image:
+def encode(frame: Image, sensor: Sensor) -> Image:
     """Clip a linear frame to full scale, apply the response and quantise."""
     # Saturation and response, then quantisation.
     values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0))
@@ -101,7 +99,7 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
     return np.asarray(frame, dtype=np.float32)
 
 
-def to_uint8(frame: Image) -> npt.NDArray[np.uint8]:
+def to_uint8(frame: Image) -> Picture:
     """Return the sRGB-encoded 8-bit picture of a linear frame, clipped to [0, 1]."""
     linear = np.clip(np.nan_to_num(frame, nan=0.0), 0, 1)
     return np.asarray(np.round(255 * srgb_encode(linear)), dtype=np.uint8)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
+from simtest.runtime.arrays import Image
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.labelled_frame import LabelledFrame
@@ -85,7 +86,7 @@ def _calibration_file(scene: Scene) -> str:
     return "# What is known of frame.png; pixel centres at integer + 0.5.\n" + toml_tables(stated)
 
 
-def encoded_png(image: npt.NDArray[np.float32], sensor: Sensor) -> bytes:
+def encoded_png(image: Image, sensor: Sensor) -> bytes:
     """Encode a sensor's frame as PNG: the sensor's own values, or else the sRGB-encoded frame."""
     picture: npt.NDArray[np.unsignedinteger]
     if sensor.encodes:

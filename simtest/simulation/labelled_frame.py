@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import Progress, Radiance, Session, TruthMaps
+from simtest.runtime.arrays import Image
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Scene
@@ -39,7 +37,7 @@ class LabelledFrame:
 
     scene: Scene
     camera: Camera
-    image: npt.NDArray[np.float32]
+    image: Image
     radiance: Radiance
     truth: TruthMaps
     highlights: list[TrueHighlight]

@@ -4,17 +4,14 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import Calibration, NoiseModel
 from simtest.rendering import HighlightPoint, Radiance, Session
+from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.camera_chain import capture, collect
 from simtest.simulation.true_highlights import TrueHighlight, judge
 from simtest.spec import Scene
-
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 LEAST_SHARE = 1e-12
 """A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
@@ -95,7 +92,7 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
     return radiance / exposure.gain
 
 
-def _light_at(light: Image, point_px: npt.NDArray[np.float64]) -> float:
+def _light_at(light: Image, point_px: Array) -> float:
     """Return the light of the pixel that a point, px, lies in."""
     column, row = (min(int(v), size - 1) for v, size in zip(point_px, light.shape[::-1], strict=True))
     return float(light[row, column])

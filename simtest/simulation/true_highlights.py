@@ -4,7 +4,6 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import NoiseModel
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
@@ -12,10 +11,9 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
+from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.files import Json
 
-Image = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 Pixel = tuple[int, int]
 """Row and column."""
 

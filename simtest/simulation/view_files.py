@@ -5,9 +5,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.runtime.arrays import Picture
 from simtest.runtime.files import write_atomically
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.frame_files import encoded_png
@@ -17,8 +17,6 @@ from simtest.simulation.viewpoints import WrittenView
 FRAMES_PER_SECOND = 25.0
 SHEET_WIDTH = 1600
 SHEET_COLUMNS = 10
-
-Picture = npt.NDArray[np.uint8]
 
 
 class ViewWriter:

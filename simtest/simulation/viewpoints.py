@@ -7,11 +7,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from simtest.errors import InputError
 from simtest.rendering import Session
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import AnatomySurface, Scene
@@ -59,7 +57,7 @@ class SampledView:
 
     viewpoint: int | float
     isolated_highlights: int
-    model_from_camera: npt.NDArray[np.float64]
+    model_from_camera: Array
     written: WrittenView | None
 
     def to_json(self, key: str) -> dict[str, Json]:

@@ -5,6 +5,7 @@ from typing import overload
 
 import numpy as np
 
+from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
 
@@ -13,9 +14,6 @@ DEFAULT_EXPONENT = 200.0
 
 ISOVALUE = 0.5
 """Level at which half-widths are taken: the middle of the default isovalues."""
-
-EDGES_PER_HALF_WIDTH = 2.0
-"""Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/meshes.md)."""
 
 LEAST_STRETCH = 0.25
 """Below this |1 + d k| there is no isolated highlight (docs/theory.md, section 6)."""

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.runtime.arrays import Array, IntArray
-from simtest.surfaces.fineness import EDGES_PER_HALF_WIDTH, needed_edge
+from simtest.surfaces.fineness import needed_edge
 from simtest.surfaces.mesh_file import other_unit, read_mesh
 from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, edge_uses, vertex_areas
 from simtest.surfaces.mesh_surface import is_lumen

@@ -13,10 +13,8 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.image_io import MAX_PIXELS, read_raw
+from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.resources import shown
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 

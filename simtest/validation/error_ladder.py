@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration import NO_PRIORS
 from simtest.conventions import CIRCLE_POSE_ISOVALUE, CONE_AXIS_ISOVALUES, DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
@@ -20,11 +19,10 @@ from simtest.geometry import Camera, CirclePose, Patch
 from simtest.geometry.circle_from_cone import circle_pose as pose_of_cone
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import Stage, generator
 from simtest.validation import laws
 from simtest.validation.statistics import mean_interval
-
-Array = npt.NDArray[np.float64]
 
 DISTANCE_MM = 10.0
 EXPONENT = 50.0
@@ -92,7 +90,7 @@ class ClosedScene:
         out[1] = 0.0
         return np.asarray(out / np.linalg.norm(out))
 
-    def frame(self) -> npt.NDArray[np.float32]:
+    def frame(self) -> Image:
         """Compute the noise-free frame, shape (H, W), with a peak of 1."""
         columns, rows = np.meshgrid(*(np.arange(n) + PIXEL_CENTRE for n in (CAMERA.width, CAMERA.height)))
         value = self.radiance(CAMERA.unproject(np.stack([columns, rows], axis=-1)))
@@ -243,7 +241,7 @@ def _rung(scene: ClosedScene, estimator: str, name: str, found: Sequence[Array |
     return Rung(scene.name, estimator, name, np.array(errors), len(found) - len(errors))
 
 
-def _whole(frame: npt.NDArray[np.float32], smoothing_px: float) -> tuple[dict[str, Array | None], Patch | Failure]:
+def _whole(frame: Image, smoothing_px: float) -> tuple[dict[str, Array | None], Patch | Failure]:
     """Reconstruct a frame as a user would; return the candidates by estimator, and the patch.
 
     A frame without a peak is a fault of the tested code: it counts as one without an answer.

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
-
-Array = npt.NDArray[np.float64]
+from simtest.runtime.arrays import Array
 
 
 def axis_ratio(kd_min: npt.ArrayLike, kd_max: npt.ArrayLike) -> Array:

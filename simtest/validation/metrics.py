@@ -13,7 +13,7 @@ from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import HighlightPoint, Session
-from simtest.rendering.frames import Array
+from simtest.runtime.arrays import Array
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws

@@ -6,7 +6,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import HighlightPoint
-from simtest.rendering.frames import Array
+from simtest.runtime.arrays import Array
 from simtest.spec.falloff import CosineProfile
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.rig import is_at_camera

@@ -3,13 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from simtest.errors import Reason
 from simtest.estimators import AnyEstimator
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
+from simtest.runtime.arrays import Image
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
@@ -17,8 +15,6 @@ from simtest.validation.cases import Case
 from simtest.validation.matching import match
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
-
-Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)

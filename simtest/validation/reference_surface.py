@@ -20,6 +20,7 @@ from simtest.reconstruction.description import (
     ReferenceRecord,
     SpecularityRecord,
 )
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
@@ -30,8 +31,6 @@ from simtest.validation.depth_maps import (
     interpolate,
     read_depth,
 )
-
-Array = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
 """Largest difference of R^T R from the identity, entry by entry: poses are written with a few digits."""
@@ -46,7 +45,7 @@ class Model:
     faces: npt.NDArray[np.integer]
 
     @cached_property
-    def _tree(self) -> tuple[Any, Array, npt.NDArray[np.int64]]:
+    def _tree(self) -> tuple[Any, Array, IntArray]:
         import igl
 
         vertices, faces = np.ascontiguousarray(self.vertices), np.ascontiguousarray(self.faces, dtype=np.int64)

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy import stats
 
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
 
-Array = npt.NDArray[np.float64]
 Interval = tuple[float | None, float | None]
 
 PENALTY_DEG = 90.0

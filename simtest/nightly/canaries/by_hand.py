@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from simtest.runtime.arrays import Array
 
 CAMERA = {"width": 160, "height": 128, "fx": 150.0, "fy": 150.0, "cx": 83.0, "cy": 61.0}
 """Camera of the rendered canaries."""

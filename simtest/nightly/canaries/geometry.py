@@ -1,14 +1,12 @@
 """Canaries of the geometry alone: nothing is rendered, and every expected number is computed by hand."""
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, circle_pose, cone_axes, cone_of_conic, ellipse_of_conic, fit_ellipse
 from simtest.nightly.canaries.canary import canary
 from simtest.nightly.records import Figure
-
-Array = npt.NDArray[np.float64]
+from simtest.runtime.arrays import Array
 
 FX, FY, CX, CY = 500.0, 480.0, 330.25, 229.75
 """Intrinsics of a camera whose numbers all differ."""

@@ -8,21 +8,19 @@ error rates. A mean of rows is a ratio of sums over units; its variance is that 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy import stats
 
 from simtest.nightly.gate.quantities import Quantity
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.validation.statistics import CONFIDENCE
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Outcomes:
     """Results of the tests of one quantity in N cells, in its harm, shape (N,); NaN where a test cannot be made."""
 
-    n: npt.NDArray[np.int64]  # units; of the smaller run where they are not paired
+    n: IntArray  # units; of the smaller run where they are not paired
     baseline: Array  # mean
     tonight: Array
     difference: Array  # tonight less the baseline
@@ -31,7 +29,7 @@ class Outcomes:
     margin: Array  # its harmless size
     worse: Array  # p-value of "no worse than by the margin"
     better: Array  # p-value of "no better than by the margin"
-    within: npt.NDArray[np.bool_]  # whether no pair differs by more than the margin
+    within: Mask  # whether no pair differs by more than the margin
     deviation: Array  # standard error of the difference
     freedom: Array  # its degrees of freedom; 0 where there is no standard error
 

@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from simtest.runtime.arrays import Array
 
 
 def holm(p: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> Array:

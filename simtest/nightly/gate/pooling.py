@@ -6,8 +6,9 @@ changed, and never beyond 2, however heavy the errors' tails. A sum of many such
 
 import numpy as np
 
-from simtest.nightly.gate.contrasts import Array, Outcomes, half_width, tail
+from simtest.nightly.gate.contrasts import Outcomes, half_width, tail
 from simtest.nightly.gate.quantities import Quantity
+from simtest.runtime.arrays import Array
 
 MIN_UNITS = 5
 """Where each cell has as many units, the cells' own standard errors are taken."""

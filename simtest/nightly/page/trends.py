@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL, NightlyRun
-from simtest.pages.style import Array
-
-Mask = npt.NDArray[np.bool_]
+from simtest.runtime.arrays import AnyArray, Array, Mask
 
 NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
 HISTORY_COLUMNS = ("kind", *CELL, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
@@ -223,5 +220,5 @@ def _places(column: pl.Series, names: Sequence[str]) -> list[int]:
     return [place[name] for name in column]
 
 
-def _text(data: npt.NDArray[Any]) -> str:
+def _text(data: AnyArray) -> str:
     return base64.b64encode(data.tobytes()).decode("ascii")

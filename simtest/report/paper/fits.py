@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from simtest.geometry.isocurves import isophote_radius
-from simtest.pages.style import Array
 from simtest.report.paper.sweeps import Value
+from simtest.runtime.arrays import Array
 
 
 class Line(NamedTuple):

@@ -8,7 +8,8 @@ from skimage.measure import find_contours
 from simtest.geometry.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Array, Symbol, symbols
+from simtest.pages.style import NEUTRAL, Symbol, symbols
+from simtest.runtime.arrays import Array
 
 KAPPA = 0.55
 """The article's value."""

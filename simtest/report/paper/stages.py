@@ -3,15 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
-from simtest.pages.style import NEUTRAL, TRUTH, Array, Symbol, degrees, labelled
+from simtest.pages.style import NEUTRAL, TRUTH, Symbol, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
+from simtest.runtime.arrays import Array, Image
 from simtest.spec.paper import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
@@ -26,11 +26,11 @@ class Stages:
 
     setting: str  # name of the setting, with the drawn values
     theta_deg: float  # slant
-    texture: npt.NDArray[np.float32]
+    texture: Image
     side: float  # of the texture's window, texture units
-    clean: npt.NDArray[np.float32]  # the part of the camera's picture that is used, shape (h, w)
-    noisy: npt.NDArray[np.float32]
-    smoothed: npt.NDArray[np.float32]  # normalised to its peak
+    clean: Image  # the part of the camera's picture that is used, shape (h, w)
+    noisy: Image
+    smoothed: Image  # normalised to its peak
     extent: tuple[float, float, float, float]  # x0, x1, y1, y0 of that part, px
     isovalue: float  # t
     isophote: Array | None  # px, shape (k, 2); None where the realisation failed
@@ -122,7 +122,7 @@ def stage_charts(data: Stages, colour: str) -> list[Chart]:
 
 
 def _picture(
-    title: str, values: npt.NDArray[np.float32], extent: tuple[float, float, float, float], titles: tuple[str, ...],
+    title: str, values: Image, extent: tuple[float, float, float, float], titles: tuple[str, ...],
     marks: tuple[Mark, ...],
 ) -> Chart:  # fmt: skip
     x0, x1, y1, y0 = extent

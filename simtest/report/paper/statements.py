@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.pages.style import Array, degrees, number
+from simtest.pages.style import degrees, number
 from simtest.report.paper import explanations, fits
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
 from simtest.report.paper.sweeps import Sweep, SweepFigure, Value
+from simtest.runtime.arrays import Array
 
 AGREES, DIFFERS, ABSENT = "agrees", "differs", "not in this run"
 PART, FEW = "only part of the range", "too few realisations"

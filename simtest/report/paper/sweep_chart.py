@@ -7,8 +7,9 @@ import numpy as np
 
 from simtest.pages.axes import Axis, finite
 from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Array, Symbol, number, symbols
+from simtest.pages.style import NEUTRAL, Symbol, number, symbols
 from simtest.report.paper.sweeps import Sweep, SweepFigure
+from simtest.runtime.arrays import Array
 
 BOUND_NAME = "Cramér-Rao bound (an RMS angle)"
 LAW_NAME = "predicted bias of the smoothing, no noise"

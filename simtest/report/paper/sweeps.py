@@ -8,9 +8,10 @@ import numpy as np
 import polars as pl
 
 from simtest.pages.axes import Axis, finite
-from simtest.pages.style import Array, degrees, estimator_order, number
+from simtest.pages.style import degrees, estimator_order, number
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
 from simtest.report.run_folder import Run
+from simtest.runtime.arrays import Array
 
 Value = float | bool | None
 """What a row holds of a parameter."""

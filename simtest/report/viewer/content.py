@@ -2,18 +2,15 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from simtest.calibration import Calibration
 from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.report.view3d import grid_triangles
-from simtest.runtime.arrays import Array, IntArray
-from simtest.simulation.rendered_view import render_view
+from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Scene
 
 GRID = 240
@@ -34,7 +31,7 @@ class Content:
     lights: Array  # true positions, shape (L, 3)
     highlights: Array  # true isolated ones, shape (N, 3)
     normals: Array  # at these
-    estimator: npt.NDArray[Any]  # name of each estimate's estimator, shape (E,)
+    estimator: AnyArray  # name of each estimate's estimator, shape (E,)
     looks: Array  # point that each estimate looks at, shape (E, 3)
     estimates: Array  # proposed normals
 
@@ -60,7 +57,7 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     camera = session.camera
     corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float)
     found = [truth for truth in seen.highlights if truth.isolated]
-    names, looks, estimates = _estimates(session, seen.frame(scene.sensor.seed), seen.calibration)
+    names, looks, estimates = _estimates(session, seen)
     return Content(
         vertices=vertices,
         faces=faces,
@@ -85,12 +82,10 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     return position[valid], faces, curvature[valid]
 
 
-def _estimates(
-    session: Session, frame: npt.NDArray[np.float32], calibration: Calibration
-) -> tuple[list[str], Array, Array]:
+def _estimates(session: Session, seen: RenderedView) -> tuple[list[str], Array, Array]:
     """Return names, points looked at and normals of all estimates that look at the surface."""
     names, pixels, normals = [], [], []
-    for specularity in reconstruct(frame, calibration):
+    for specularity in reconstruct(seen.frame(seen.scene.sensor.seed), seen.calibration):
         for name, estimate in specularity.estimates.items():
             if not isinstance(estimate, Failure):
                 names.append(name)

@@ -1,12 +1,10 @@
 """The Cramer-Rao bound of the published protocol: how well any unbiased method could do on its frames."""
 
 import numpy as np
-import numpy.typing as npt
 
+from simtest.runtime.arrays import Array, Mask
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.slanted_view import region_of_interest
-
-Array = npt.NDArray[np.float64]
 
 _STEPS = np.array([1e-5, 1e-5, 1e-2, 1e-2, 1e-4, 1e-2, 1e-3])
 """Central-difference steps of the parameters: tilts (rad), BP (px), log scale, n, c."""
@@ -81,7 +79,7 @@ def _model(setting: PaperSetting, parameters: Array) -> Array:
     return np.asarray(peak * np.maximum(cosine, 0) ** exponent)
 
 
-def _inside_window(setting: PaperSetting) -> npt.NDArray[np.bool_]:
+def _inside_window(setting: PaperSetting) -> Mask:
     """Return which pixels see the texture's window in front of the camera, shape (h, w) like the sightlines."""
     rays = _sightlines(setting)
     theta, centre = np.radians(setting.theta_deg), np.array([0.0, 0.0, setting.height])

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.geometry.isocurves import brightest_point
+from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
@@ -22,8 +22,6 @@ from simtest.validation.gallery_items import (
 from simtest.validation.paper.published_pipeline import Stages
 from simtest.validation.paper.rows import SURFACE, pipeline_with
 from simtest.validation.paper.slanted_view import Box, plane_from_image, texture, window_centre
-
-Array = npt.NDArray[np.float64]
 
 LENGTH_UNIT = "texture units"
 

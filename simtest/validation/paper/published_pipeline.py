@@ -6,18 +6,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from simtest.detection import estimate_noise
+from simtest.calibration import estimate_noise
 from simtest.errors import Failure
 from simtest.estimators import Estimate, Estimator
 from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.dispatch import run_each
 from simtest.geometry import Patch
+from simtest.runtime.arrays import Array
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.slanted_view import Box, draw_light, picture, region_of_interest, sample_positions
-
-Array = npt.NDArray[np.float64]
 
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""

@@ -6,14 +6,13 @@ centres at + 0.5; the camera has f = M.
 """
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.isocurves import brightest_point
+from simtest.runtime.arrays import Array
 from simtest.spec.paper import PaperSetting
 
-Array = npt.NDArray[np.float64]
 Box = tuple[int, int, int, int]
 """Column, row, width, height, px."""
 

@@ -1,7 +1,6 @@
 """Predicts the bias of circle pose under smoothing: its error without noise (docs/theory.md, section 4)."""
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.geometry.circle_from_cone import circle_pose
@@ -10,8 +9,6 @@ from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.slanted_view import plane_from_image
-
-Array = npt.NDArray[np.float64]
 
 MARGIN_WIDTHS = 2.0
 """The texture's window must go on for this many smoothing widths beyond the isophote for the law to hold."""
