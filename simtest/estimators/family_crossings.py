@@ -12,7 +12,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue
 from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
 from simtest.geometry import Array, Camera, Index, Mask, Patch
-from simtest.geometry.level_sets import Sensitivities
+from simtest.geometry.level_sets import Crossings
 
 STEP_PX = 0.1
 """Step of the central differences of a distorting lens's sightlines."""
@@ -92,7 +92,7 @@ class FamilyCrossings:
             Their derivatives by a common shift of all -ln t, and the peak value that t is relative to: it moves the
             levels one way, the peak's pixel the other.
         """
-        noise, moved = self.patch.noise, self._sensitivities
+        noise, crossings = self.patch.noise, self._crossings
         assert noise is not None
         # by crossing, through the conics
         by_moment, moments = self._conics_by_crossings
@@ -100,8 +100,8 @@ class FamilyCrossings:
             [each @ moments[:, part] for each, part in zip(by_conic @ by_moment, self._parts, strict=True)], axis=1
         )
         # by smoothed pixel: the two beside each crossing, and the peak's, which sets the level
-        by_peak = by_crossing @ (moved.level * np.repeat(self.isovalues, self._counts))
-        moves, pixels = [(by_crossing[:, :, None] * moved.weights).reshape(len(by_peak), -1)], [self._pixels]
+        by_peak = by_crossing @ (crossings.by_level * np.repeat(self.isovalues, self._counts))
+        moves, pixels = [(by_crossing[:, :, None] * crossings.by_pixels).reshape(len(by_peak), -1)], [self._pixels]
         if by_level is not None:
             by_shift, peak = by_level
             by_peak = by_peak - by_shift / self.patch.peak_value
@@ -153,19 +153,19 @@ class FamilyCrossings:
         return (ax + by + d) * x + (cy + e) * y - 1, np.array([2 * ax + by + d, bx + 2 * cy + e])
 
     @cached_property
-    def _sensitivities(self) -> Sensitivities:
-        """How the points move along their lines with the patch's pixels."""
-        return self.patch.sensitivities(self.isovalues.tolist(), [isophote.cut for isophote in self.isophotes])
+    def _crossings(self) -> Crossings:
+        """The points as crossings of lines between pixels, with how they move along these."""
+        return self.patch.traced(self.isovalues.tolist(), [isophote.cut for isophote in self.isophotes])
 
     @cached_property
     def _pixels(self) -> Index:
         """Indices in the flattened patch of the two pixels beside each point, shape (2 N,)."""
-        pixels = self._sensitivities.pixels
+        pixels = self._crossings.pixels
         return np.asarray(pixels[..., 1] * self.patch.values.shape[1] + pixels[..., 0]).ravel()
 
     @cached_property
     def _conics_by_crossings(self) -> tuple[Array, Array]:
         """Derivatives of the conics by their crossings (see `conics_by_crossings`)."""
-        moves = self._steps(self._sensitivities.vertical)
+        moves = self._steps(self._crossings.vertical)
         cut = [isophote.cut for isophote in self.isophotes]
         return conics_by_crossings(self._point_tangents, self._misses[1], moves, self._parts, cut)

@@ -54,7 +54,7 @@ class IsophoteTracer:
 
     def crossings(self, sets: list[LevelSet]) -> Crossings:
         """Return where the borders of level sets cross the lines between pixel centres."""
-        # Usually the points are asked for first, then their sensitivities.
+        # Usually the points are used first, then how they move.
         key = tuple(sets)
         if key not in self._crossings:
             self._crossings[key] = crossings(sets)

@@ -26,30 +26,6 @@ _ABOVE, _REGION, _OUTSIDE = 1, 2, 3
 
 
 @dataclass(frozen=True)
-class Sensitivities:
-    """How the crossings of a level set move along the lines that they lie on, to first order.
-
-    Crossing i moves by w1_i dI(first) + w2_i dI(second) + wl_i dlevel px along its line.
-
-    Parameters
-    ----------
-    vertical : ndarray of bool, shape (N,)
-        Whether the line is vertical; else it is horizontal.
-    pixels : ndarray of int, shape (N, 2, 2)
-        Column and row of the line's first and second pixel in the region's array.
-    weights : ndarray, shape (N, 2)
-        w1 and w2, px per unit of intensity.
-    level : ndarray, shape (N,)
-        wl, px per unit of intensity.
-    """
-
-    vertical: Mask
-    pixels: Index
-    weights: Array
-    level: Array
-
-
-@dataclass(frozen=True)
 class Crossings:
     """Where the borders of K level sets cross the lines between pixel centres, by linear interpolation.
 
@@ -85,15 +61,24 @@ class Crossings:
         return points
 
     @property
-    def sensitivities(self) -> Sensitivities:
-        """How the points move with the intensities."""
+    def pixels(self) -> Index:
+        """Column and row of each line's two pixels in the regions' array, shape (N, 2, 2)."""
         ends = np.empty((len(self.first), 2, 2), dtype=np.intp)
         ends[:, 0] = ends[:, 1] = self.first
         ends[:, 1, 0] += ~self.vertical
         ends[:, 1, 1] += self.vertical
-        level = 1 / self.rise
-        second = -self.share * level
-        return Sensitivities(self.vertical, ends, np.array([-level - second, second]).T, level)
+        return ends
+
+    @property
+    def by_level(self) -> Array:
+        """Derivative of each point along its line by the level, px per unit of intensity, shape (N,)."""
+        return 1 / self.rise
+
+    @property
+    def by_pixels(self) -> Array:
+        """Derivatives of each point along its line by the intensities of the line's two pixels, shape (N, 2)."""
+        second = -self.share * self.by_level
+        return np.array([-self.by_level - second, second]).T
 
     def each(self, table: AnyArray) -> list[AnyArray]:
         """Cut a table of all points, shape (N, ...), into those of the sets."""

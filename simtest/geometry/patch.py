@@ -9,7 +9,7 @@ from scipy import ndimage
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.isophotes import IsophoteTracer
-from simtest.geometry.level_sets import LevelSet, Sensitivities
+from simtest.geometry.level_sets import Crossings, LevelSet
 from simtest.runtime.arrays import Array, Image, Mask
 
 MIN_PLATEAU_PX = 12
@@ -177,14 +177,14 @@ class Patch:
         """
         return self._isophotes.crossings([self._isophotes.cut(isovalue)]).points + self._first_centre
 
-    def sensitivities(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Sensitivities:
-        """Return how the points of `crossings`, or of `arc` where `cut` is true, move with the patch's values.
+    def traced(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Crossings:
+        """Return the points of `crossings`, or of `arc` where `cut` is true, and how they move with the values.
 
-        The isophotes must have been found; their points follow each other in the same order.
+        The isophotes must have been found; pixels and points are those of the region.
         """
-        traced = self._isophotes
-        found = [traced.cut(t) if arc else traced.closed(t) for t, arc in zip(isovalues, cut, strict=True)]
-        return traced.crossings([each for each in found if isinstance(each, LevelSet)]).sensitivities
+        tracer = self._isophotes
+        found = [tracer.cut(t) if arc else tracer.closed(t) for t, arc in zip(isovalues, cut, strict=True)]
+        return tracer.crossings([each for each in found if isinstance(each, LevelSet)])
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Return the points of `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.

@@ -75,8 +75,8 @@ def test_a_cut_isophote_is_the_whole_one_away_from_the_cut():
     assert {tuple(point) for point in np.round(points, 9)} <= seen
     # 1.5 times the smoothing's width from the cut.
     assert 52 - 4.5 <= points[:, 0].max() <= 52 - 3
-    moved = part.sensitivities([0.5], [True])
-    assert len(moved.level) == len(points)
+    moved = part.traced([0.5], [True])
+    assert len(moved.by_level) == len(points)
     outline = part.inside(0.5, cut=True)
     assert outline[40, 51]
     assert not outline[2, 51]

@@ -146,29 +146,29 @@ def test_the_bisector_halves_the_angle():
     assert angle_deg(N, -P / np.linalg.norm(P)) == pytest.approx(np.degrees(laws.bisector_angle(P, light)))
 
 
-# The spot -----------------------------------------------------------------------------------------------------------
+# The family -----------------------------------------------------------------------------------------------------------
 
 
 def test_moments_of_a_gaussian_are_those_before_smoothing():
-    spot = fit_isophote_family(lobe(), CAMERA, ISOVALUES)
-    raw = np.sqrt(np.linalg.eigvalsh(spot.moments)) * 200
+    family = fit_isophote_family(lobe(), CAMERA, ISOVALUES)
+    raw = np.sqrt(np.linalg.eigvalsh(family.moments)) * 200
     # Tangents about an axis that lies 1 deg off the optical one.
     np.testing.assert_allclose(raw, [9.0, 14.0], rtol=2e-3)
     unsmoothed = fit_isophote_family(replace(lobe(), smoothing_px=0.0), CAMERA, ISOVALUES)
     assert np.sqrt(np.linalg.eigvalsh(unsmoothed.moments)[0]) * 200 > 9.0 * 1.02
 
 
-def test_crossings_move_as_their_sensitivities_say():
+def test_crossings_move_as_their_derivatives_say():
     patch, t, change = lobe(), 0.5, 1e-8
-    moved = patch.sensitivities([t], [False])
+    moved = patch.traced([t], [False])
     before, bump = patch.crossings(t), change * np.random.default_rng(1).standard_normal(patch.values.shape)
     column, row = patch.peak_pixel
     value = float(patch.values[row, column] + bump[row, column])
     after = replace(patch, values=patch.values + bump, peak_value=value).crossings(t)
     across = np.where(moved.vertical, 1, 0)
     shift = (after - before)[np.arange(len(before)), across]
-    by_pixels = np.sum(moved.weights * bump[moved.pixels[..., 1], moved.pixels[..., 0]], axis=1)
-    np.testing.assert_allclose(shift, by_pixels + moved.level * t * bump[row, column], atol=3e-11)
+    by_pixels = np.sum(moved.by_pixels * bump[moved.pixels[..., 1], moved.pixels[..., 0]], axis=1)
+    np.testing.assert_allclose(shift, by_pixels + moved.by_level * t * bump[row, column], atol=3e-11)
 
 
 def test_the_covariance_is_that_of_realisations():
@@ -176,9 +176,11 @@ def test_the_covariance_is_that_of_realisations():
     count, sigma = 200, 0.02
     made, basis = [], fit_isophote_family(lobe(), CAMERA, ISOVALUES)
     for seed in range(count):
-        spot = fit_isophote_family(lobe(sigma, seed=seed), CAMERA, ISOVALUES)
-        m = spot.moments
-        made.append([*(basis.basis @ spot.axis), *(basis.basis @ (spot.drift @ spot.basis)), m[0, 0], m[0, 1], m[1, 1]])
+        family = fit_isophote_family(lobe(sigma, seed=seed), CAMERA, ISOVALUES)
+        m = family.moments
+        made.append(
+            [*(basis.basis @ family.axis), *(basis.basis @ (family.drift @ family.basis)), m[0, 0], m[0, 1], m[1, 1]]
+        )
     one = fit_isophote_family(lobe(sigma, seed=1), CAMERA, ISOVALUES)
     stated = np.concatenate([np.diag(one.axes_covariance), np.diag(one.moments_covariance)])
     # Variances of 200 draws lie within 30 % with more than 99.7 % each; top and peak pixel are not quite linear.
@@ -222,7 +224,7 @@ def test_curvature_with_and_without_a_known_lobe():
     hypotheses = with_lobe.curvature.hypotheses
     assert (hypotheses[0] > 0).all()
     assert (np.diff(np.sum((hypotheses - 1) ** 2, axis=1)) >= 0).all()
-    # The long axis of the spot is the direction of the smaller gain.
+    # The long axis of the family is the direction of the smaller gain.
     assert abs(with_lobe.curvature.directions[0] @ [1.0, 0.0, 0.0]) > 0.999
     assert abs(with_lobe.curvature.gains[0]) < abs(with_lobe.curvature.gains[1])
 

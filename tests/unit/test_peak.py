@@ -1,4 +1,4 @@
-"""The axis at a lopsided lobe's peak, and what a spot states about it."""
+"""The axis at a lopsided lobe's peak, and what a family states about it."""
 
 import numpy as np
 import pytest
@@ -32,10 +32,10 @@ def lopsided(cubic, widths=(7.0, 7.0), base=0.0, smoothing=2.0, sigma=0.0, seed=
 
 def errors_px(patch):
     """How far mean axis, peak of the smoothed lobe, and axis at the peak lie from the true one, px."""
-    spot, true = fit_isophote_family(patch, CAMERA, ISOVALUES), CAMERA.unproject(PLACE)
-    places = np.array([pose.axis for pose in spot.poses])
-    smoothed = weights_at_zero(spot.levels) @ places
-    axes = (spot.axis, smoothed / np.linalg.norm(smoothed), spot.peak_axis)
+    family, true = fit_isophote_family(patch, CAMERA, ISOVALUES), CAMERA.unproject(PLACE)
+    places = np.array([pose.axis for pose in family.poses])
+    smoothed = weights_at_zero(family.levels) @ places
+    axes = (family.axis, smoothed / np.linalg.norm(smoothed), family.peak_axis)
     return [float(angle_deg(axis, true)) / PIXEL_DEG for axis in axes]
 
 
@@ -63,29 +63,29 @@ def test_on_a_base_the_axis_runs_with_the_area():
 
 
 def test_weights_sum_to_one_and_leave_a_common_axis():
-    spot = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
-    weights = weights_of_axes(spot._crossings.conics, spot._crossings.isovalues, spot._px2, 2.0)
+    family = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
+    weights = weights_of_axes(family._crossings.conics, family._crossings.isovalues, family._px2, 2.0)
     assert weights.sum() == pytest.approx(1)
-    assert angle_deg(spot.peak_axis, spot.axis) < 0.01 * PIXEL_DEG
-    one = spot._crossings
-    assert weights_of_axes(one.conics[:1], one.isovalues[:1], spot._px2, 2.0) == pytest.approx([1])
+    assert angle_deg(family.peak_axis, family.axis) < 0.01 * PIXEL_DEG
+    one = family._crossings
+    assert weights_of_axes(one.conics[:1], one.isovalues[:1], family._px2, 2.0) == pytest.approx([1])
 
 
 def test_what_a_drift_adds_and_where_it_adds_nothing():
     plain = fit_isophote_family(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
     assert not plain.drift_is_real
     np.testing.assert_array_equal(plain.axis_covariance, plain.axes_covariance[:2, :2])
-    spot = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
-    assert spot.drift_is_real
-    added = spot.axis_covariance - spot.axes_covariance[:2, :2]
-    along = spot.drift / np.linalg.norm(spot.drift)
+    family = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
+    assert family.drift_is_real
+    added = family.axis_covariance - family.axes_covariance[:2, :2]
+    along = family.drift / np.linalg.norm(family.drift)
     across = np.array([-along[1], along[0]])
     # What the line to the peak leaves open lies in all directions; that the mean axis is not the peak's, along the run.
     left_open = across @ added @ across
-    assert along @ added @ along == pytest.approx(left_open + MEAN_SHARE * spot.drift @ spot.drift, rel=1e-6)
+    assert along @ added @ along == pytest.approx(left_open + MEAN_SHARE * family.drift @ family.drift, rel=1e-6)
     assert np.sqrt(left_open) > np.radians(0.08 * PIXEL_DEG)
-    noise = np.hstack([np.eye(2)] * 2) @ spot.axes_covariance @ np.vstack([np.eye(2)] * 2)
-    np.testing.assert_allclose(spot.peak_covariance - noise, left_open * np.eye(2), rtol=1e-2, atol=1e-10)
+    noise = np.hstack([np.eye(2)] * 2) @ family.axes_covariance @ np.vstack([np.eye(2)] * 2)
+    np.testing.assert_allclose(family.peak_covariance - noise, left_open * np.eye(2), rtol=1e-2, atol=1e-10)
 
 
 def test_noise_alone_drifts_as_often_as_is_said():
