@@ -8,8 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.runtime.files import as_json
-
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
@@ -59,7 +57,7 @@ def script_text(text: str) -> str:
 
 def script_json(value: Any) -> str:
     """Write a value as compact JSON that may stand inside a script element."""
-    return script_text(json.dumps(value, allow_nan=False, separators=(",", ":"), default=as_json))
+    return script_text(json.dumps(value, allow_nan=False, separators=(",", ":")))
 
 
 @cache

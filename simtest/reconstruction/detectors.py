@@ -86,7 +86,8 @@ def find_peaks(light: LinearPicture, calibration: Calibration, smoothing_px: flo
     # reject
     if isolated:
         left, flat = _noise_left(smoothing_px), flat_pixels(light.encoded)
-        found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * _at(frame.noise, r.peak), flat)]
+        noise = np.broadcast_to(frame.noise, frame.smoothed.shape)
+        found = [(r, patch) for r, patch in found if _is_highlight(r, patch, left * float(noise[r.peak[::-1]]), flat)]
     return Found(frame, [region for region, _ in found], [patch for _, patch in found])
 
 
@@ -178,10 +179,6 @@ def _noise(
         return white
     noise = np.maximum(white, known)
     return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
-
-
-def _at(noise: float | Image, pixel: tuple[int, int]) -> float:
-    return float(noise) if isinstance(noise, float) else float(noise[pixel[1], pixel[0]])
 
 
 def _noise_left(smoothing_px: float) -> float:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from simtest.calibration import Calibration
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
-from simtest.detection.blobs import Highlight
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate, Estimator, load_estimators
 from simtest.estimators.execution_guard import run_each
@@ -166,26 +165,22 @@ def _estimate(found: Found, estimators: Mapping[str, Estimator], calibration: Ca
     """Run each estimator on all patches of a picture."""
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in found.regions]
-    patches = [_beside(patch, (*peaks[:i], *peaks[i + 1 :])) for i, patch in enumerate(found.patches)]
+    patches = [
+        patch
+        if isinstance(patch, Failure) or len(peaks) == 1
+        else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]))
+        for i, patch in enumerate(found.patches)
+    ]
     made = {name: run_each(each, patches, calibration.camera, calibration.priors) for name, each in estimators.items()}
     # Flags that depend on the frame are added behind those of the estimators.
-    limited = found.frame.corrected.limited
-    rounded_px = SMALL_RADIUS * found.frame.smoothing_px
-    small = [_radius_px(highlight) < rounded_px for highlight in found.highlights] or [False] * len(patches)
+    limited, rounded_px = found.frame.corrected.limited, SMALL_RADIUS * found.frame.smoothing_px
+    small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in found.highlights] or [False] * len(patches)
     return [
         Specularity(
             region, patch, {name: _flagged(results[i], patch, limited, small[i]) for name, results in made.items()}
         )
         for i, (region, patch) in enumerate(zip(found.regions, patches, strict=True))
     ]
-
-
-def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:
-    return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
-
-
-def _radius_px(highlight: Highlight) -> float:
-    return math.sqrt(highlight.area_px / math.pi)
 
 
 def _flagged(
