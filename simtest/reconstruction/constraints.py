@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry import Camera
 from simtest.geometry.vectors import tangent_basis
-from simtest.reconstruction.description import SpecularityRecord
+from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.spec import describe_camera
@@ -44,61 +43,54 @@ class Constraint:
     flags: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Constraints:
-    """The constraints of a picture."""
+def constraints_of(spots: Sequence[SpecularityRecord]) -> list[Constraint]:
+    """Return the best normal of each specularity that has one and a sightline."""
+    return [
+        Constraint(
+            id=spot.id,
+            track=spot.track,
+            pixel=spot.peak_px,
+            sightline=spot.sightline,
+            normal=best.normal,
+            basis=np.concatenate(tangent_basis(best.normal[None])),
+            covariance=best.covariance,
+            estimator=spot.best,
+            candidates=spot.normals.get("circle_pose", best).candidates,
+            score=spot.score,
+            flags=best.flags,
+        )
+        for spot in spots
+        if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
+    ]
 
-    image: str
-    camera: Camera
-    constraints: list[Constraint]
 
-    @classmethod
-    def of(cls, image: str, camera: Camera, spots: Sequence[SpecularityRecord]) -> "Constraints":
-        """Take the best normal of each specularity that has one and a sightline."""
-        made = [
-            Constraint(
-                id=spot.id,
-                track=spot.track,
-                pixel=spot.peak_px,
-                sightline=spot.sightline,
-                normal=best.normal,
-                basis=np.concatenate(tangent_basis(best.normal[None])),
-                covariance=best.covariance,
-                estimator=spot.best,
-                candidates=spot.normals.get("circle_pose", best).candidates,
-                score=spot.score,
-                flags=best.flags,
-            )
-            for spot in spots
-            if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
-        ]
-        return cls(image, camera, made)
+def constraints_json(record: PictureRecord) -> JsonObject:
+    """Return the content of constraints.json."""
+    about = {"version": VERSION, "about": ABOUT, "image": record.image, "camera": describe_camera(record.camera)}
+    return {**about, "constraints": constraints_of(record.specularities)}
 
-    def to_json(self) -> JsonObject:
-        """Return the content of constraints.json."""
-        about = {"version": VERSION, "about": ABOUT, "image": self.image}
-        return {**about, "camera": describe_camera(self.camera), "constraints": self.constraints}
 
-    def arrays(self) -> dict[str, npt.NDArray[np.generic]]:
-        """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
+def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generic]]:
+    """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
 
-        id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3)
-        with NaN where there is no second, estimator (N,) as text.
-        """
-        every = self.constraints
-        stacked = {}
-        for name, shape in SHAPES.items():
-            rows = [getattr(constraint, name) for constraint in every]
-            filled = [np.full(shape, np.nan) if row is None else row for row in rows]
-            stacked[name] = np.array(filled, dtype=float).reshape(-1, *shape)
-        candidates = np.full((len(every), 2, 3), np.nan)
-        for pair, constraint in zip(candidates, every, strict=True):
-            pair[: len(constraint.candidates)] = constraint.candidates[:2]
-        return {
-            "version": np.array(VERSION),
-            "id": np.array([constraint.id for constraint in every], dtype=int),
-            **stacked,
-            "candidates": candidates,
-            "estimator": np.array([constraint.estimator for constraint in every], dtype=str),
-            "K": self.camera.K,
-        }
+    id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3) with
+    NaN where there is no second, estimator (N,) as text.
+    """
+    made = constraints_of(record.specularities)
+    stacked = {}
+    for name, shape in SHAPES.items():
+        rows = [getattr(constraint, name) for constraint in made]
+        filled = [np.full(shape, np.nan) if row is None else row for row in rows]
+        stacked[name] = np.array(filled, dtype=float).reshape(-1, *shape)
+    candidates = np.full((len(made), 2, 3), np.nan)
+    for pair, constraint in zip(candidates, made, strict=True):
+        pair[: len(constraint.candidates)] = constraint.candidates[:2]
+    ids, estimators = ([getattr(constraint, name) for constraint in made] for name in ("id", "estimator"))
+    return {
+        "version": np.array(VERSION),
+        "id": np.array(ids, dtype=int),
+        **stacked,
+        "candidates": candidates,
+        "estimator": np.array(estimators, dtype=str),
+        "K": record.camera.K,
+    }

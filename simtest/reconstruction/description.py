@@ -4,7 +4,7 @@ docs/reconstruct.md explains the keys. `write_json` writes a record by its `to_j
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -203,11 +203,6 @@ def _describe(index: int, specularity: Specularity, highlight: Highlight | None,
     kind, score = (None, None) if highlight is None else (str(highlight.kind), highlight.score)
     box, best = specularity.region.box, best_of(estimates)
     return SpecularityRecord(index, box, peak, sightline, kind, score, best, estimates, highlight, drawings)
-
-
-def without_drawings(spots: Sequence[SpecularityRecord]) -> list[SpecularityRecord]:
-    """Return the same without what only drawings need."""
-    return [replace(spot, drawings={}) for spot in spots]
 
 
 def best_of(estimates: Mapping[str, Estimate | Failure]) -> str | None:

@@ -12,7 +12,7 @@ import numpy as np
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, KannalaBrandt
-from simtest.reconstruction.constraints import Constraints
+from simtest.reconstruction.constraints import constraints_arrays, constraints_json
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
@@ -44,8 +44,7 @@ def write_outputs(
     """
     spots, camera = record.specularities, record.camera
     depths = [1.0] * len(spots) if depth_mm is None else depth_mm
-    constraints = Constraints.of(record.image, camera, spots)
-    arrays = constraints.arrays()
+    arrays = constraints_arrays(record)
 
     def write_text(name: str, content: str) -> None:
         write_atomically(out / name, lambda part: part.write_text(content, encoding="ascii"))
@@ -57,7 +56,7 @@ def write_outputs(
         write_text("normals.ply", normals_ply(spots, camera, depths))
         write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
         write_text("arrows.ply", arrows_ply(spots, camera, depths))
-        write_json(out / "constraints.json", constraints)
+        write_json(out / "constraints.json", constraints_json(record))
         write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
         write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     except OSError as error:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Frame, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
-from simtest.detection.blobs import Highlight
 from simtest.detection.colour import ColourDetection, ColourDetector, detect_colour
 from simtest.detection.detector import Detection, Detector, load_detector
 from simtest.detection.peaks import PeakDetector
@@ -211,13 +210,18 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
     cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
-    patches = [_beside(patch, (*peaks[:i], *peaks[i + 1 :])) for i, patch in enumerate(cut)]
+    patches = [
+        patch
+        if isinstance(patch, Failure) or len(cut) == 1
+        else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]))
+        for i, patch in enumerate(cut)
+    ]
     made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
     # Flags that depend on the frame are added behind those of the estimators.
     limited = frame.corrected.limited
     result = Reconstruction([], detection)
     rounded_px = SMALL_RADIUS * frame.smoothing_px
-    small = [_radius_px(highlight) < rounded_px for highlight in detection.highlights] or [False] * len(patches)
+    small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
         estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
         result.specularities.append(Specularity(region, patch, estimates))
@@ -232,14 +236,6 @@ def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
     x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
     no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
     return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
-
-
-def _beside(patch: Patch | Failure, others: tuple[tuple[float, float], ...]) -> Patch | Failure:
-    return patch if isinstance(patch, Failure) or not others else replace(patch, others_px=others)
-
-
-def _radius_px(highlight: Highlight) -> float:
-    return math.sqrt(highlight.area_px / math.pi)
 
 
 def _flagged(

@@ -11,7 +11,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.pages.html import write_page
 from simtest.pages.style import colours
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord, deviation_deg
+from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
@@ -29,11 +29,12 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
     data = {
         "spots": [_spot(spot, palette) for spot in spots],
         "others": [
-            {"kind": h.kind, "outline": np.round(h.outline, 1), "peak": np.add(h.region.peak, 0.5), "score": h.score}
+            {"kind": h.kind, "outline": _rounded(h.outline, 1), "peak": np.add(h.region.peak, 0.5).tolist(),
+             "score": h.score}
             for h in record.other_highlights
         ],
         "colours": palette,
-    }
+    }  # fmt: skip
     height, width = picture.shape[:2]
     address = _data_address(picture)
     title = Path(record.image).name
@@ -70,7 +71,7 @@ def _data_address(picture: Image) -> str:
 def _spot(spot: SpecularityRecord, palette: dict[str, str]) -> JsonObject:
     return {
         "id": spot.id,
-        "peak": spot.position_px,
+        "peak": spot.position_px.tolist(),
         "size": max(spot.box_px[2:]),
         "kind": spot.kind,
         "score": spot.score,
@@ -90,12 +91,16 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord) -> Json
     drawing = spot.drawings[name]
     return {
         "status": "ok",
-        "normals": np.round(result.candidates, 4),
+        "normals": _rounded(result.candidates, 4),
         "margin": result.choice_margin,
         "look": [v if np.isfinite(v) else None for v in result.look_px.tolist()],
-        "isophotes": [np.round(points, 1) for _, points in drawing.isophotes],
-        "curves": [np.round(curve, 1) for curve in drawing.curves],
+        "isophotes": [_rounded(points, 1) for _, points in drawing.isophotes],
+        "curves": [_rounded(curve, 1) for curve in drawing.curves],
         "deviation": deviation_deg(result),
         "flags": result.flags,
         "error": error and error.error_deg,
     }
+
+
+def _rounded(points: npt.ArrayLike, digits: int) -> Points:
+    return np.round(np.asarray(points, dtype=float), digits).tolist()

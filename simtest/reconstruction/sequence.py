@@ -10,7 +10,7 @@ import cv2
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.reconstruction.description import SpecularityRecord, without_drawings
+from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.image_io import SequenceFrame, open_source
 from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
@@ -123,7 +123,7 @@ class _Run:
         spots = self._tracked(record.specularities, size)
         overlay = draw_overlay(picture, spots)
         write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
-        spots = without_drawings(spots)
+        spots = [replace(spot, drawings={}) for spot in spots]
         entry = {"frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
         write_json(stem.with_suffix(".json"), replace(record, specularities=spots).to_json() | entry, compact=True)

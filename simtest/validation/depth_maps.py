@@ -135,8 +135,9 @@ def depth_normals(points: Array) -> Array:
     along_y = cv2.sepFilter2D(values, cv2.CV_64F, mean, slope, borderType=cv2.BORDER_REPLICATE)
     normal = np.cross(along_x, along_y)
     length = np.linalg.norm(normal, axis=-1)
-    # reject windows with a hole or a jump
-    sound = _whole(known & ~_jumps(values[..., 2], known)) & (length > 0)
+    # reject windows that leave the map, or hold a hole or a jump
+    clear = (known & ~_jumps(values[..., 2])).astype(np.uint8)
+    sound = (cv2.erode(clear, np.ones((2 * RADIUS_PX + 1,) * 2, np.uint8), borderValue=0) > 0) & (length > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         normal /= length[..., None]
     normal[np.einsum("hwi,hwi->hw", normal, values) > 0] *= -1
@@ -144,19 +145,13 @@ def depth_normals(points: Array) -> Array:
     return np.asarray(normal)
 
 
-def _jumps(depth: Array, known: Mask) -> Mask:
+def _jumps(depth: Array) -> Mask:
     """Mark the pixels where the depth jumps."""
     # the second difference along rows and columns
     bend = np.zeros(depth.shape)
     bend[:, 1:-1] = np.abs(depth[:, 2:] + depth[:, :-2] - 2 * depth[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(depth[2:] + depth[:-2] - 2 * depth[1:-1]))
-    return np.asarray(known & (bend > JUMP_SHARE * np.abs(depth)))
-
-
-def _whole(known: Mask) -> Mask:
-    """Mark the pixels whose windows lie inside the map and hold known depths only."""
-    size = 2 * RADIUS_PX + 1
-    return cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
+    return np.asarray(bend > JUMP_SHARE * np.abs(depth))
 
 
 def depth_problems(depth: Array, normals: Array, camera: Camera) -> tuple[str, ...]:

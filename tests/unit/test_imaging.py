@@ -12,7 +12,7 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import Constraints
+from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.image_io import is_coloured, open_source, read_picture
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.sequence import reconstruct_sequence
@@ -90,7 +90,7 @@ def test_a_picture_gives_all_files(shot, tmp_path):
 def test_constraints_as_arrays(shot, tmp_path):
     record, files = quietly(shot, tmp_path / "out")
     described, stored = json.loads(files[5].read_text()), np.load(files[6], allow_pickle=False)
-    for name, values in Constraints.of(record.image, record.camera, record.specularities).arrays().items():
+    for name, values in constraints_arrays(record).items():
         np.testing.assert_array_equal(stored[name], values)
     assert len(described["constraints"]) == 2
     for i, constraint in enumerate(described["constraints"]):
