@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
