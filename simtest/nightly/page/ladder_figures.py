@@ -13,8 +13,7 @@ from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel, label_keys
 from simtest.pages.style import NEUTRAL, degrees, number, symbols
 
-FLOOR_DEG = 1e-6
-"""Smaller errors are rounding: on the chart's logarithmic axis they are drawn here."""
+FLOOR_DEG = 1e-6  # smaller errors are rounding: on the chart's logarithmic axis they are drawn here
 
 
 @dataclass(frozen=True)

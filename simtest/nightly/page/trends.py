@@ -20,29 +20,21 @@ from simtest.nightly.page.phrases import short_commit
 from simtest.pages.style import Array
 
 Mask = npt.NDArray[np.bool_]
-
 NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
 HISTORY_COLUMNS = ("kind", *PLACE, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
 """All that the page reads of the history; a history of other columns may leave the rest out."""
 
-BUDGET_BYTES = 2_800_000
-"""Most that the curves may take in the page."""
-
-MOST_POINTS = 500
-"""Most points of a curve: more cannot be told apart on a screen."""
-
-NEWEST = 30
-"""Nights that are all kept."""
+BUDGET_BYTES = 2_800_000  # most that the curves may take in the page
+MOST_POINTS = 500  # most points of a curve: more cannot be told apart on a screen
+NEWEST = 30  # nights that are all kept
 
 LEAST_POINTS = NEWEST + 20
 """Points that every curve has; where there is no room for them, the oldest nights are left out."""
 
 COSTS, MEDIAN = "run time and memory", "median over all settings"
-
 _KEY = ("kind", *PLACE, "quantity", "unit")
 _KINDS = ("setting", "cost", "ladder")
-_NAMES_BYTES, _NIGHT_BYTES = 45, 50
-"""What a curve's names and ends, and a night's, take."""
+_NAMES_BYTES, _NIGHT_BYTES = 45, 50  # what a curve's names and ends, and a night's, take
 
 
 @dataclass(frozen=True)

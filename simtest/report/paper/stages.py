@@ -16,7 +16,6 @@ from simtest.spec.paper import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
 _DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
-
 PICTURES = ("texture", "clean", "smoothed")
 
 

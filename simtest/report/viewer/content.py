@@ -16,27 +16,22 @@ from simtest.simulation.rendered_view import view
 from simtest.spec import Scene
 from simtest.surfaces.model import Array, IntArray
 
-GRID = 240
-"""Samples of the visible surface along the longer side of the frame."""
-
-OCCLUSION = 1.15
-"""Neighbouring samples whose distances differ by a larger factor lie on both sides of an edge."""
+GRID = 240  # samples of the visible surface along the longer side of the frame
+OCCLUSION = 1.15  # factor between the distances of neighbouring samples beyond which there is an edge
+CAMERA, TRUE = "camera", "true normal"
 
 
 @dataclass(frozen=True)
 class Content:
-    """A scene's 3D view, camera frame, mm."""
+    """A scene's 3D view, camera frame, mm: a surface, light positions, and line segments by name."""
 
     vertices: Array  # samples of the visible surface, shape (V, 3)
     faces: IntArray  # triangles between them, shape (F, 3)
     curvature: Array  # principal curvature of larger size, 1/mm, convex towards the camera positive, shape (V,)
-    frustum: Array  # unit sightlines through the corners of the image, in turn, shape (4, 3)
-    lights: Array  # true positions, shape (L, 3)
-    highlights: Array  # true isolated ones, shape (N, 3)
-    normals: Array  # at these
-    estimator: npt.NDArray[Any]  # name of each estimate's estimator, shape (E,)
-    looks: Array  # point that each estimate looks at, shape (E, 3)
-    estimates: Array  # proposed normals
+    lights: Array  # shape (L, 3)
+    names: npt.NDArray[Any]  # `CAMERA`, `TRUE` or an estimator, shape (S,)
+    starts: Array  # shape (S, 3)
+    ends: Array
 
     def save(self, path: Path) -> None:
         """Write the arrays to a NumPy archive."""
@@ -57,22 +52,25 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     session = Session(scene, variant)
     seen = view(session, scene)
     vertices, faces, curvature = _visible(session)
+    distance = np.linalg.norm(vertices, axis=1)
+    near, reach = 0.5 * float(np.quantile(distance, 0.05)), 0.35 * float(np.median(distance))
+
+    # The camera's frustum: to the corners of the image, and around it.
     camera = session.camera
-    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float)
+    size = np.array([camera.width, camera.height], dtype=float)
+    sightlines = np.asarray(camera.unproject(size * [[0, 0], [1, 0], [1, 1], [0, 1]]))
+    corners = near * sightlines / sightlines[:, 2:3]
+    segments = [(CAMERA, start, end) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    segments += [(CAMERA, np.zeros(3), corner) for corner in corners]
+
+    # True normals are longer than the estimates', so that they show where these lie on them.
     found = [truth.highlight for truth in seen.truths if truth.isolated]
-    names, looks, estimates = _estimates(session, seen.frame(scene.sensor.seed), seen.calibration)
-    return Content(
-        vertices=vertices,
-        faces=faces,
-        curvature=curvature,
-        frustum=np.asarray(camera.unproject(corners)),
-        lights=np.asarray(scene.rig.true_mm()),
-        highlights=np.array([h.position for h in found]).reshape(-1, 3),
-        normals=np.array([h.normal for h in found]).reshape(-1, 3),
-        estimator=np.array(names, dtype=np.str_),
-        looks=looks,
-        estimates=estimates,
-    )
+    segments += [(TRUE, h.position, h.position + 1.3 * reach * h.normal) for h in found]
+    estimates = _estimates(session, seen.frame(scene.sensor.seed), seen.calibration)
+    segments += [(name, look, look + reach * normal) for name, look, normal in estimates]
+    names, starts, ends = zip(*segments, strict=True)
+    lights = np.asarray(scene.rig.true_mm())
+    return Content(vertices, faces, curvature, lights, np.array(names), np.array(starts), np.array(ends))
 
 
 def _visible(session: Session) -> tuple[Array, IntArray, Array]:
@@ -87,17 +85,16 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
 
 def _estimates(
     session: Session, frame: npt.NDArray[np.float32], calibration: Calibration
-) -> tuple[list[str], Array, Array]:
-    """Return names, points looked at and normals of all estimates that look at the surface."""
-    names, pixels, normals = [], [], []
-    for specularity in reconstruct(frame, calibration):
-        for name, estimate in specularity.estimates.items():
-            if not isinstance(estimate, Failure):
-                names.append(name)
-                pixels.append(estimate.look_px)
-                normals.append(estimate.normal)
-    if not names:
-        return [], np.empty((0, 3)), np.empty((0, 3))
-    points = session.cast(np.array(pixels))[0].position
-    hit = np.asarray(np.isfinite(points).all(axis=1))
-    return [name for name, kept in zip(names, hit, strict=True) if kept], points[hit], np.array(normals)[hit]
+) -> list[tuple[str, Array, Array]]:
+    """Return name, point looked at and normal of all estimates that look at the surface."""
+    found = [
+        (name, estimate)
+        for specularity in reconstruct(frame, calibration)
+        for name, estimate in specularity.estimates.items()
+        if not isinstance(estimate, Failure)
+    ]
+    if not found:
+        return []
+    points = session.cast(np.array([estimate.look_px for _, estimate in found]))[0].position
+    hits = zip(found, points, strict=True)
+    return [(name, point, estimate.normal) for (name, estimate), point in hits if np.isfinite(point).all()]
