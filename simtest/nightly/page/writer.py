@@ -13,10 +13,10 @@ from simtest.nightly.page.comparisons import comparisons
 from simtest.nightly.page.error_figures import error_figures
 from simtest.nightly.page.extras import Extras
 from simtest.nightly.page.ladder_figures import ladder
-from simtest.nightly.page.trends import MEDIAN, NEWEST, Trends, trends
+from simtest.nightly.page.trends import LEFT_OUT, MEDIAN, NEWEST, Trends, trends
 from simtest.nightly.page.worst_cases import read_cases
 from simtest.pages import chart_web, style
-from simtest.pages.html import environment, script_json
+from simtest.pages.html import environment
 from simtest.report.gallery import draw_gallery, isophote_keys
 from simtest.report.run_folder import GalleryItem
 from simtest.runtime.files import write_atomically
@@ -111,9 +111,7 @@ def _estimators(night: Night, verdict: Verdict, items: Iterable[GalleryItem], pa
 
 
 def _trends_section(past: Trends, verdict: Verdict, colours: dict[str, str]) -> dict[str, Any]:
-    """Give what the template and the page's script need of the trends."""
-    from markupsafe import Markup
-
+    """Return what the template and the page's script need of the trends."""
     names = past.data["names"]
     first = verdict.regressions.head(1).to_dicts()
     wanted = first[0] if first else {}
@@ -128,5 +126,5 @@ def _trends_section(past: Trends, verdict: Verdict, colours: dict[str, str]) -> 
     }
     return {
         "nights": past.nights, "points": past.points, "thinned": past.nights > past.points, "newest": NEWEST,
-        "left_out": past.left_out, "data": Markup(script_json(data)),
+        "left_out": past.left_out, "gap": LEFT_OUT, "data": chart_web.packed(data),
     }  # fmt: skip
