@@ -10,7 +10,6 @@ import numpy.typing as npt
 from simtest.runtime.arrays import Array
 
 Tick = tuple[float, str]
-
 _STRETCH = 0.01
 _STRETCHED_TICKS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

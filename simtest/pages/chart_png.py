@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Pixels = npt.NDArray[np.uint8]
-
 DPI = 150
 PX = 0.78  # points a px of the page
 
@@ -25,7 +24,6 @@ SINGLE, SEVERAL, COLUMNS = 7.8, 4.8, 3
 # ... margins, a row of the legend, space between panels; width of a letter and of a legend entry's line.
 LEFT, RIGHT, TOP, BOTTOM, ROW, GAP = 0.85, 0.15, 0.36, 0.56, 0.2, 0.12
 LETTER, HANDLE = 0.066, 0.55
-
 DASHES = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":", "": ""}
 _SETTINGS = {
     "font.size": 10, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True, "axes.titlesize": 11,

@@ -17,11 +17,8 @@ from simtest.pages.chart import Bars, Chart, Mark, Panel
 from simtest.pages.style import rgb
 from simtest.runtime.arrays import Array
 
-PlotlyJson = dict[str, Any]
-"""Plotly's own description of a figure or a part of it, as it leaves for the page."""
-
+PlotlyJson = dict[str, Any]  # plotly's own description of a figure or a part of it, as it leaves for the page
 BUNDLE = Path(__file__).parent / "vendor" / "plotly-gl3d.min.js.zz"
-
 _GAP = 0.03  # half the space between stacked panels, share of the figure's height
 
 

@@ -14,17 +14,10 @@ from simtest.runtime.arrays import Array
 
 Pixels = npt.NDArray[np.uint8]
 Window = tuple[float, float, float, float]
-
-GAMMA = 2.2
-"""Frames are linear; they are shown with this display gamma. Isophotes are those of the linear frame."""
-
+GAMMA = 2.2  # frames are linear; they are shown with this display gamma. Isophotes are those of the linear frame
 AVIF_QUALITY, AVIF_SPEED = 42, 10
-PNG_COMPRESSION = 1
-"""Noise hardly gets smaller at higher levels."""
-
-_BITS = 4
-"""Binary digits of a drawn coordinate behind the point."""
-
+PNG_COMPRESSION = 1  # noise hardly gets smaller at higher levels
+_BITS = 4  # binary digits of a drawn coordinate behind the point
 _DASH_PX, _FONT_PX, _LINE_PX = 4.0, 13, 20
 
 

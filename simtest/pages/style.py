@@ -17,15 +17,9 @@ ESTIMATOR_COLOURS = {
 """Colours of Okabe and Ito's colour-blind-safe palette, plus one violet."""
 
 _FURTHER = ("#A6761D", "#7A8B99", "#B2478F", "#4E9A9A", "#9A9A2E", "#C08A7A")
-
-NEUTRAL = "#7D828A"
-"""Grey of laws and truth: readable on light and on dark."""
-
-LIGHT = "#F2C500"
-"""Yellow of lights in 3D views."""
-
-TRUTH = "#F5D90A"
-"""Yellow of the truth on top of frames."""
+NEUTRAL = "#7D828A"  # grey of laws and truth: readable on light and on dark
+LIGHT = "#F2C500"  # yellow of lights in 3D views
+TRUTH = "#F5D90A"  # yellow of the truth on top of frames
 
 
 class Symbol(NamedTuple):

@@ -10,7 +10,6 @@ from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
 
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"
-
 _MEASURES = (("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG),
              ("axis ratio", "axis_ratio", "axis_ratio_law", "", 0.0))  # fmt: skip
 """Name, columns of measurement and law, unit and the least tolerance."""

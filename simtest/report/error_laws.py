@@ -15,7 +15,6 @@ from simtest.spec.experiment import LawName
 from simtest.validation import laws
 
 MET, DEPARTS, ABSENT = "met", "departs", "not in this run"
-
 SLOPE = "branch_point_slope"
 BRANCH_SLOPE = 0.5
 

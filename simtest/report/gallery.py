@@ -13,21 +13,15 @@ from simtest.pages.style import NEUTRAL, TRUTH, hexadecimal
 from simtest.report.run_folder import GalleryItem, KeptEstimate
 from simtest.runtime.arrays import Array
 
-HEIGHT_PX, PAGE_PX = 400, 300
-"""Height of a picture in its file and in the page."""
-
+HEIGHT_PX, PAGE_PX = 400, 300  # height of a picture in its file and in the page
 _GAP_PX = 6
-
 THREADS = 4
 
 _ARROW, _ARROW_ENLARGED = 0.2, 0.4
 """Length of a normal over the distance in the frame, and over the width that the enlargement shows."""
 
 _TRUTH_EDGE, _ESTIMATE_EDGE = "#332B00", "#FFFFFF"
-_COOL = ((0.0, 1.0, 1.0), (1.0, 0.0, 1.0))
-"""Ends of the isophotes' colours: t = 0 is cyan, t = 1 magenta."""
-
-_LONGEST_NAME, _MOST_LEVELS = 24, 5
+_MOST_LEVELS = 5
 
 
 class Shown(NamedTuple):
@@ -122,9 +116,9 @@ def _projected(item: GalleryItem, point: Array, normal: Array, reach: float) -> 
 
 
 def isophote_colour(isovalue: float) -> str:
-    """Return the colour of an isophote at t in 0..1."""
+    """Return the colour of an isophote at t in 0..1: from cyan to magenta."""
     share = float(np.clip(isovalue, 0, 1))
-    return hexadecimal([(1 - share) * low + share * high for low, high in zip(*_COOL, strict=True)])
+    return hexadecimal((share, 1 - share, 1))
 
 
 def isophote_keys(items: Iterable[GalleryItem]) -> list[tuple[float, str]]:
@@ -153,14 +147,10 @@ def _window(item: GalleryItem) -> Window | None:
 
 def _legend(item: GalleryItem, colours: Mapping[str, str], window: Window | None) -> list[tuple[str, str]]:
     names = dict.fromkeys(estimate.estimator for estimate in item.meta.estimates)
-    entries = [(TRUTH, "truth"), *((colours.get(name, NEUTRAL), _short(name)) for name in names)]
+    entries = [(TRUTH, "truth"), *((colours.get(name, NEUTRAL), name) for name in names)]
     levels = isophote_keys([item])
     entries += [(colour, f"isophote t = {t:g}") for t, colour in levels[:: -(-len(levels) // _MOST_LEVELS) or 1]]
     if window:
         x0, x1, y0, y1 = window
         entries.append(("#FFFFFF", f"enlarged: x {x0:.0f} to {x1:.0f}, y {y0:.0f} to {y1:.0f} px"))
     return entries
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 1] + "…"

@@ -13,8 +13,7 @@ from simtest.report.curves import prepared, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
 
-_COLOURS = "cividis"
-"""Colour map; perceptually uniform and colour-blind-safe."""
+_COLOURS = "cividis"  # colour map; perceptually uniform and colour-blind-safe
 
 _EMPTY, _DARK, _HALF = "#888888", 0.55, 0.49
 """Colour of a cell without a value, share of the scale below which text is white, and half a cell's side."""

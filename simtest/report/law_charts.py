@@ -10,9 +10,7 @@ from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, symbols
 from simtest.report.error_laws import SLOPE, LawResult
 
 _COLOURS = (*ESTIMATOR_COLOURS.values(), "#A6761D", "#7A8B99")
-
-_LEAST_SHARE = 1e-4
-"""Departures over what is allowed: smaller ones are drawn here on the logarithmic axis."""
+_LEAST_SHARE = 1e-4  # departures over what is allowed: smaller ones are drawn here on the logarithmic axis
 
 
 def law_colours(results: Sequence[LawResult]) -> dict[str, str]:

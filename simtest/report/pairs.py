@@ -11,10 +11,7 @@ from simtest.report.run_folder import Run
 from simtest.validation.statistics import student_interval
 
 ALL = "all settings"
-
-KEYS = ("experiment", "setting", "realisation", "true_id")
-"""A true highlight of a frame."""
-
+KEYS = ("experiment", "setting", "realisation", "true_id")  # a true highlight of a frame
 NONE = "–"
 
 

@@ -17,9 +17,7 @@ from simtest.runtime.arrays import Array, Image
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.paper import PaperSetting
 
-MAX_GALLERY = 24
-"""Gallery items that a page shows; of a longer gallery, evenly spaced ones."""
-
+MAX_GALLERY = 24  # gallery items that a page shows; of a longer gallery, evenly spaced ones
 _TEXT = ("experiment", "surface", "reflectance", "setting", "label", "estimator", "status")
 _WHOLE = ("realisation", "specularity", "true_id")
 _FLOAT = (

@@ -14,18 +14,12 @@ from simtest.report.curves import Ask, Curve, gather, prepared, varies
 from simtest.report.run_folder import Run
 from simtest.spec.describe import describe_key, name_key
 
-TOLERANCE_DEG = 0.3
-TOLERANCE_SHARE = 0.03
-"""A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4)."""
-
-MOST_TITLE = 70
-"""Characters of a description that fit under an axis."""
-
+# A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4).
+TOLERANCE_DEG, TOLERANCE_SHARE = 0.3, 0.03
+MOST_TITLE = 70  # characters of a description that fit under an axis
 _ERROR_TITLE = "angular error (deg)"
 _DASH = Symbol("_", "line-ew-open", "–")
-
-LEAST_LAW = 0.01
-"""A law below this (deg, or axis ratio) predicts nothing that noise would leave visible."""
+LEAST_LAW = 0.01  # a law below this (deg, or axis ratio) predicts nothing that noise would leave visible
 
 
 @dataclass(frozen=True)
@@ -164,8 +158,7 @@ def line_chart(data: LineFigure, colours: Mapping[str, str]) -> Chart:
     laws = [_law_mark(data, curve, colours) for curve in data.curves if _has_law(curve, data.y)]
     marks = [*laws, *(_points_mark(data, curve, colours, shapes[curve.label]) for curve in data.curves)]
     if laws:
-        colour, width = NEUTRAL, 1.5
-        marks.append(Mark(NOTHING, NOTHING, colour, "law", line="dash", width=width))
+        marks.append(Mark(NOTHING, NOTHING, NEUTRAL, "law", line="dash", width=1.5))
     # Laws may leave the range of what was measured.
     limits = log_range([part for c in data.curves for part in (c.y, c.low, c.high)])
     y = replace(data.y, limits=limits) if data.y.scale == "log" else data.y

@@ -14,10 +14,7 @@ from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
-
-STRIP_POINTS = 120
-"""Points drawn beside a box: evenly spaced order statistics where there are more values."""
-
+STRIP_POINTS = 120  # points drawn beside a box: evenly spaced order statistics where there are more values
 _DOT = Symbol(".", "circle", "●")
 
 

@@ -64,7 +64,8 @@ def read_study() -> Fineness:
 def fineness_charts(study: Fineness) -> list[Chart]:
     """Describe the study: a chart of normals, one of axis ratios; the dashed line is the rule for meshes."""
     shapes = symbols(curve.surface for curve in study.curves)
-    x = Axis(X_TITLE, "log", named=tuple((float(edge), f"{edge:g}") for edge in study.edge_over_half_width))
+    edges = study.edge_over_half_width
+    x = Axis(X_TITLE, "log", named=tuple((edge, f"{edge:g}") for edge in edges))
     charts = []
     for key, title, name, factor, least in PANELS:
         marks = []
@@ -73,22 +74,10 @@ def fineness_charts(study: Fineness) -> list[Chart]:
             values = factor * np.array(getattr(curve, key))
             hover = [
                 f"{curve.surface}, {shading}\nedge {edge:g}: {name} {value:.2g}"
-                for edge, value in zip(study.edge_over_half_width, values, strict=True)
+                for edge, value in zip(edges, values, strict=True)
             ]
-            shown = np.maximum(values, least)
-            symbol = shapes[curve.surface]
-            marks.append(
-                Mark(
-                    study.edge_over_half_width,
-                    shown,
-                    colour,
-                    shading,
-                    line="solid",
-                    width=1.2,
-                    symbol=symbol,
-                    hover=hover,
-                )
-            )
+            y, symbol = np.maximum(values, least), shapes[curve.surface]
+            marks.append(Mark(edges, y, colour, shading, line="solid", width=1.2, symbol=symbol, hover=hover))
         ends = log_range([mark.y for mark in marks])
         rule = Mark([1 / EDGES_PER_HALF_WIDTH] * 2, ends, NEUTRAL, line="dash", width=1.2)
         panel = Panel(x, Axis(name, "log", ends), (rule, *marks))

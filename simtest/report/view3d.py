@@ -17,12 +17,8 @@ from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
 from simtest.runtime.arrays import Array, IntArray, Mask
 
-_GRID, _NORMALS = 72, 9
-"""Samples of the surface along the longer side, and of the normals that are drawn all over it."""
-
-_OCCLUSION = 1.25
-"""Factor between the distances of neighbouring samples beyond which there is an edge."""
-
+_GRID, _NORMALS = 72, 9  # samples of the surface along the longer side, and of the normals that are drawn all over it
+_OCCLUSION = 1.25  # factor between the distances of neighbouring samples beyond which there is an edge
 _TRUE, _AT_HIGHLIGHT, _SIGHTLINE = "true normals", "true normal at the highlight", "sightline from the camera"
 _COLOURS = {_TRUE: "#5E8FBF", _SIGHTLINE: NEUTRAL, _AT_HIGHLIGHT: "#C9A800"}
 _CURVATURE = ("#053061", "#2166ac", "#4393c3", "#92c5de", "#d1e5f0", "#f7f7f7", "#fddbc7", "#f4a582", "#d6604d",

@@ -1,7 +1,6 @@
 """The nightly page: what it says, what it embeds, and that it keeps its limits."""
 
 import base64
-import json
 import re
 import zlib
 from dataclasses import replace
@@ -18,10 +17,10 @@ from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.page.ladder_figures import FLOOR_DEG, ladder
 from simtest.nightly.page.run_tables import comparisons
-from simtest.nightly.page.trends import COSTS, MEDIAN, NEWEST, trends
+from simtest.nightly.page.trends import COSTS, LEFT_OUT, MEDIAN, NEWEST, trends
 from simtest.nightly.phrases import bounds, headline_sentence, measure, short_commit, signed
 from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
-from simtest.pages.chart_web import BUNDLE
+from simtest.pages.chart_web import BUNDLE, packed
 from simtest.pages.style import colours
 from simtest.validation.results_table import SCHEMA
 
@@ -270,23 +269,15 @@ def test_numbers_have_signs_units_and_dashes():
 def unpacked(found):
     """Do what the page's script does: curves by name, as (nights, values)."""
     data = found.data
-    width = -(-len(data["nights"]["started"]) // 8)
-    masks = np.frombuffer(base64.b64decode(data["kept"]), np.uint8).reshape(-1, width)
-    codes = np.frombuffer(base64.b64decode(data["values"]), "<u2")
-    curves, place = {}, 0
-    for i, mask in enumerate(data["kept_of"]):
+    codes = np.frombuffer(base64.b64decode(data["values"]), "<u2").reshape(-1, len(data["nights"]["started"]))
+    curves = {}
+    for i, own in enumerate(codes):
         name = tuple(
             data["names"][key][data["series"][key][i]] for key in ("experiment", "setting", "estimator", "quantity")
         )
-        nights = np.flatnonzero(np.unpackbits(masks[mask])[: found.nights])
-        low, high = data["low"][i], data["high"][i]
-        values = np.full(len(nights), low)
-        if high > low:
-            values = low + (high - low) * codes[place : place + len(nights)] / 65535
-            place += len(nights)
+        nights = np.flatnonzero(own != LEFT_OUT)
         assert name not in curves
-        curves[name] = (nights, values)
-    assert place == len(codes)
+        curves[name] = (nights, data["low"][i] + (data["high"][i] - data["low"][i]) * own[nights] / (LEFT_OUT - 1))
     return curves
 
 
@@ -327,7 +318,7 @@ def test_a_long_history_keeps_its_extremes_and_its_newest_nights(night):
     long = history_of(night, 400)
     found = trends(long, night, budget=120_000)
     assert found.points < found.nights + found.left_out
-    assert len(json.dumps(found.data)) < 1.2 * 120_000
+    assert len(packed(found.data)) < 1.2 * 120_000
     newest = set(range(found.nights - NEWEST, found.nights))
     whole = unpacked(trends(long, night, budget=10**9))
     for name, (nights, values) in unpacked(found).items():

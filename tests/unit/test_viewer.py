@@ -21,10 +21,13 @@ def test_content_is_the_scene(content):
     np.testing.assert_allclose(content.curvature, 0.2, rtol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(content.vertices - [0, 0, 15.0], axis=1), 5.0, atol=1e-4)
     assert content.faces.max() < len(content.vertices)
-    assert len(content.highlights) == 1
-    assert set(content.estimator) == {"circle_pose", "brightest_point", "cone_axis"}
-    cone = content.estimates[content.estimator == "cone_axis"]
-    assert float(cone[0] @ content.normals[0]) > 0.99999
+    normals = {}
+    for name, start, end in zip(content.names, content.starts, content.ends, strict=True):
+        normals.setdefault(name, []).append((end - start) / np.linalg.norm(end - start))
+    assert set(normals) == {"camera", "true normal", "circle_pose", "brightest_point", "cone_axis"}
+    assert len(normals["camera"]) == 8
+    assert len(normals["true normal"]) == 1
+    assert float(normals["cone_axis"][0] @ normals["true normal"][0]) > 0.99999
 
 
 @pytest.mark.render
@@ -32,7 +35,7 @@ def test_content_survives_its_file(content, tmp_path):
     content.save(tmp_path / "content.npz")
     again = Content.load(tmp_path / "content.npz")
     np.testing.assert_array_equal(again.vertices, content.vertices)
-    assert list(again.estimator) == list(content.estimator)
+    assert list(again.names) == list(content.names)
 
 
 @pytest.mark.render

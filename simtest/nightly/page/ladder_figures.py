@@ -1,8 +1,8 @@
 """The error ladder: what is left of the error when each stage's input is replaced by the exact one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -13,12 +13,10 @@ from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel, label_keys
 from simtest.pages.style import NEUTRAL, degrees, number, symbols
 
-FLOOR_DEG = 1e-6
-"""Smaller errors are rounding: on the chart's logarithmic axis they are drawn here."""
+FLOOR_DEG = 1e-6  # smaller errors are rounding: on the chart's logarithmic axis they are drawn here
 
 
-@dataclass(frozen=True)
-class RungError:
+class RungError(NamedTuple):
     """The mean error on one rung with its interval, deg; None and "" where there is none."""
 
     value: float | None = None
@@ -30,8 +28,7 @@ class RungError:
         return degrees(self.value)
 
 
-@dataclass(frozen=True)
-class LadderRow:
+class LadderRow(NamedTuple):
     """A scene and estimator: the errors by rung, and which stage takes most of the error away."""
 
     setting: str
@@ -40,8 +37,7 @@ class LadderRow:
     blame: str
 
 
-@dataclass(frozen=True)
-class Ladder:
+class Ladder(NamedTuple):
     """A table of rungs: name and meaning of each, from the whole pipeline to the exact answer, and their chart."""
 
     rungs: tuple[tuple[str, str], ...]

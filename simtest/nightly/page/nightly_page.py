@@ -9,11 +9,11 @@ from simtest.nightly import phrases
 from simtest.nightly.page import run_tables as tables
 from simtest.nightly.page.error_figures import error_figures
 from simtest.nightly.page.ladder_figures import ladder
-from simtest.nightly.page.trends import MEDIAN, NEWEST, Trends, trends
+from simtest.nightly.page.trends import LEFT_OUT, MEDIAN, NEWEST, Trends, trends
 from simtest.nightly.page.worst_cases import read_cases
 from simtest.nightly.records import JudgedRun, Verdict
 from simtest.pages import chart_web, style
-from simtest.pages.html import environment, script_json
+from simtest.pages.html import environment
 from simtest.report.gallery import draw_gallery, isophote_keys
 from simtest.report.run_folder import GalleryItem
 from simtest.runtime.files import write_atomically
@@ -48,7 +48,6 @@ def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = (
 
 
 def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
-    from markupsafe import Markup
 
     run, verdict, record = judged.run, judged.verdict, judged.run.record
     # Read and draw
@@ -72,7 +71,8 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         compared=tables.comparisons(verdict),
         canaries=tables.canaries(run),
         trends=past,
-        trend_data=None if past is None else Markup(_trend_script(past, verdict, colours)),
+        trend_data=None if past is None else _trend_data(past, verdict, colours),
+        trend_gap=LEFT_OUT,
         newest=NEWEST,
         groups=groups,
         ladder=steps,
@@ -102,8 +102,8 @@ def _estimators(judged: JudgedRun, items: Iterable[GalleryItem], past: Trends | 
     return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
 
 
-def _trend_script(past: Trends, verdict: Verdict, colours: dict[str, str]) -> str:
-    """Return what the page's script needs of the trends, as JSON; they open with the first regression, if any."""
+def _trend_data(past: Trends, verdict: Verdict, colours: dict[str, str]) -> str:
+    """Return what the page's script needs of the trends, packed; they open with the first regression, if any."""
     names = ("experiment", "quantity", "setting")
     data = past.data | {
         "colours": [colours[name] for name in past.data["names"]["estimator"]],
@@ -111,4 +111,4 @@ def _trend_script(past: Trends, verdict: Verdict, colours: dict[str, str]) -> st
         "baseline": None if verdict.baseline is None else verdict.baseline.started,
         "median": MEDIAN,
     }
-    return script_json(data)
+    return chart_web.packed(data)

@@ -2,7 +2,7 @@
 
 A curve is one quantity of one estimator in one setting. Where there are more nights than a curve may have points, the
 newest are all kept; the older ones are cut into stretches, and of each the lowest and the highest are kept, so that no
-peak is lost. Values are stored as 16 bits between the curve's own least and largest.
+peak is lost. Values are stored as 16 bits between the curve's own least and largest, and all are packed by zlib.
 """
 
 import base64
@@ -15,30 +15,24 @@ import polars as pl
 
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL, NightlyRun
-from simtest.runtime.arrays import AnyArray, Array, Mask
+from simtest.runtime.arrays import Array, Mask
 
 NIGHT_COLUMNS = ("run_id", "started", "commit", "state")
 HISTORY_COLUMNS = ("kind", *CELL, "quantity", "unit", "value", *NIGHT_COLUMNS, "profile")
 """All that the page reads of the history; a history of other columns may leave the rest out."""
 
-BUDGET_BYTES = 2_800_000
-"""Most that the curves may take in the page."""
-
-MOST_POINTS = 500
-"""Most points of a curve: more cannot be told apart on a screen."""
-
-NEWEST = 30
-"""Nights that are all kept."""
+BUDGET_BYTES = 2_800_000  # most that the curves may take in the page
+MOST_POINTS = 500  # most points of a curve: more cannot be told apart on a screen
+NEWEST = 30  # nights that are all kept
 
 LEAST_POINTS = NEWEST + 20
 """Points that every curve has; where there is no room for them, the oldest nights are left out."""
 
 COSTS, MEDIAN = "run time and memory", "median over all settings"
-
 _KEY = ("kind", *CELL, "quantity", "unit")
 _KINDS = ("setting", "cost", "ladder")
-_NAMES_BYTES, _NIGHT_BYTES = 45, 50
-"""What a curve's names and ends, and a night's, take."""
+LEFT_OUT = 65535  # code of a night that a curve has no point at
+_NAMES_BYTES, _NIGHT_BYTES = 45, 50  # what a curve's names and ends, and a night's, take
 
 
 @dataclass(frozen=True)
@@ -195,10 +189,8 @@ def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame)
     names = {name: keys[name].unique(maintain_order=True).to_list() for name in keys.columns}
     low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
     span = np.where(high > low, high - low, 1.0)[:, None]
-    codes = np.rint((values - low[:, None]) / span * 65535)
-    coded = kept & (high > low)[:, None]
-    # Most curves of quiet nights have the same points.
-    masks, mask_of = np.unique(np.packbits(kept, axis=1), axis=0, return_inverse=True)
+    with np.errstate(invalid="ignore"):
+        codes = np.where(kept, np.rint((values - low[:, None]) / span * (LEFT_OUT - 1)), LEFT_OUT).astype("<u2")
     return {
         "nights": {
             "started": nights["started"].dt.strftime("%Y-%m-%dT%H:%M:%SZ").to_list(),
@@ -206,19 +198,14 @@ def _packed(keys: pl.DataFrame, values: Array, kept: Mask, nights: pl.DataFrame)
             "state": [state or "" for state in nights["state"]],
         },
         "names": names,
-        "series": {name: _places(keys[name], names[name]) for name in keys.columns},
+        "series": {name: _numbers(keys[name], names[name]) for name in keys.columns},
         "low": [float(f"{v:.7g}") for v in low],
         "high": [float(f"{v:.7g}") for v in high],
-        "kept": _text(masks),
-        "kept_of": mask_of.ravel().tolist(),
-        "values": _text(codes[coded].astype("<u2")),
+        # A curve after the other, a code a night; what is left out, and level lines, compress to nothing.
+        "values": base64.b64encode(codes.tobytes()).decode("ascii"),
     }
 
 
-def _places(column: pl.Series, names: Sequence[str]) -> list[int]:
-    place = {name: i for i, name in enumerate(names)}
-    return [place[name] for name in column]
-
-
-def _text(data: AnyArray) -> str:
-    return base64.b64encode(data.tobytes()).decode("ascii")
+def _numbers(column: pl.Series, names: Sequence[str]) -> list[int]:
+    number = {name: i for i, name in enumerate(names)}
+    return [number[name] for name in column]

@@ -11,15 +11,9 @@ from simtest.pages.chart import Chart, Mark, Panel
 from simtest.pages.style import NEUTRAL, Symbol, symbols
 from simtest.runtime.arrays import Array
 
-KAPPA = 0.55
-"""The article's value."""
-
-OFFSET_LIGHT = (1.2, 0.0, 1.0)
-"""A light beside the camera, abs(V_Z)."""
-
-REACH = 3.6
-"""Half-width of the drawn part of the plane, abs(V_Z)."""
-
+KAPPA = 0.55  # the article's value
+OFFSET_LIGHT = (1.2, 0.0, 1.0)  # a light beside the camera, abs(V_Z)
+REACH = 3.6  # half-width of the drawn part of the plane, abs(V_Z)
 _SAMPLES, _POINTS, _CURVE = 721, 241, 200
 _LIMITS = (1e-3, 0.999)
 _ISOPHOTE, _BRANCH, _FOOT = "#0072B2", "#D55E00", "#B8860B"

@@ -73,8 +73,5 @@ _KNOWN = (
     Parameter("recentre", "", "place of the window"),
 )  # fmt: skip
 
-PARAMETERS = {parameter.name: parameter for parameter in _KNOWN}
-"""By name; every field of `PaperSetting` has one."""
-
-DEFAULTS = PaperSetting().model_dump()
-"""The article's defaults by name."""
+PARAMETERS = {parameter.name: parameter for parameter in _KNOWN}  # by name; every field of `PaperSetting` has one
+DEFAULTS = PaperSetting().model_dump()  # the article's defaults by name

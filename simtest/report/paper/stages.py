@@ -16,7 +16,6 @@ from simtest.spec.paper import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
 _DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
-
 PICTURES = ("texture", "clean", "smoothed")
 
 
@@ -24,22 +23,30 @@ PICTURES = ("texture", "clean", "smoothed")
 class Stages:
     """The stages of one realisation; pictures are shares of the noise-free peak."""
 
-    setting: str  # name of the setting, with the drawn values
-    theta_deg: float  # slant
+    setting: PaperSetting
     texture: Image
-    side: float  # of the texture's window, texture units
     clean: Image  # the part of the camera's picture that is used, shape (h, w)
     noisy: Image
     smoothed: Image  # normalised to its peak
     extent: tuple[float, float, float, float]  # x0, x1, y1, y0 of that part, px
-    isovalue: float  # t
     isophote: Array | None  # px, shape (k, 2); None where the realisation failed
     ellipse: Array | None
     truth: Array  # true normal
     candidates: tuple[Array, ...]  # the proposed one first
     errors_deg: tuple[float, ...]  # of the candidates
     status: str  # "ok" or the failure's reason
-    is_default: bool  # whether the setting is the article's
+
+    @property
+    def is_default(self) -> bool:
+        """Whether the setting is the article's."""
+        return self.setting == PaperSetting()
+
+    @property
+    def values(self) -> str:
+        """The setting in words."""
+        names = ("sigma", "theta_deg", "exponent", "isovalue", "eps")
+        values = ", ".join(PARAMETERS[name].text(getattr(self.setting, name)) for name in names)
+        return f"{values}, smoothing {PARAMETERS['smoothing_px'].text(self.setting.smoothing_px)}"
 
     @property
     def result(self) -> str:
@@ -58,58 +65,43 @@ def stages(run: Run) -> Stages | None:
 
     Returns None where the run kept no realisation of the published protocol.
     """
-    kept = [
-        (item, item.meta.paper)
-        for item in run.gallery
-        if item.meta.paper is not None and all(name in item.pictures for name in PICTURES)
-    ]
+    kept = [item for item in run.gallery if item.meta.paper and all(name in item.pictures for name in PICTURES)]
     if not kept:
         return None
-    return _read(*max(kept, key=lambda pair: (pair[1] == PaperSetting(), _answered(pair[0]))))
+    return _read(max(kept, key=lambda item: (item.meta.paper == PaperSetting(), _pose(item).status == "ok")))
 
 
-def _pose(item: GalleryItem) -> KeptEstimate | None:
+def _pose(item: GalleryItem) -> KeptEstimate:
     """Return circle pose's estimate, else the first one."""
-    estimates = item.meta.estimates
-    return next((e for e in estimates if e.estimator == "circle_pose"), estimates[0] if estimates else None)
+    estimates = item.meta.estimates or (KeptEstimate(estimator="", status="no estimate"),)
+    return next((estimate for estimate in estimates if estimate.estimator == "circle_pose"), estimates[0])
 
 
-def _answered(item: GalleryItem) -> bool:
-    estimate = _pose(item)
-    return estimate is not None and estimate.status == "ok"
-
-
-def _read(item: GalleryItem, setting: PaperSetting) -> Stages:
-    estimate = _pose(item)
-    x, y, width, height = item.meta.outer
-    peak = item.meta.peak_value or float(np.max(item.pictures["smoothed"])) or 1.0
-    truth = np.array(item.meta.truth[0].normal)
-    candidates = tuple(estimate.normals) if estimate else ()
-    names = ("sigma", "theta_deg", "exponent", "isovalue", "eps")
-    values = ", ".join(PARAMETERS[name].text(getattr(setting, name)) for name in names)
+def _read(item: GalleryItem) -> Stages:
+    meta, estimate = item.meta, _pose(item)
+    assert meta.paper is not None
+    x, y, width, height = meta.outer
+    peak = meta.peak_value or float(np.max(item.pictures["smoothed"])) or 1.0
+    truth, candidates = np.array(meta.truth[0].normal), tuple(estimate.normals)
     return Stages(
-        setting=f"{values}, smoothing {PARAMETERS['smoothing_px'].text(setting.smoothing_px)}",
-        theta_deg=setting.theta_deg,
+        setting=meta.paper,
         texture=item.pictures["texture"],
-        side=float(setting.size),
         clean=item.pictures["clean"],
         noisy=item.frame[y : y + height, x : x + width],
         smoothed=item.pictures["smoothed"] / np.float32(peak),
         extent=(x, x + width, y + height, y),
-        isovalue=setting.isovalue,
-        isophote=np.array(estimate.isophotes[0].points) if estimate and estimate.isophotes else None,
-        ellipse=np.array(estimate.curves[0]) if estimate and estimate.curves else None,
+        isophote=np.array(estimate.isophotes[0].points) if estimate.isophotes else None,
+        ellipse=np.array(estimate.curves[0]) if estimate.curves else None,
         truth=truth,
         candidates=candidates,
         errors_deg=tuple(float(angle_deg(candidate, truth)) for candidate in candidates),
-        status=estimate.status if estimate else "None",
-        is_default=setting == PaperSetting(),
+        status=estimate.status,
     )
 
 
 def stage_charts(data: Stages, colour: str) -> list[Chart]:
     """Describe the six pictures of the pipeline; `colour` is the estimator's."""
-    half = data.side / 2
+    half = data.setting.size / 2
     plane = tuple(f"{name} on the plane (texture units)" for name in "xy")
     texture = _picture("1  texture of the specular term", data.texture, (-half, half, half, -half), plane, ())
     pictures = (
@@ -135,7 +127,7 @@ def _fitted(data: Stages, colour: str) -> list[Mark]:
     marks = []
     if data.isophote is not None:
         x, y = np.vstack([data.isophote, data.isophote[:1]]).T
-        marks.append(Mark(x, y, _ISOPHOTE, f"isophote t = {data.isovalue:g}", line="solid", width=2.8))
+        marks.append(Mark(x, y, _ISOPHOTE, f"isophote t = {data.setting.isovalue:g}", line="solid", width=2.8))
     if data.ellipse is not None:
         x, y = data.ellipse.T
         marks.append(Mark(x, y, colour, "fitted ellipse", line="dash", width=2.0))
@@ -144,12 +136,19 @@ def _fitted(data: Stages, colour: str) -> list[Mark]:
 
 def _side_view(data: Stages, colour: str) -> Chart:
     """Describe the normals in the plane of the tilt, seen from the side: the camera looks along z."""
-    theta = np.radians(data.theta_deg)
+    theta = np.radians(data.setting.theta_deg)
     end = 0.95 * np.array([np.cos(theta), np.sin(theta)])
     marks = [
         Mark([0, 0], [0, -1.12], NEUTRAL, line="dot"),
         Mark([0], [-1.2], _PLANE, words=["towards the camera"]),
-        Mark([-end[0], end[0]], [-end[1], end[1]], _PLANE, f"plane, slant {data.theta_deg:g}°", line="solid", width=3),
+        Mark(
+            [-end[0], end[0]],
+            [-end[1], end[1]],
+            _PLANE,
+            f"plane, slant {data.setting.theta_deg:g}°",
+            line="solid",
+            width=3,
+        ),
         _normal(data.truth, TRUTH, "true normal", 7),
     ]
     for index, candidate in enumerate(data.candidates):

@@ -15,26 +15,22 @@ AGREES, DIFFERS, ABSENT = "agrees", "differs", "not in this run"
 PART, FEW = "only part of the range", "too few realisations"
 """What the run holds agrees, but is not the claim's whole range; there is no standard error to judge by."""
 
-ESTIMATOR = "circle_pose"
-"""The article's method; only its sweeps are compared."""
-
+ESTIMATOR = "circle_pose"  # the article's method; only its sweeps are compared
 ARTICLE, EXPECTED = "published", "expected here"
-
+# Figures of [MB, section 3.1]; docs/theory.md, section 2.
 MEAN_BELOW_DEG = 1.25
 SLANT_BELOW_DEG = 7.0
 EXPONENT_BELOW_DEG = 1.75
 EXPONENT_SLOPE_DEG = 1e-2
 LEAST_AT = (0.5, 0.6)
 STABLE_TO = 200.0
-"""Figures of [MB, section 3.1]; docs/theory.md, section 2."""
 
 BRANCH_SLOPE = 0.5
 SLOPE_TOLERANCE = 0.05
 STABLE_TOLERANCE = 0.1
 LAW_TOLERANCE = 0.2
 LAW_FROM_PX = 1.0
-FREE = ("smoothing_px",)
-"""Parameters that the article does not state: any fixed value is compared."""
+FREE = ("smoothing_px",)  # parameters that the article does not state: any fixed value is compared
 
 
 @dataclass(frozen=True)
@@ -218,8 +214,7 @@ def _truncation(sweep: Sweep) -> tuple[str, bool]:
     return f"{text}; largest mean {_largest(sweep, sweep.mean)}", met
 
 
-_BY_STANDARD_ERROR = (_grows, _slope, _u_shape, _stable, _half)
-"""Tests that hang on the means' standard errors."""
+_BY_STANDARD_ERROR = (_grows, _slope, _u_shape, _stable, _half)  # tests that hang on the means' standard errors
 
 SIGMA, SLANT, EXPONENT, ISOVALUE = (0.0, 0.1), (10.0, 75.0), (30.0, 120.0), (0.05, 0.8)
 """Ranges of the article's claims; towards slant 90 and t = 0.02 the window leaves no closed isophote."""

@@ -1,7 +1,6 @@
 """The article's error plots as charts: means with both bars, bound and law, and below them the failures."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,9 +13,8 @@ from simtest.runtime.arrays import Array
 BOUND_NAME = "Cramér-Rao bound (an RMS angle)"
 LAW_NAME = "predicted bias of the smoothing, no noise"
 _BOUND_COLOUR, _FAILED_COLOUR = "#8A6D00", "#D03030"
-
-_STD_PX, _SHARE = 6.0, 0.2
-"""Width of the standard deviation's bars, and the failures' strip over the panel above it."""
+_WIDE = 20.0  # means that span more than this factor are drawn on a logarithmic axis
+_STD_PX, _SHARE = 6.0, 0.2  # width of the standard deviation's bars, and the failures' strip over the panel above it
 
 _KEYS = (
     Mark(NOTHING, NOTHING, NEUTRAL, "± standard deviation", symbol=Symbol("|", "line-ns", "▮"), size=13, width=_STD_PX),
@@ -29,31 +27,59 @@ _CLOSE, _STAGGER = 0.09, 0.24
 
 def sweep_chart(data: SweepFigure, colours: Mapping[str, str]) -> Chart:
     """Describe an error plot and its strip of failures."""
-    shapes = symbols(data.labels)
-    y = replace(data.y, limits=_log_limits(data)) if data.y.scale == "log" else data.y
+    shapes = symbols(sweep.label for sweep in data.sweeps)
+    x, y = _axes(data)
     floor = y.limits[0] if y.limits else 0.0
+    shifted = _shifted(data, x)
     marks, strip = [], []
     for index, sweep in enumerate(data.sweeps):
         colour, symbol = colours[sweep.estimator], shapes[sweep.label]
-        marks += _means(sweep, data.shifted_x(index), colour, symbol, floor)
-        strip += _failures(data, index, colour, symbol)
+        marks += _means(sweep, shifted[index], colour, symbol, floor)
+        strip += _failures(data, index, x, colour, symbol)
     for sweep in data.bounds:
         told = f"{BOUND_NAME}\n{sweep.label}: {{y}}°"
         marks.append(Mark(sweep.shown_x, sweep.bound, _BOUND_COLOUR, BOUND_NAME, line="dashdot", hover=told))
     for index, sweep in data.laws:
         told = f"{LAW_NAME}\n{sweep.label}: {{y}}°"
-        marks.append(Mark(data.shifted_x(index), sweep.law, NEUTRAL, LAW_NAME, line="dash", hover=told))
+        marks.append(Mark(shifted[index], sweep.law, NEUTRAL, LAW_NAME, line="dash", hover=told))
     rows = len(data.sweeps)
     below = Axis(_failures_title(data), limits=(-0.8, rows - 0.2), named=())
-    panels = Panel(data.x, y, tuple(marks)), Panel(data.x, below, tuple(strip), share=_SHARE)
+    panels = Panel(x, y, tuple(marks)), Panel(x, below, tuple(strip), share=_SHARE)
     return Chart(data.key, data.title, panels, 480 + 24 * rows, _KEYS)
 
 
-def _log_limits(data: SweepFigure) -> tuple[float, float]:
-    """Return the range of a logarithmic error axis: bars may leave it below, where they would squeeze the means."""
+def _axes(data: SweepFigure) -> tuple[Axis, Axis]:
+    """Choose the axes of parameter and errors.
+
+    The parameter's is logarithmic where its values are evenly spaced in the logarithm; the errors' is so beside such a
+    one, or where the means differ much, and else begins at 0 as in the article.
+    """
+    values, title = np.unique(finite([sweep.shown_x for sweep in data.sweeps])), data.parameter.axis_title
+    is_log = values.size > 2 and values[0] > 0 and _unevenness(np.log(values)) < 0.5 * _unevenness(values)
+    x, about = Axis(title, "log" if is_log else "linear"), "error of the better candidate (deg)"
     means, lows, tops = (finite([getattr(s, side) for s in data.sweeps]) for side in ("mean", "least", "largest"))
-    least = max(float(lows[lows > 0].min(initial=np.inf)), float(means[means > 0].min()) / 12)
-    return least / 1.3, float(tops.max()) * 1.4
+    if means.size and means.min() > 0 and (is_log or means.max() > _WIDE * means.min()):
+        # Bars may leave the range below, where they would squeeze the means.
+        least = max(float(lows[lows > 0].min(initial=np.inf)), float(means.min()) / 12)
+        return x, Axis(about, "log", (least / 1.3, float(tops.max()) * 1.4))
+    top = finite([tops, *(sweep.bound for sweep in data.sweeps)]).max(initial=0.0)
+    return x, Axis(about, limits=(0.0, 1.06 * float(top)) if top > 0 else None)
+
+
+def _unevenness(values: Array) -> float:
+    """Return the spread of the steps between ascending values, over their mean."""
+    steps = np.diff(values)
+    return float(steps.std() / steps.mean())
+
+
+def _shifted(data: SweepFigure, axis: Axis) -> list[Array]:
+    """Return the x at which each sweep is drawn: beside the others, so that the bars of several show."""
+    is_log, count = axis.scale == "log", len(data.sweeps)
+    values = np.unique(finite([sweep.shown_x for sweep in data.sweeps]))
+    gap = float(np.diff(np.log(values) if is_log else values).min()) if values.size > 1 else 1.0
+    shifts = (np.arange(count) - (count - 1) / 2) * min(0.14, 0.6 / count) * gap
+    columns = zip(data.sweeps, shifts, strict=True)
+    return [s.shown_x * np.exp(shift) if is_log else s.shown_x + shift for s, shift in columns]
 
 
 def _means(sweep: Sweep, x: Array, colour: str, symbol: Symbol, floor: float) -> list[Mark]:
@@ -75,7 +101,7 @@ def _means(sweep: Sweep, x: Array, colour: str, symbol: Symbol, floor: float) ->
     ]
 
 
-def _failures(data: SweepFigure, index: int, colour: str, symbol: Symbol) -> list[Mark]:
+def _failures(data: SweepFigure, index: int, axis: Axis, colour: str, symbol: Symbol) -> list[Mark]:
     """Return the counts of a sweep's failed realisations; those of several sweeps in colour and with symbols."""
     sweep, several = data.sweeps[index], len(data.sweeps) > 1
     name = f"{sweep.estimator}: {sweep.label}"
@@ -86,7 +112,7 @@ def _failures(data: SweepFigure, index: int, colour: str, symbol: Symbol) -> lis
         for at, failed, ok, reasons in zip(sweep.x, sweep.failed, sweep.answered, sweep.reasons, strict=True)
     ])  # fmt: skip
     x = sweep.shown_x
-    at = np.log(x) if data.x.scale == "log" else x
+    at = np.log(x) if axis.scale == "log" else x
     close = x.size > 1 and np.diff(at).min() < _CLOSE * np.ptp(at)
     height = len(data.sweeps) - 1 - index + (_STAGGER * (-1.0) ** np.arange(x.size) if close else np.zeros(x.size))
     marks = []

@@ -7,18 +7,12 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from simtest.pages.axes import Axis, finite
 from simtest.pages.style import degrees, estimator_order, number
 from simtest.report.paper.parameters import DEFAULTS, PARAMETERS, PREFIX, Parameter
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
 
-Value = float | bool | None
-"""What a row holds of a parameter."""
-
-_WIDE = 20.0
-"""Means that span more than this factor are drawn on a logarithmic axis."""
-
+Value = float | bool | None  # what a row holds of a parameter
 _FEWEST = 2
 _LEAST_LAW_DEG = 1e-3  # a smaller prediction is none
 
@@ -95,16 +89,6 @@ class SweepFigure:
         return f"Error against {self.parameter.words} {self.parameter.symbol}"
 
     @property
-    def labels(self) -> list[str]:
-        """Labels in order of appearance."""
-        return list(dict.fromkeys(sweep.label for sweep in self.sweeps))
-
-    @property
-    def estimators(self) -> list[str]:
-        """Estimators in the report's order."""
-        return estimator_order(sweep.estimator for sweep in self.sweeps)
-
-    @property
     def bounds(self) -> list[Sweep]:
         """The sweeps whose Cramer-Rao bound is drawn: one a label, where it is not 0 everywhere."""
         seen: dict[str, Sweep] = {}
@@ -118,43 +102,6 @@ class SweepFigure:
         """The sweeps whose law is drawn, with their indices: it is known at two settings, not 0 everywhere."""
         known = [(i, sweep) for i, sweep in enumerate(self.sweeps) if np.isfinite(sweep.law).sum() > 1]
         return [(i, sweep) for i, sweep in known if np.nanmax(sweep.law) > _LEAST_LAW_DEG]
-
-    @property
-    def x(self) -> Axis:
-        """The parameter's axis: logarithmic where the values are evenly spaced in the logarithm."""
-        values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
-        is_log = values.size > 2 and values[0] > 0 and _unevenness(np.log(values)) < 0.5 * _unevenness(values)
-        return Axis(self.parameter.axis_title, "log" if is_log else "linear")
-
-    @property
-    def y(self) -> Axis:
-        """The errors' axis: from 0 as in the article; logarithmic beside such an x, or where the means differ much."""
-        title = "error of the better candidate (deg)"
-        means = finite([sweep.mean for sweep in self.sweeps])
-        if means.size and means.min() > 0 and (self.x.scale == "log" or means.max() > _WIDE * means.min()):
-            return Axis(title, "log")
-        tops = finite([part for sweep in self.sweeps for part in (sweep.largest, sweep.bound)])
-        return Axis(title, "linear", (0.0, 1.06 * float(tops.max())) if tops.size and tops.max() > 0 else None)
-
-    def shifted_x(self, index: int) -> Array:
-        """Return the x at which a sweep is drawn: beside the others, so that the bars of several show."""
-        x = self.sweeps[index].shown_x
-        values = np.unique(np.concatenate([sweep.shown_x for sweep in self.sweeps]))
-        is_log = self.x.scale == "log"
-        gap = float(np.diff(np.log(values) if is_log else values).min()) if values.size > 1 else 1.0
-        shift = (index - (len(self.sweeps) - 1) / 2) * self.spread * gap
-        return x * np.exp(shift) if is_log else x + shift
-
-    @property
-    def spread(self) -> float:
-        """Share of the least gap between settings that one sweep takes."""
-        return min(0.14, 0.6 / max(len(self.sweeps), 1))
-
-
-def _unevenness(values: Array) -> float:
-    """Spread of the steps between ascending values, over their mean."""
-    steps = np.diff(values)
-    return float(steps.std() / steps.mean())
 
 
 def is_published(run: Run) -> bool:

@@ -9,31 +9,26 @@ from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.report.view3d import grid_triangles
-from simtest.runtime.arrays import AnyArray, Array, IntArray
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.runtime.arrays import Array, IntArray
+from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene
 
-GRID = 240
-"""Samples of the visible surface along the longer side of the frame."""
-
-OCCLUSION = 1.15
-"""Neighbouring samples whose distances differ by a larger factor lie on both sides of an edge."""
+GRID = 240  # samples of the visible surface along the longer side of the frame
+OCCLUSION = 1.15  # factor between the distances of neighbouring samples beyond which there is an edge
+CAMERA, TRUE = "camera", "true normal"
 
 
 @dataclass(frozen=True)
 class Content:
-    """A scene's 3D view, camera frame, mm."""
+    """A scene's 3D view, camera frame, mm: a surface, light positions, and line segments by name."""
 
     vertices: Array  # samples of the visible surface, shape (V, 3)
     faces: IntArray  # triangles between them, shape (F, 3)
     curvature: Array  # principal curvature of larger size, 1/mm, convex towards the camera positive, shape (V,)
-    frustum: Array  # unit sightlines through the corners of the image, in turn, shape (4, 3)
-    lights: Array  # true positions, shape (L, 3)
-    highlights: Array  # true isolated ones, shape (N, 3)
-    normals: Array  # at these
-    estimator: AnyArray  # name of each estimate's estimator, shape (E,)
-    looks: Array  # point that each estimate looks at, shape (E, 3)
-    estimates: Array  # proposed normals
+    lights: Array  # shape (L, 3)
+    names: AnyArray  # `CAMERA`, `TRUE` or an estimator, shape (S,)
+    starts: Array  # shape (S, 3)
+    ends: Array
 
     def save(self, path: Path) -> None:
         """Write the arrays to a NumPy archive."""
@@ -54,22 +49,25 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     session = Session(scene, variant)
     seen = render_view(session, scene)
     vertices, faces, curvature = _visible(session)
+    distance = np.linalg.norm(vertices, axis=1)
+    near, reach = 0.5 * float(np.quantile(distance, 0.05)), 0.35 * float(np.median(distance))
+
+    # The camera's frustum: to the corners of the image, and around it.
     camera = session.camera
-    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float)
+    size = np.array([camera.width, camera.height], dtype=float)
+    sightlines = np.asarray(camera.unproject(size * [[0, 0], [1, 0], [1, 1], [0, 1]]))
+    corners = near * sightlines / sightlines[:, 2:3]
+    segments = [(CAMERA, start, end) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    segments += [(CAMERA, np.zeros(3), corner) for corner in corners]
+
+    # True normals are longer than the estimates', so that they show where these lie on them.
     found = [truth for truth in seen.highlights if truth.isolated]
-    names, looks, estimates = _estimates(session, seen)
-    return Content(
-        vertices=vertices,
-        faces=faces,
-        curvature=curvature,
-        frustum=np.asarray(camera.unproject(corners)),
-        lights=np.asarray(scene.rig.true_mm()),
-        highlights=np.array([h.position for h in found]).reshape(-1, 3),
-        normals=np.array([h.normal for h in found]).reshape(-1, 3),
-        estimator=np.array(names, dtype=np.str_),
-        looks=looks,
-        estimates=estimates,
-    )
+    segments += [(TRUE, h.position, h.position + 1.3 * reach * h.normal) for h in found]
+    estimates = _estimates(session, seen)
+    segments += [(name, look, look + reach * normal) for name, look, normal in estimates]
+    names, starts, ends = zip(*segments, strict=True)
+    lights = np.asarray(scene.rig.true_mm())
+    return Content(vertices, faces, curvature, lights, np.array(names), np.array(starts), np.array(ends))
 
 
 def _visible(session: Session) -> tuple[Array, IntArray, Array]:
@@ -82,17 +80,16 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array]:
     return position[valid], faces, curvature[valid]
 
 
-def _estimates(session: Session, seen: RenderedView) -> tuple[list[str], Array, Array]:
-    """Return names, points looked at and normals of all estimates that look at the surface."""
-    names, pixels, normals = [], [], []
-    for specularity in reconstruct(seen.frame(seen.scene.sensor.seed), seen.calibration):
-        for name, estimate in specularity.estimates.items():
-            if not isinstance(estimate, Failure):
-                names.append(name)
-                pixels.append(estimate.look_px)
-                normals.append(estimate.normal)
-    if not names:
-        return [], np.empty((0, 3)), np.empty((0, 3))
-    points = session.cast(np.array(pixels))[0].position
-    hit = np.asarray(np.isfinite(points).all(axis=1))
-    return [name for name, kept in zip(names, hit, strict=True) if kept], points[hit], np.array(normals)[hit]
+def _estimates(session: Session, seen: RenderedView) -> list[tuple[str, Array, Array]]:
+    """Return name, point looked at and normal of all estimates that look at the surface."""
+    found = [
+        (name, estimate)
+        for specularity in reconstruct(seen.frame(seen.scene.sensor.seed), seen.calibration)
+        for name, estimate in specularity.estimates.items()
+        if not isinstance(estimate, Failure)
+    ]
+    if not found:
+        return []
+    points = session.cast(np.array([estimate.look_px for _, estimate in found]))[0].position
+    hits = zip(found, points, strict=True)
+    return [(name, point, estimate.normal) for (name, estimate), point in hits if np.isfinite(point).all()]

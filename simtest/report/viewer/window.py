@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.report.viewer.content import Content
+from simtest.report.viewer.content import CAMERA, TRUE, Content
 from simtest.runtime.files import write_atomically
 
 OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
@@ -20,10 +20,11 @@ OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
 TIMEOUT_S = 180
 SIZE = (1280, 800)
-COLOURS = {"circle_pose": "#d95f02", "brightest_point": "#7570b3", "cone_axis": "#1b9e77"}
-OTHER = "#666666"
-TRUE = "black"
-LIGHT = "#f2c500"
+LINES = {CAMERA: ("black", 2), TRUE: ("black", 3),
+         "circle_pose": ("#d95f02", 6), "brightest_point": ("#7570b3", 6), "cone_axis": ("#1b9e77", 6)}  # fmt: skip
+"""Colour and width of lines."""
+
+OTHER, LIGHT = "#666666", "#f2c500"
 DONE = "simtest view: drawn"
 
 
@@ -112,21 +113,15 @@ def _plot(content: Content, screenshot: str | None) -> None:
                          "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25,
                          "position_y": 0.02},
     )  # fmt: skip
-    near = float(np.quantile(np.linalg.norm(content.vertices, axis=1), 0.05))
-    reach = 0.35 * float(np.median(np.linalg.norm(content.vertices, axis=1)))
-    _add_camera(plotter, content, 0.5 * near)
+    legend: list[tuple[str, str]] = []
+    for name in dict.fromkeys(content.names.tolist()):
+        own = content.names == name
+        points = np.stack([content.starts[own], content.ends[own]], axis=1).reshape(-1, 3)
+        colour, width = LINES.get(name, (OTHER, 6))
+        plotter.add_mesh(pyvista.line_segments_from_points(points), color=colour, line_width=width)
+        legend.append((name, colour))
     plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
-    legend: list[tuple[str, str]] = [("camera", "black"), ("light", LIGHT)]
-    if len(content.highlights):
-        legend.append(("true normal", TRUE))
-    for foot, normal in zip(content.highlights, content.normals, strict=True):
-        # Longer than the estimates', so that it shows where they lie on it.
-        plotter.add_mesh(pyvista.Line(foot, foot + 1.3 * reach * normal), color=TRUE, line_width=3)
-    for name, look, normal in zip(content.estimator, content.looks, content.estimates, strict=True):
-        colour = COLOURS.get(str(name), OTHER)
-        plotter.add_mesh(pyvista.Line(look, look + reach * normal), color=colour, line_width=6)
-        if (str(name), colour) not in legend:
-            legend.append((str(name), colour))
+    legend.insert(1, ("light", LIGHT))
     plotter.add_legend([list(entry) for entry in legend], bcolor="white", border=True, size=(0.16, 0.032 * len(legend)))
     _move_viewer(plotter, content)
     if screenshot is None:
@@ -134,16 +129,6 @@ def _plot(content: Content, screenshot: str | None) -> None:
     else:
         plotter.screenshot(screenshot)
     plotter.close()
-
-
-def _add_camera(plotter: object, content: Content, reach: float) -> None:
-    """Add the camera's frustum as lines: to the corners of the image and around it."""
-    import pyvista
-
-    corners = reach * content.frustum / content.frustum[:, 2:3]
-    for i, corner in enumerate(corners):
-        for end in ((0.0, 0.0, 0.0), corners[(i + 1) % 4]):
-            plotter.add_mesh(pyvista.Line(end, corner), color="black", line_width=2)  # type: ignore[attr-defined]
 
 
 def _move_viewer(plotter: object, content: Content) -> None:
