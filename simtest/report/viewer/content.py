@@ -9,8 +9,8 @@ from simtest.errors import Failure, InputError
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.report.view3d import grid_triangles
-from simtest.runtime.arrays import Array, IntArray
-from simtest.simulation.rendered_view import render_view
+from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Scene
 
 GRID = 240  # samples of the visible surface along the longer side of the frame
