@@ -52,10 +52,6 @@ class Detector(Protocol):
             The frame's camera.
         priors : Priors
             What is known of lights, distance and lobe.
-
-        Returns
-        -------
-        Detection
         """
 
 
