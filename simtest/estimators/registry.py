@@ -8,9 +8,9 @@ from simtest.calibration import Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.plugins import PluginGroup
+from simtest.runtime.entry_points import EntryPointGroup
 
-ESTIMATORS = PluginGroup("simtest.estimators", "estimator")
+ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
 
 @dataclass(frozen=True)
