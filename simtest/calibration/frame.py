@@ -8,7 +8,6 @@ import numpy as np
 from simtest.calibration.calibration import Calibration, CorrectedFrame, brightest_channel
 from simtest.calibration.noise_estimate import estimate_noise
 from simtest.calibration.response import Response
-from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
 
@@ -35,7 +34,7 @@ class Frame:
 
     encoded: Image
     calibration: Calibration
-    smoothing_px: float = DEFAULT_SMOOTHING_PX
+    smoothing_px: float
     seen: Mask | None = None
     light: Image | None = None
     _patches: dict[tuple[Box, tuple[int, int] | None], Patch | Failure] = field(

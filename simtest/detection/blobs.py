@@ -205,6 +205,7 @@ def _traced(
     clipped, visible = masks
     value = float(values[row, column])
     sets = tuple(level_set_around(values, pixel, t * value, visible) for t in NESTED_ISOVALUES)
+    # several peaks, or a clipped plateau
     count, _, stats, _ = cv2.connectedComponentsWithStats(((values >= TOP * value) & region).astype(np.uint8))
     several = int(np.count_nonzero(stats[1:count, cv2.CC_STAT_AREA] >= 2)) > 1
     in_frame = (column + corner[0], row + corner[1])

@@ -26,16 +26,9 @@ LEAST_SPECULAR = 0.01
 
 @dataclass(frozen=True)
 class ColourDetection:
-    """Light and highlights of a colour frame.
+    """The light of a colour frame in its two parts, the pixels of highlights of every kind, shape (H, W), and these.
 
-    Parameters
-    ----------
-    light : SplitLight
-        The frame's light in its two parts.
-    mask : ndarray of bool, shape (H, W)
-        Pixels of highlights of every kind.
-    highlights : list of Highlight
-        The brightest first.
+    The highlights come brightest first.
     """
 
     light: SplitLight
@@ -78,10 +71,12 @@ def _above_own_peak(above: Mask, specular: Image) -> Mask:
     count, labels, stats, _ = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
     if count < 2:
         return above
+    # peak of each connected part
     rows, columns = np.nonzero(above)
     number = labels[rows, columns]
     peaks = np.zeros(count, dtype=np.float32)
     np.maximum.at(peaks, number, specular[rows, columns])
+    # reject small parts and low pixels
     large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA_PX
     kept = large[number] & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peaks[number])
     mask = np.zeros(above.shape, dtype=bool)

@@ -9,9 +9,9 @@ from simtest.detection.regions import Region
 from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.runtime.plugins import PluginGroup
+from simtest.runtime.entry_points import EntryPointGroup
 
-DETECTORS = PluginGroup("simtest.detectors", "detector")
+DETECTORS = EntryPointGroup("simtest.detectors", "detector")
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,6 @@ class Detector(Protocol):
             The frame's camera.
         priors : Priors
             What is known of lights, distance and lobe.
-
-        Returns
-        -------
-        Detection
         """
 
 

@@ -38,21 +38,12 @@ _WIDE = np.ones((5, 5), dtype=np.uint8)
 
 @dataclass(frozen=True)
 class SplitLight:
-    """The two parts of a frame's light, share of full scale.
+    """The two parts of a frame's light, shape (H, W), share of full scale.
 
-    Parameters
-    ----------
-    intensity : ndarray of float32, shape (H, W)
-        Mean of the channels.
-    specular : ndarray of float32, shape (H, W)
-        Light mirrored by the surface; about 0 elsewhere, with the noise of the difference; 0 outside the view.
-    tissue : ndarray of float32, shape (H, W)
-        The rest.
-    noise : float
-        Standard deviation of the specular part from pixel to pixel.
+    Specular light is mirrored by the surface: about 0 elsewhere, with the noise of the difference, and 0 outside the
+    view. The rest is the tissue's. `noise` is the standard deviation of the specular part from pixel to pixel.
     """
 
-    intensity: Image
     specular: Image
     tissue: Image
     noise: float
@@ -84,7 +75,7 @@ def split_light(linear: Image, clipped: Mask, seen: Mask | None = None) -> Split
     # largest channel is clipped.
     specular = np.minimum(intensity - tissue, least - floor * tissue)
     specular[~inside] = 0
-    return SplitLight(intensity, specular, intensity - specular, estimate_noise(specular, seen))
+    return SplitLight(specular, intensity - specular, estimate_noise(specular, seen))
 
 
 def _tissue_colour(intensity: Image, difference: Image, least: Image, sound: Mask) -> tuple[Image, Image]:

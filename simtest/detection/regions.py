@@ -47,16 +47,9 @@ class Region:
 
 @dataclass(frozen=True)
 class Component:
-    """The connected pixels above half of a peak's value.
+    """The connected pixels above half of a peak's value: a mask whose first pixel is (x, y) in the frame.
 
-    Parameters
-    ----------
-    mask : ndarray of bool, shape (h, w)
-        The pixels.
-    x, y : int
-        Column and row of the mask's first pixel in the frame.
-    closed : bool
-        Whether they stay clear of the frame's border and of pixels outside the view mask.
+    It is closed if it stays clear of the frame's border and of pixels outside the view mask.
     """
 
     mask: Mask
@@ -66,7 +59,10 @@ class Component:
 
 
 def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: Mask | None = None) -> list[Region]:
-    """Find the specularities of a frame.
+    """Find the specularities of a frame, the brightest first.
+
+    Each is a local maximum whose isophote at t = 0.5 closes inside the frame without a higher value in it, and which
+    stands 10 noise standard deviations above its surroundings.
 
     Parameters
     ----------
@@ -78,12 +74,6 @@ def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: M
         Leave out those whose isophote at t = 0.5 reaches the frame's border, or that of the view.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
-
-    Returns
-    -------
-    list of Region
-        The brightest first. Each is a local maximum whose isophote at t = 0.5 closes inside the frame without a
-        higher value in it, and which stands 10 noise standard deviations above its surroundings.
     """
     image = np.where(np.isfinite(smoothed), smoothed, 0).astype(np.float32)
     if seen is not None:

@@ -134,6 +134,7 @@ def _at_own_scale(patch: Patch) -> tuple[Patch, float]:
     more = SCALE * width
     if more <= DEFAULT_SMOOTHING_PX / 2:
         return patch, 1.0
+    # the peak of the smoothed patch, near the old one
     values = smooth(patch.values, more)
     rows, columns = np.nonzero(patch.inside(TOP_ISOVALUE))
     highest = int(np.argmax(values[rows, columns]))

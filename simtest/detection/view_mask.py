@@ -42,12 +42,8 @@ MARGIN = 0.012
 class View:
     """The part of a picture that shows tissue.
 
-    Parameters
-    ----------
-    seen : ndarray of bool, shape (H, W), or None
-        Inside the border, without its bright rim; None where the whole picture is seen.
-    circle : ViewMask or None
-        The border, where it is round.
+    `seen`, shape (H, W), is the inside of the border without its bright rim, None where the whole picture is seen;
+    `circle` is the border, where it is round.
     """
 
     seen: Mask | None
@@ -104,14 +100,17 @@ def _inside(brightness: Image) -> Mask | None:
     corner = max(2, round(0.02 * max(smooth.shape)))
     ends = (np.s_[:corner], np.s_[-corner:])
     corners = [smooth[rows, columns] for rows in ends for columns in ends]
+    # two or more dark corners
     dark = [float(c.mean()) for c in corners if float(c.mean()) < DARK]
     if len(dark) < 2:
         return None
     level = max(0.05, 1.5 * max(dark) + 0.02)
+    # dark surroundings: connected to the corner
     below = np.pad((smooth < level).astype(np.uint8), 1, constant_values=1)
     cv2.floodFill(below, None, (0, 0), 2)
     lit = (below[1:-1, 1:-1] != 2).astype(np.uint8)
     lit = cv2.morphologyEx(lit, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    # the largest lit part
     count, labels, stats, _ = cv2.connectedComponentsWithStats(lit)
     if count < 2:
         return None

@@ -191,6 +191,7 @@ def _peak_deviation(
     known = np.array([p.noise if isinstance(p.noise, float) else _at_peak(p) for p in patches])
     smoothing = np.array([max(p.smoothing_px, LEAST_SMOOTHING_PX) for p in patches])
     height = np.array([p.peak_value for p in patches])
+    # shift of the peak: noise slope over the lobe's curvature
     level = -2 * np.log([isophote.isovalue for isophote in isophotes])
     ends = camera.project(np.stack([poses.axes + poses.narrow, poses.axes - poses.narrow]))
     radius = np.linalg.norm(ends[0] - ends[1], axis=1) / 2

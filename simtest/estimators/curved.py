@@ -121,6 +121,6 @@ def _without_noise(values: Array, covariance: Array | None) -> tuple[Array, bool
 def sign_hypotheses(stiffness: Array, lobe: float) -> Array:
     """List (1 + d k) along both directions for all signs, the least curved surface first, shape (4, 2)."""
     positive = gain_of_stiffness(stiffness, lobe)
-    pairs = [(m, -2 / lobe - m) for m in positive]
+    pairs = [(m, -2 / lobe - m) for m in positive]  # both roots of H = c m^2 + 2 m
     listed = np.array(list(itertools.product(*pairs)))
     return listed[np.argsort(np.sum((listed - 1) ** 2, axis=1), kind="stable")]

@@ -16,15 +16,7 @@ UNIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class FrameResults:
-    """The results of one estimator in a frame.
-
-    Parameters
-    ----------
-    of_patches : list
-        Estimate or Failure of each patch.
-    elsewhere : list of Estimate
-        Estimates that look where no patch is, or where another estimate is nearer to the patch's peak.
-    """
+    """The results of one estimator: of each patch, and estimates of a frame that no patch takes."""
 
     of_patches: list[Estimate | Failure]
     elsewhere: list[Estimate] = field(default_factory=list)
@@ -58,7 +50,7 @@ def run_each(
         results = _batch(estimator, sound, camera, priors)
     if results is None:
         results = [run(estimator, patch, camera, priors) for patch in sound]
-    following = iter(results)
+    following = iter(results)  # failures keep their positions among the patches
     return [patch if isinstance(patch, Failure) else next(following) for patch in patches]
 
 
@@ -156,6 +148,7 @@ def _checked(result: object, camera: Camera, peak_px: Array | None = None) -> Es
 
 def _malformed(estimate: Estimate) -> Failure | None:
     """Return what is wrong with the shape, type or value of an estimate's parts, or None."""
+    # shapes and finite values
     shapes = (
         ("normal", estimate.normal, (3,)),
         ("candidates", estimate.candidates, (max(len(estimate.candidates), 1), 3)),
@@ -174,6 +167,7 @@ def _malformed(estimate: Estimate) -> Failure | None:
             return Failure(Reason.NOT_FINITE, f"{name} is {number}")
     if estimate.region is not None and not np.isfinite(estimate.region.statistic(estimate.candidates)).all():
         return Failure(Reason.NOT_FINITE, "region: the statistic of a candidate is not finite")
+    # unit vectors, the proposed one first
     lengths = np.linalg.norm(np.concatenate([estimate.normal[None], estimate.candidates]), axis=1)
     if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
         return Failure(Reason.ESTIMATOR_ERROR, f"normal or candidate of length {lengths.max():g}: must be unit vectors")

@@ -170,6 +170,7 @@ class IsophoteFamily:
     @cached_property
     def _tangent_moments(self) -> Array:
         """E(t) of each isophote in the basis, squared tangents, shape (K, 2, 2)."""
+        # half-axes of each ellipse from its cone's eigenvalues
         cones = np.array([isophote.cone for isophote in self.isophotes])
         values, vectors = cone_axes(cones, np.array([isophote.sightline for isophote in self.isophotes]))
         across = self.basis @ vectors[:, :, :2]
@@ -304,7 +305,7 @@ class IsophoteFamily:
     def _moments_by_conic(self) -> Array:
         """Derivative of the moments by the conic of each isophote, shape (K, 3, 5)."""
         a, b, c = self._crossings.conics.T[:3]
-        made = np.zeros((len(self.isophotes), 3, 5))
+        made = np.zeros((len(self.isophotes), 3, 5))  # the moments do not depend on d and e
         # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
         p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)
         dE = -np.array([[p * p, p * q, q * q], [p * q, (p * r + q * q) / 2, q * r], [q * q, q * r, r * r]])
@@ -318,11 +319,8 @@ _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
     """Fit the isophotes of one highlight.
 
-    Returns
-    -------
-    IsophoteFamily or Failure
-        Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut
-        are fitted too; with fewer than 2 of either kind, the first one's Failure.
+    Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
+    fitted too; with fewer than 2 of either kind the result is the first one's Failure.
     """
     # whole isophotes
     fitted, failures = fit_isophotes(patch, camera, isovalues)

@@ -89,11 +89,8 @@ def fit_isophote_of_each(
 def fit_cut_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophote | Failure:
     """Fit the seen part of an isophote at t in (0, 1) that the border or the view cuts (see `geometry.fit_arc`).
 
-    Returns
-    -------
-    FittedIsophote or Failure
-        Also a Failure where the seen part is no arc of an ellipse around the peak: where the region of interest lies on
-        a slope, for example, or a wide isophote shows in one corner of the frame alone.
+    Also a Failure where the seen part is no arc of an ellipse around the peak: where the region of interest lies on a
+    slope, for example, or a wide isophote shows in one corner of the frame alone.
     """
     points = patch.arc(isovalue)
     if len(points) < MIN_POINTS:
@@ -125,6 +122,7 @@ def _fit(
     planes = fitting_planes(list(traced.values()), camera)
     conics = fit_ellipses(planes.points)
     cones = cone_of_conic(conics, planes.plane_from_camera)
+    # back into the order of the contours
     results: dict[int, FittedIsophote | Failure] = {i: c for i, c in enumerate(contours) if isinstance(c, Failure)}
     for row, (i, points) in enumerate(traced.items()):
         conic = planes.failures.get(row) or conics[row]

@@ -52,6 +52,7 @@ def _misfit(seen: Array, offsets: Array) -> float:
         if len(set(taken.tolist())) < len(taken):
             continue
         matched = offsets[taken]
+        # refine the factor with all pairs
         factor = max(float(np.sum(seen * matched) / np.sum(seen * seen)), 0.0)
         best = min(best, float(np.linalg.norm(factor * seen - matched) / np.linalg.norm(matched)))
     return best

@@ -56,21 +56,17 @@ def fit_lobe(
 ) -> LobeFit[Model] | None:
     """Fit a model by Levenberg and Marquardt's method: maximum likelihood under white noise.
 
+    The start must be near the minimum. None where the fit does not converge, or the pixels do not determine a
+    parameter.
+
     Parameters
     ----------
-    start : LobeModel
-        Near the minimum.
     observed : ndarray, shape (m,)
         Intensities of the model's pixels.
     clipped : ndarray of bool, shape (m,), optional
         Censored pixels: the intensity is at least what was observed, so a model above it leaves no residual.
     rounding : float
         Relative error of the sum of squares by the model's rounding: a change by no more than that ends the fit.
-
-    Returns
-    -------
-    LobeFit or None
-        None where it does not converge, or the pixels do not determine a parameter.
     """
     # A step too far overflows, and is then not taken.
     with np.errstate(all="ignore"):

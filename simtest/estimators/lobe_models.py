@@ -147,7 +147,7 @@ class PlaneFromAside:
         D = self.rays * reach[:, None] - F
         rho2 = np.sum(D * D, axis=1)
         cosine = np.maximum((1 - rho2) / (1 + rho2), _DARK)
-        exponent = np.exp(self.log_exponent)
+        exponent = np.exp(self.log_exponent)  # n
         intensity = np.exp(self.log_scale) * cosine**exponent
         by_rho2 = -2 * exponent * intensity / (cosine * (1 + rho2) ** 2)
         # derivatives through rho^2, then by log n and log c

@@ -176,12 +176,13 @@ def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> Highlig
     t = next(closed, CUT_REGION if cut else None)
     if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")
+    # candidates, evenly thinned where they are many
     rows, columns = np.nonzero(patch.inside(t, cut))
     step = -(-len(rows) // MAX_PIXELS)
     rows, columns = rows[::step], columns[::step]
     centres = np.stack([columns, rows], axis=1) + 0.5 + np.array(patch.origin_px)
     rays = camera.unproject(centres)
-    sound = np.isfinite(rays).all(axis=1)
+    sound = np.isfinite(rays).all(axis=1)  # the lens may see no direction there
     values = patch.values if patch.raw is None else patch.raw
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
     stated = patch.noise
@@ -199,7 +200,7 @@ def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     # On the plane across s at unit distance the cone is an ellipse: w^T Q w = 1.
     values, vectors = np.linalg.eigh(cone[:2, :2] / -cone[2, 2])
     exponent = -np.log(isophote.isovalue) * values[0] / 2
-    gain = np.sqrt(values[1] / values[0])
+    gain = np.sqrt(values[1] / values[0])  # 1 + d k across the longer axis
     K = (gain - 1) * np.outer(vectors[:, 1], vectors[:, 1])
     shape = np.array([K[0, 0], K[0, 1], K[1, 1]])
     return ColocatedQuadric(rays, basis, shape, float(np.log(family.patch.peak_value)), float(exponent))

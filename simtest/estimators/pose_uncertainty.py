@@ -31,7 +31,7 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
 
 
 def _region(family: IsophoteFamily) -> PoseRegion | None:
-    conic, noise = family.conic(0), family.conic_covariance(0)
+    conic, noise = family.conic(0), family.conic_covariance(0)  # as seen, after smoothing
     # the ellipse before smoothing: same centre, smaller moments
     shrink = np.append(np.zeros(2), -family.widening()[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)

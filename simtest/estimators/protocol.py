@@ -105,10 +105,6 @@ class Estimator(Protocol):
             Geometry of the camera.
         priors : Priors
             What is known of lights, distance and lobe.
-
-        Returns
-        -------
-        Estimate or Failure
         """
 
 

@@ -8,20 +8,14 @@ from simtest.calibration import Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.plugins import PluginGroup
+from simtest.runtime.entry_points import EntryPointGroup
 
-ESTIMATORS = PluginGroup("simtest.estimators", "estimator")
+ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
 
 @dataclass(frozen=True)
 class PlainCallable:
-    """A function of patch and camera, the old form of an estimator, which this release still accepts.
-
-    Parameters
-    ----------
-    function : callable
-        Takes a patch and a camera and returns an Estimate or a Failure; it is told no priors.
-    """
+    """A function of patch and camera, the old form of an estimator, which this release still accepts."""
 
     function: Callable[[Patch, Camera], Estimate | Failure]
 
@@ -52,17 +46,9 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
 
 
 def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:
-    """Load estimators.
+    """Load estimators by name, or take those of a mapping, in the given order.
 
-    Parameters
-    ----------
-    estimators : sequence of str, or mapping
-        Names as registered, "package:name" where two packages register one name; or the estimators themselves by name.
-
-    Returns
-    -------
-    dict
-        Estimator by name, in the given order.
+    A name is as registered, or "package:name" where two packages register it.
 
     Raises
     ------
@@ -73,7 +59,7 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
     for name in estimators:
-        given = ESTIMATORS.load(name)
+        given = ESTIMATORS.load(name)  # raises where the name is not clear
         if name in loaded:
             raise InputError(f"estimator {name!r}: given twice")
         loaded[name] = as_estimator(name, given)

@@ -76,14 +76,9 @@ def rank_by_motion(
     second_from_first : array_like, shape (4, 4)
         The camera's motion: from the first camera's frame to the second one's, mm.
     priors : Priors
-        For the distance in the first picture, which must be known.
+        For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
     gain_sd : float
         Relative standard deviation of the first picture's abs(1 + d k), > 0.
-
-    Returns
-    -------
-    RankedHypotheses or Failure
-        ``not_known`` without hypotheses or distance.
 
     Raises
     ------
@@ -155,7 +150,7 @@ def _predicted(first: Estimate, values: Array, position: Array) -> Array | None:
         except np.linalg.LinAlgError:
             return None
         x = x - step
-        if not np.isfinite(x).all() or np.abs(x).max() > 10:
+        if not np.isfinite(x).all() or np.abs(x).max() > 10:  # diverged, or far off the patch
             return None
         if np.abs(step).max() < 1e-12:
             normal = np.append(K * x, 1.0)

@@ -116,6 +116,7 @@ class Camera:
             circle = centre + radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
             tried = np.concatenate([tried[self.view_mask.contains(tried)], circle])
             tried = tried[(tried >= 0).all(axis=1) & (tried <= [self.width, self.height]).all(axis=1)]
+        # reject a camera with a folded point, and name the one nearest to the principal point
         folded = tried[np.isnan(self.unproject(tried)).any(axis=1)]
         if len(folded):
             gaps = np.hypot(*(folded - [self.cx, self.cy]).T)
@@ -129,19 +130,12 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, matrix: npt.ArrayLike, width: int, height: int) -> "Camera":
-        """Make a camera from its calibration matrix.
-
-        Parameters
-        ----------
-        matrix : array_like, shape (3, 3)
-            K, upper triangular with K[2, 2] = 1, px, pixel centres at integer + 0.5.
-        width, height : int
-            Image size, px.
+        """Make a camera from K, array_like, shape (3, 3), px, pixel centres at integer + 0.5, and the image's size.
 
         Raises
         ------
         InputError
-            If K has another shape, is not upper triangular or is singular.
+            If K has another shape, is not upper triangular with K[2, 2] = 1, or is singular.
         """
         try:
             K = np.asarray(matrix, dtype=float)
@@ -174,17 +168,9 @@ class Camera:
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
-        """Return the unit sightlines of pixels, inside the image and outside.
+        """Return the unit sightlines, shape (..., 3), of pixels, shape (..., 2), inside the image and outside.
 
-        Parameters
-        ----------
-        points_px : array_like, shape (..., 2)
-            Pixel positions (x, y).
-
-        Returns
-        -------
-        ndarray, shape (..., 3)
-            Unit vectors in the camera frame; NaN where the lens sees no direction.
+        They are in the camera frame; NaN where the lens sees no direction.
         """
         points = np.asarray(points_px, dtype=float)
         y = (points[..., 1] - self.cy) / self.fy
@@ -197,21 +183,11 @@ class Camera:
         return rays
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """Return the pixels at which the lens images points or directions.
+        """Return the pixels, shape (..., 2), at which the lens images points or directions, shape (..., 3).
 
-        Like `unproject` it describes the lens alone, also outside the image and the view mask; what is in view,
-        `contains` decides.
-
-        Parameters
-        ----------
-        points : array_like, shape (..., 3)
-            Points in the camera frame, any length unit.
-
-        Returns
-        -------
-        ndarray, shape (..., 2)
-            Pixel positions (x, y); NaN where the lens images nothing: z <= 0 (but for a fisheye, which sees sideways
-            and backwards), and where the lens folds over.
+        These are in the camera frame. Like `unproject` it describes the lens alone, also outside the image and the view
+        mask; what is in view, `contains` decides. NaN where the lens images nothing: z <= 0 (but for a fisheye, which
+        sees sideways and backwards), and where the lens folds over.
         """
         P = np.asarray(points, dtype=float)
         if self.distortion is not None:

@@ -62,9 +62,8 @@ class CirclePoses:
     def __getitem__(self, index: int) -> CirclePose | Failure:
         # A negative index must find its failure too.
         index = range(len(self))[operator.index(index)]
-        failure = self.failures.get(index)
         ratio = float(self.axis_ratios[index])
-        return failure or CirclePose(self.normals[index], self.axes[index], ratio, self.centres[index])
+        return self.failures.get(index) or CirclePose(self.normals[index], self.axes[index], ratio, self.centres[index])
 
 
 def cone_axes(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> tuple[Array, Array]:
@@ -108,22 +107,11 @@ def circle_pose(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None) -> 
 
 
 def circle_poses(cones: npt.ArrayLike, sightlines: npt.ArrayLike | None = None) -> CirclePoses:
-    """Compute the two poses of each circle seen as a conic [MB, section 2.3; F91].
+    """Compute the two poses of each circle seen as a conic [MB, section 2.3; F91], from C' = K^T C K, shape (N, 3, 3).
 
-    g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence
-    its distance, is not observable.
-
-    Parameters
-    ----------
-    cones : array_like, shape (N, 3, 3)
-        C' = K^T C K, any scale and sign.
-    sightlines : array_like, shape (N, 3) or (3,), optional
-        Any direction on the wanted side of each cone; default forward.
-
-    Returns
-    -------
-    CirclePoses
-        A Failure for each C' that is not finite or not the cone of an ellipse.
+    g = sqrt((l1 - l2)/(l1 - l3)), h = sqrt((l2 - l3)/(l1 - l3)), N+- = -(+-g e1 + h e3). The circle's radius, hence its
+    distance, is not observable. C' has any scale and sign; a sightline, shape (N, 3) or (3,), is any direction on the
+    wanted side of its cone, default forward. A Failure for each C' that is not finite or not the cone of an ellipse.
     """
     # candidates: finite cones of a size whose squares stay in range; a round cone stands in for the others
     C = np.asarray(cones, dtype=float)

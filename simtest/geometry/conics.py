@@ -13,17 +13,9 @@ from simtest.runtime.arrays import Array
 def cone_of_conic(conic: FittedConic | FittedConics, plane_from_camera: Array) -> Array:
     """Return the cone of directions through an ellipse, or through each: C' = A^T C A [MB, section 2.3, step 3].
 
-    Parameters
-    ----------
-    conic : FittedConic or FittedConics
-        In a plane's coordinates.
-    plane_from_camera : ndarray, shape (3, 3) or (N, 3, 3)
-        A, from the camera frame to the plane's homogeneous coordinates: K for pixels, a rotation for a gnomonic plane.
-
-    Returns
-    -------
-    ndarray, shape (3, 3) or (N, 3, 3)
-        Symmetric, camera frame, scaled to unit norm; w^T C' w = 0 for the directions w of the ellipse's points.
+    A, shape (3, 3) or (N, 3, 3), takes the camera frame to the plane's homogeneous coordinates: K for pixels, a
+    rotation for a gnomonic plane. C' is symmetric, scaled to unit norm; w^T C' w = 0 for the directions w of the
+    ellipse's points.
     """
     # The transforms are multiplied first, so that a small ellipse far from the origin keeps its digits.
     H = conic.normalised_from_image @ plane_from_camera

@@ -283,6 +283,7 @@ def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
             after = x - gap / slope
         after = np.where((after >= low) & (after <= high), after, (low + high) / 2)
+        # points leave the iteration as they converge
         done = (np.abs(after - x) <= CLOSE * x) | (np.abs(gap) <= CLOSE * target)
         found[open_[done]] = after[done]
         open_, target, low, high, x = (part[~done] for part in (open_, target, low, high, after))

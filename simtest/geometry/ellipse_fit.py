@@ -91,8 +91,7 @@ class FittedConics:
     def __getitem__(self, index: int) -> FittedConic | Failure:
         # A negative index must find its failure too.
         index = range(len(self))[operator.index(index)]
-        failure = self.failures.get(index)
-        return failure or FittedConic(self.normalised[index], self.normalised_from_image[index])
+        return self.failures.get(index) or FittedConic(self.normalised[index], self.normalised_from_image[index])
 
 
 class _Failures:
@@ -116,17 +115,10 @@ class _Failures:
 
 
 def fit_ellipse(points: npt.ArrayLike) -> FittedConic | Failure:
-    """Fit an ellipse to points: minimise the algebraic distance subject to 4 a c - b^2 = 1 [FF99, HF98].
+    """Fit an ellipse to points, array_like of shape (N, 2): minimise the algebraic distance with 4 a c - b^2 = 1.
 
-    Parameters
-    ----------
-    points : array_like, shape (N, 2)
-        Pixels.
-
-    Returns
-    -------
-    FittedConic or Failure
-        A Failure for fewer than 6 points, values that are not finite, points on a line, or no elliptic solution.
+    The direct fit [FF99, HF98]. A Failure for fewer than 6 points, values that are not finite, points on a line, or no
+    elliptic solution.
 
     Raises
     ------

@@ -8,21 +8,10 @@ from simtest.runtime.arrays import Image, Mask
 
 
 def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
-    """Smooth a frame with a Gaussian.
+    """Smooth a frame, shape (H, W) or (H, W, C), with a Gaussian of a standard deviation in px; 0 leaves it as it is.
 
-    Parameters
-    ----------
-    frame : array_like, shape (H, W) or (H, W, C)
-        Intensities.
-    sigma_px : float
-        Standard deviation, px; 0 leaves the frame as it is.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside a camera's view mask. Each smoothed value is then the weighted mean of those alone, so that
-        the dark outside does not lower the values at the mask's border; pixels outside become 0.
-
-    Returns
-    -------
-    ndarray of float32, same shape
+    With `seen`, shape (H, W), the pixels inside a camera's view mask, each smoothed value is the weighted mean of those
+    alone, so that the dark outside does not lower the values at the mask's border; pixels outside become 0.
     """
     image = np.ascontiguousarray(frame, dtype=np.float32)
     if seen is None:

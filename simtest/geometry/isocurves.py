@@ -16,21 +16,8 @@ def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.A
     """Evaluate Q(p) = ((R-P).(V-P))^2 - tau^2 abs(R-P)^2 abs(V-P)^2 [MB, section 2.1, Proposition 1].
 
     Its zeros are a quartic with two branches: cos(beta) = tau, which is the isophote, and cos(beta) = -tau, which is
-    none (see `on_isophote_branch`).
-
-    Parameters
-    ----------
-    points : array_like, shape (..., 2)
-        p on the plane z = 0.
-    light, camera : array_like, shape (3,) or (..., 3)
-        L and V.
-    tau : array_like
-        (t / c)^(1/n) on the isophote at t of a lobe c cos(beta)^n.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Fourth power of the length unit.
+    none (see `on_isophote_branch`). Points p, shape (..., 2), lie on the plane z = 0; L and V have shape (3,) or (...,
+    3); tau is (t / c)^(1/n) on the isophote at t of a lobe c cos(beta)^n. The unit is the fourth power of the length's.
     """
     to_mirrored, to_camera = _directions(points, light, camera)
     product = np.sum(to_mirrored * to_camera, axis=-1)

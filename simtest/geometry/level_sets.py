@@ -181,23 +181,10 @@ def _crossed_lines(sets: Sequence[LevelSet]) -> tuple[tuple[int, int], Mask]:
 def level_set_around(
     values: Image | Array, pixel: tuple[int, int], level: float, seen: Mask | None = None
 ) -> LevelSet | None:
-    """Find the region above a level that holds a pixel.
+    """Find the region above a level that holds a pixel (column, row) whose value lies above it.
 
-    Parameters
-    ----------
-    values : ndarray, shape (H, W)
-        Finite intensities.
-    pixel : tuple of int
-        Column and row; its value lies above the level.
-    level : float
-        The level.
-    seen : ndarray of bool, shape (H, W), optional
-        Where the values are known; default everywhere.
-
-    Returns
-    -------
-    LevelSet or None
-        None where the region touches the array's border or, across a corner too, an unseen pixel: its border is open.
+    The values, shape (H, W), are finite; `seen` tells where they are known, default everywhere. None where the region
+    touches the array's border or, across a corner too, an unseen pixel: its border is open.
     """
     marks = (values > level if seen is None else (values > level) & seen).view(np.uint8)
     # High values are 4-connected, low ones 8-connected: marching squares' choice for an ambiguous cell.

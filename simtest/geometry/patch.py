@@ -138,20 +138,11 @@ class Patch:
         )  # fmt: skip
 
     def crossings(self, isovalue: float) -> Array | Failure:
-        """Return the isophote's points by marching squares, in no order [MB, section 2.3, step 1].
+        """Return the isophote's points by marching squares [MB, section 2.3, step 1], shape (N, 2), px, in no order.
 
-        The isophote is the outer border of the region above t times the peak that holds the peak. Its points lie where
-        it crosses the lines between the centres of neighbouring pixels.
-
-        Parameters
-        ----------
-        isovalue : float
-            t in (0, 1), relative to the smoothed peak.
-
-        Returns
-        -------
-        ndarray, shape (N, 2), or Failure
-            In the frame, px. A pixel whose value is the level, where several lines cross, counts once.
+        The isophote at t in (0, 1) of the smoothed peak is the outer border of the region above that level that holds
+        the peak. Its points lie where it crosses the lines between the centres of neighbouring pixels. A pixel whose
+        value is the level, where several lines cross, counts once. A Failure where it does not close.
 
         Raises
         ------

@@ -9,11 +9,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS
 from simtest.conventions import CIRCLE_POSE_ISOVALUE, CONE_AXIS_ISOVALUES, DEFAULT_SMOOTHING_PX, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.dispatch import run
 from simtest.estimators.protocol import Estimate, Estimator
 from simtest.geometry import Camera, CirclePose, Patch
 from simtest.geometry.circle_from_cone import circle_pose as pose_of_cone
@@ -229,7 +229,7 @@ def _of_scene(scene: ClosedScene, realisations: int, seed: int) -> Iterator[Rung
     for name, estimator in ESTIMATORS.items():
         steps: tuple[list[Array | None], ...] = (
             [found[name] for found in noisy], [smoothed[name]], [sharp[name]],
-            [None if exact is None else _candidates(estimator.whole.estimate(exact, CAMERA, NO_PRIORS))],
+            [None if exact is None else _candidates(run(estimator.whole, exact, CAMERA))],
             [_of_cones(estimator, scene)], [scene.normal()[None]],
         )  # fmt: skip
         for rung, candidates in zip(RUNGS, steps, strict=True):

@@ -80,7 +80,7 @@ def test_colour_is_that_of_the_pipeline(name, isolated):
 
 
 def test_the_same_box_gives_the_same_patch_again():
-    frame = Frame(lobes(), Calibration(CAMERA))
+    frame = Frame(lobes(), Calibration(CAMERA), 2.0)
     (first, *_) = peaks.detect(frame, CAMERA, NO_PRIORS).regions
     patch = frame.patch(first.box, first.peak)
     assert isinstance(patch, Patch)
@@ -99,7 +99,7 @@ def test_detectors_are_found_by_name_or_given():
 
 
 def test_a_region_that_was_given_has_no_contrast_and_still_a_shape():
-    frame = Frame(lobes(), Calibration(CAMERA))
+    frame = Frame(lobes(), Calibration(CAMERA), 2.0)
     detected = peaks.detect(frame, CAMERA).regions[0]
     given = Region(detected.box, detected.peak, None)
     patch = frame.patch(given.box, given.peak)

@@ -117,7 +117,7 @@ for name in ("nobody", "other_constant"):
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     load_estimators(["other_plain"])
-seen = Frame(frame, Calibration(camera))
+seen = Frame(frame, Calibration(camera), 2.0)
 print(json.dumps({
     "available": ESTIMATORS.names(), "detectors": DETECTORS.names(), "said": said, "refused": refused,
     "distributions": ESTIMATORS.distributions(["other_axis", "Other-Core:cone_axis", "nobody"]),

@@ -10,7 +10,7 @@ from simtest.errors import InputError
 
 
 @dataclass(frozen=True)
-class PluginGroup:
+class EntryPointGroup:
     """One entry-point group.
 
     A name that two packages register is refused, unless the package is named too: "package:name", which is accepted for
