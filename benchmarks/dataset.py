@@ -26,7 +26,7 @@ ROUNDS = 5
 
 
 def figures() -> list[Figure]:
-    """Measure."""
+    """Measure encoding, overlap and reading."""
     maker = Maker(Plan(load_dataset("endoscopy", {"samples": 10 * COUNT, "samples_per_anatomy": 2 * COUNT})))
     maker.make(0)
     samples = [maker.make(index) for index in range(COUNT)]

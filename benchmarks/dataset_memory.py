@@ -31,7 +31,7 @@ for index in range(samples):
 
 
 def figures() -> list[Figure]:
-    """Measure."""
+    """Measure how the memory grows over all samples."""
     command = [sys.executable, "-c", _PROGRAM, str(SAMPLES), str(EVERY)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     memory = np.array([float(line) for line in done.stdout.split()])

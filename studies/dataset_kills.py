@@ -25,7 +25,7 @@ _COMMAND = [
 
 
 def figures() -> list[Figure]:
-    """Kill, and compare with an undisturbed run."""
+    """Kill runs, and compare the result with that of an undisturbed run."""
     rng, killed = random.Random(1), {"writer": 0, "worker": 0}
     with tempfile.TemporaryDirectory() as scratch:
         whole, cut = Path(scratch) / "whole", Path(scratch) / "cut"
@@ -41,7 +41,7 @@ def figures() -> list[Figure]:
 
 
 def _disturb(command: list[str], killed: dict[str, int], rng: random.Random) -> None:
-    """Start a run again and again, and kill, until it finishes or there were enough kills."""
+    """Start and kill a run repeatedly, until it finishes or there were enough kills."""
     while sum(killed.values()) < KILLS:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while process.poll() is None and sum(killed.values()) < KILLS:

@@ -42,7 +42,7 @@ SHADINGS = ("flat", "estimated", "exact")
 
 
 def graph(height: Callable, slope: Callable) -> Patches:
-    """Give a patch z = height(x, y), -grad z = slope(x, y), over its tangent plane."""
+    """Return a patch z = height(x, y), -grad z = slope(x, y), over its tangent plane."""
 
     def at(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y = xy.T
@@ -53,7 +53,7 @@ def graph(height: Callable, slope: Callable) -> Patches:
 
 
 def round_patch(radius: float, bent: tuple[float, float]) -> Patches:
-    """Give a sphere's, bent (1, 1), or a cylinder's, bent (1, 0), side towards the camera."""
+    """Return the near side of a sphere, bent (1, 1), or of a cylinder, bent (1, 0)."""
     a, b = bent
 
     def root(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -63,12 +63,12 @@ def round_patch(radius: float, bent: tuple[float, float]) -> Patches:
 
 
 def saddle(k1: float, k2: float) -> Patches:
-    """Give the graph z = -(k1 x^2 + k2 y^2)/2."""
+    """Return the graph z = -(k1 x^2 + k2 y^2)/2."""
     return graph(lambda x, y: -(k1 * x**2 + k2 * y**2) / 2, lambda x, y: (k1 * x, k2 * y))
 
 
 def colon_patch(u: float, v: float) -> tuple[Patches, np.ndarray]:
-    """Give the generated colon around (u, v) in its tangent frame, and its curvatures there."""
+    """Return the generated colon around (u, v) in its tangent frame, and its curvatures there."""
     tube = build(ColonRecipe()).tube
     point, along, around = (part[0] for part in tube.tangents(np.array([u]), np.array([v])))
     normal, operator = (part[0] for part in tube.normal_and_shape_operator(np.array([u]), np.array([v])))
@@ -86,7 +86,7 @@ def colon_patch(u: float, v: float) -> tuple[Patches, np.ndarray]:
 
 
 def lattice(edge: float, reach: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Give an equilateral lattice of the plane, turned and shifted at random, and its triangles, counter-clockwise."""
+    """Return an equilateral lattice of the plane, randomly turned and shifted, and its counter-clockwise triangles."""
     count = int(reach / edge * 1.3) + 3
     i, j = (g.ravel() for g in np.meshgrid(*[np.arange(-count, count + 1)] * 2, indexing="ij"))
     shift, turn = rng.random(2), rng.uniform(0, 2 * np.pi)
@@ -106,7 +106,7 @@ def lattice(edge: float, reach: float, rng: np.random.Generator) -> tuple[np.nda
 
 
 def look(patch: Patches, edge: float, width: float, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
-    """Give the error of the normal, deg, and the axis ratio for each shading; NaN where there is no answer."""
+    """Return the error of the normal, deg, and the axis ratio for each shading; NaN without an estimate."""
     focal = HALF_WIDTH_PX * DISTANCE_MM / width
     reach = 1.1 * PIXELS / 2 / focal * DISTANCE_MM
     plane, faces = lattice(edge, reach, rng)
@@ -142,7 +142,7 @@ def look(patch: Patches, edge: float, width: float, rng: np.random.Generator) ->
 
 
 def surfaces() -> dict[str, list[tuple[Patches, float]]]:
-    """Give for each kind of surface its patches, each with the half-width of the highlight on it, mm."""
+    """Return the patches of each kind of surface, each with the half-width of the highlight on it, mm."""
     c = phong_concentration(EXPONENT)
 
     def narrow(*curvatures: float) -> float:

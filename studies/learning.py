@@ -6,7 +6,6 @@ python -m studies.learning data/learning docs/images/learning.png
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,13 +15,13 @@ from simtest.dataset.learn.crops import Crops, read_crops
 from simtest.dataset.learn.network import propose, train
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.style import colours
+from simtest.runtime.arrays import Array
 
-Array = np.ndarray[Any, Any]
 NETWORK = "network"
 
 
 def main() -> None:
-    """Train, and compare on the test split's anatomies."""
+    """Train, and compare on the anatomies of the test split."""
     folder, picture = Path(sys.argv[1]), Path(sys.argv[2])
     taught, tested = read_crops(folder, "train"), read_crops(folder, "test")
     print(f"{len(taught)} crops to learn from, {len(tested)} of other anatomies to test on\n")
@@ -35,7 +34,7 @@ def main() -> None:
 
 
 def table(tested: Crops, errors: dict[str, tuple[Array, Array]]) -> str:
-    """Give the table: all on the crops where all answered."""
+    """Return the table, of the crops on which every estimator answered."""
     everywhere = np.all([np.isfinite(error) for error, _ in errors.values()], axis=0)
     lines = ["| estimator | n | normal: median, deg | mean, deg | 95 % below, deg | axis ratio: median error |",
              "|---|---|---|---|---|---|"]  # fmt: skip
