@@ -55,7 +55,7 @@ class _Check:
     claim: str
     rule: str
     test: Callable[[Sweep], tuple[str, bool]]
-    because: Callable[[Sweep], str]
+    because: str | Callable[[Sweep], str]
     source: str = ARTICLE
     where: str = ""
     range: tuple[float, float] | None = None
@@ -89,7 +89,8 @@ def statements(figures: Sequence[SweepFigure]) -> list[Statement]:
             continue
         measured, met = check.test(sweep)
         verdict = check.verdict(sweep, met)
-        because = check.because(sweep) if verdict == DIFFERS else ""
+        told = check.because if isinstance(check.because, str) else check.because(sweep)
+        because = told if verdict == DIFFERS else ""
         rows.append(Statement(name, check.claim, check.source, check.rule, measured, verdict, because))
     return rows
 
@@ -220,28 +221,24 @@ SIGMA, SLANT, EXPONENT, ISOVALUE = (0.0, 0.1), (10.0, 75.0), (30.0, 120.0), (0.0
 """Ranges of the article's claims; towards slant 90 and t = 0.02 the window leaves no closed isophote."""
 
 
-def _says(text: str) -> Callable[[Sweep], str]:
-    return lambda _sweep: text
-
-
 _CHECKS = (
     _Check(
         "sigma", {}, "the mean error grows with the noise",
         "no mean falls below the one before by more than 2 standard errors, and the last is above the first",
-        _grows, _says(explanations.NOISE), range=SIGMA,
+        _grows, explanations.NOISE, range=SIGMA,
     ),
     _Check(
         "sigma", {}, f"the mean stays below {MEAN_BELOW_DEG}° throughout to 10\u00a0%", "largest mean",
-        _mean_below, _says(explanations.NOISE_LEVEL), range=SIGMA,
+        _mean_below, explanations.NOISE_LEVEL, range=SIGMA,
     ),
     _Check(
         "theta_deg", {}, "strong growth of the error with the slant",
         "no mean falls below the one before by more than 2 standard errors, and the last is above the first",
-        _grows, _says(explanations.NEAR_ZERO_SLANT), range=SLANT,
+        _grows, explanations.NEAR_ZERO_SLANT, range=SLANT,
     ),
     _Check(
         "theta_deg", {}, f"the maximum stays below {SLANT_BELOW_DEG:g}°", "largest single error",
-        _single_below(SLANT_BELOW_DEG), _says(explanations.NEAR_ZERO_SLANT), range=SLANT,
+        _single_below(SLANT_BELOW_DEG), explanations.NEAR_ZERO_SLANT, range=SLANT,
     ),
     _Check(
         "exponent", {}, "about linear, slope about 10⁻² degrees per unit",
@@ -250,32 +247,32 @@ _CHECKS = (
     ),
     _Check(
         "exponent", {}, f"never above {EXPONENT_BELOW_DEG}°", "largest single error",
-        _single_below(EXPONENT_BELOW_DEG), _says(explanations.NOISE_LEVEL), range=EXPONENT,
+        _single_below(EXPONENT_BELOW_DEG), explanations.NOISE_LEVEL, range=EXPONENT,
     ),
     _Check(
         "isovalue", {}, f"U-shaped, minimum at {LEAST_AT[0]:g} to {LEAST_AT[1]:g}",
         "of the settings where at least half answered, both ends above the least mean and a mean in that range "
         "equal to it, by 2 standard errors",
-        _u_shape, _says(explanations.ISOVALUE_MINIMUM), range=ISOVALUE,
+        _u_shape, explanations.ISOVALUE_MINIMUM, range=ISOVALUE,
     ),
     _Check(
         "eps", {"exponent": 100.0}, f"stable up to ε = {STABLE_TO:g}",
-        f"ratio 1 within {STABLE_TOLERANCE:g}, give or take 2 standard errors", _stable, _says(explanations.OFFSET),
+        f"ratio 1 within {STABLE_TOLERANCE:g}, give or take 2 standard errors", _stable, explanations.OFFSET,
     ),
     _Check(
         "sigma", {"theta_deg": 0.0}, "at slant 0 the error grows with the root of the noise: log-log slope 1/2",
-        f"within {SLOPE_TOLERANCE:g}, give or take 2 standard errors", _half, _says(explanations.BRANCH_POINT),
+        f"within {SLOPE_TOLERANCE:g}, give or take 2 standard errors", _half, explanations.BRANCH_POINT,
         EXPECTED, "slant 0",
     ),
     _Check(
         "eps", {"exponent": 100.0, "recentre": False},
         "with the window at the foot, failures begin where the window cuts the isophote, and not before",
-        "no failure before, some beyond", _truncation, _says(explanations.TRUNCATION), EXPECTED, "window at the foot",
+        "no failure before, some beyond", _truncation, explanations.TRUNCATION, EXPECTED, "window at the foot",
     ),
     *(
         _Check(
             "smoothing_px", {"sigma": 0.0, "isovalue": t}, "without noise the error is the smoothing's predicted bias",
-            f"within {LAW_TOLERANCE:.0%} from s = {LAW_FROM_PX:g} px on", _bias, _says(explanations.SMOOTHING),
+            f"within {LAW_TOLERANCE:.0%} from s = {LAW_FROM_PX:g} px on", _bias, explanations.SMOOTHING,
             EXPECTED, f"no noise, t = {t:g}",
         )
         for t in (0.1, 0.5)
