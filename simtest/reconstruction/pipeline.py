@@ -165,7 +165,7 @@ def detect_in_picture(
     # Detection by colour uses no angle, so any field of view serves.
     camera = Camera.from_fov(60.0, picture.shape[1], picture.shape[0])
     calibration = Calibration(camera, response=response or Response("srgb"), saturation_level=level)
-    frame = Frame(picture, calibration, seen=seen)
+    frame = Frame(picture, calibration, SMOOTHING_BY_COLOUR_PX, seen=seen)
     view = find_view(picture) if seen is None else View(seen)
     return PictureDetection(view, detect_colour(frame.channels, frame.clipped, view.seen))
 
