@@ -1,23 +1,12 @@
 """`simtest doctor`."""
 
 import json
-from typing import Annotated
 
-from cyclopts import Parameter
-
-from simtest.cli.options import Variant
+from simtest.cli.options import AsJson, Variant
 
 
-def doctor(*, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False, variant: Variant = None) -> int:
-    """Check the rendering backend in a child process and say how to mend it; exit 1 if it cannot render.
-
-    Parameters
-    ----------
-    as_json : bool
-        Print JSON.
-    variant : str, optional
-        Mitsuba variant to check.
-    """
+def doctor(*, as_json: AsJson = False, variant: Variant = None) -> int:
+    """Check the rendering backend in a child process and say how to mend it; exit 1 if it cannot render."""
     from simtest.rendering.backend_check import examine
 
     report = examine(variant)

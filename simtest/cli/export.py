@@ -1,16 +1,10 @@
 """`simtest export`."""
 
-from simtest.cli.options import Out, Settings, Variant
+from simtest.cli.options import Out, SceneName, Settings, Variant
 
 
-def export(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
-    """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh.
-
-    Parameters
-    ----------
-    scene : str
-        A scene file, or the name of a shipped scene.
-    """
+def export(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
+    """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh."""
     from simtest import api
     from simtest.runtime.files import refuse_file
     from simtest.spec import parse_settings

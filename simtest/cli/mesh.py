@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import replacing, whole_number
+from simtest.cli.options import AsJson, replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
@@ -23,7 +23,7 @@ def check(
     exponent: float | None = None,
     roughness: float | None = None,
     kind: Literal["auto", "lumen", "organ"] = "auto",
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Check what is wrong with a mesh, what is mended when it is used, and whether it is fine enough for highlights.
 
@@ -41,8 +41,6 @@ def check(
         GGX roughness alpha instead of an exponent.
     kind : str
         Which side the camera is on; auto goes by the shape.
-    as_json : bool
-        Print JSON.
     """
     from simtest.errors import InputError
     from simtest.surfaces.fineness import concentration

@@ -21,6 +21,8 @@ def replacing(example: str) -> Parameter:
     return Parameter(name="--set", negative="", help=text)
 
 
+SceneName = Annotated[str, Parameter(help="A scene file, or the name of a shipped scene.")]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
     str | None, Parameter(help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono.")

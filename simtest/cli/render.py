@@ -1,18 +1,13 @@
 """`simtest render`."""
 
-from simtest.cli.options import Out, Settings, Variant
+from simtest.cli.options import Out, SceneName, Settings, Variant
 
 
-def render(scene: str, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
+def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
     A sensor with a response, bits, saturation, vignetting or a full well also gets calibration.toml, and so does a
     light at the camera whose emission is known (rig.emission_known).
-
-    Parameters
-    ----------
-    scene : str
-        A scene file, or the name of a shipped scene.
     """
     from simtest import api
     from simtest.cli.progress import progress_bar

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Settings, Variant
+from simtest.cli.options import SceneName, Settings, Variant
 
 
 def view(
-    scene: str,
+    scene: SceneName,
     /,
     *,
     screenshot: Annotated[
@@ -18,13 +18,7 @@ def view(
     settings: Settings = None,
     variant: Variant = None,
 ) -> None:
-    """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals.
-
-    Parameters
-    ----------
-    scene : str
-        A scene file, or the name of a shipped scene.
-    """
+    """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals."""
     from simtest.report.viewer import check_target, make_content, save_screenshot, show
     from simtest.spec import load_scene, parse_settings
 

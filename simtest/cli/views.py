@@ -4,13 +4,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Out, Settings, Variant, whole_number
+from simtest.cli.options import Out, SceneName, Settings, Variant, whole_number
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
 
 
 def views(
-    scene: str,
+    scene: SceneName,
     /,
     *,
     out: Out,
@@ -24,11 +24,6 @@ def views(
     """Pick viewpoints of an anatomy that show isolated highlights: views.json, a picture of each, a sheet of all.
 
     With --along, a film along the camera path instead.
-
-    Parameters
-    ----------
-    scene : str
-        A scene file, or the name of a shipped scene.
     """
     from simtest import api
     from simtest.cli.progress import progress_bar
