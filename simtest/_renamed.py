@@ -21,7 +21,10 @@ MODULES = {
 }
 """Old and new name of a module; its submodules follow it. The first that fits counts."""
 
-NAMES = {"simtest.gate.records.Night": "simtest.nightly.records.NightlyRun"}
+NAMES = {
+    "simtest.estimators.base.fit_isophotes": "simtest.estimators.isophote_fit.fit_isophotes",
+    "simtest.gate.records.Night": "simtest.nightly.records.NightlyRun",
+}
 """Old and new full name of what changed its own name."""
 
 
@@ -53,6 +56,9 @@ class RenamedModules:
 
 def lookup(module: str, name: str, home: str | None = None) -> Any:
     """Return what a module calls by an old name, or else the attribute of that name in the module's new home."""
+    if name.startswith("__"):
+        # Python and its tools ask every module for such names; none of them was ever documented.
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
     if (new := NAMES.get(f"{module}.{name}")) is not None:
         _warn(f"{module}.{name}", new)
         home, _, name = new.rpartition(".")

@@ -102,7 +102,7 @@ class Way:
         if isinstance(value, dict):
             return any(self._holds(item, depth - 1) for item in value.values())
         fields = getattr(value, "__dataclass_fields__", ())
-        return any(self._holds(value.__dict__.get(name), depth - 1) for name in fields)
+        return any(self._holds(getattr(value, name, None), depth - 1) for name in fields)
 
     @property
     def passed(self) -> list[str]:

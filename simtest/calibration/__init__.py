@@ -38,6 +38,8 @@ def __getattr__(name: str) -> Any:
     import warnings
 
     warnings.warn(
-        "simtest.calibration.Known is now Priors; the old name goes with the next release", DeprecationWarning, 2
+        "simtest.calibration.Known is now simtest.calibration.Priors; the old name goes with the next release",
+        DeprecationWarning,
+        2,
     )
     return Priors

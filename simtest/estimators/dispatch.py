@@ -80,7 +80,7 @@ def run_in_frame(
     peak first, one a patch. A patch without any gets a Failure ``no_estimate``. Where `estimate_frame` raises, or one
     of its estimates is malformed, its results are refused as a whole: every patch gets that Failure.
     """
-    camera = frame.camera
+    camera = frame.calibration.camera
     if not isinstance(estimator, FrameEstimator):
         return FrameResults(run_each(estimator, patches, camera, priors))
     try:

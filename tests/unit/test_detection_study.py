@@ -57,7 +57,7 @@ def test_normals_through_a_clipped_8_bit_picture_of_a_tilted_sphere(radius):
     picture = (np.rint(255 * srgb_encode(np.clip(linear, 0, 1))) / 255).astype(np.float32)
     made = reconstruct_colour(picture, Calibration(session.camera))
     (spot,) = made.specularities
-    assert made.found.highlights[0].kind is Kind.ISOLATED
+    assert made.detection.highlights[0].kind is Kind.ISOLATED
     for name, most in (("cone_axis", 0.1), ("brightest_point", 0.5)):
         estimate = spot.estimates[name]
         assert np.degrees(np.arccos(min(1.0, estimate.normal @ truth.normal))) < most

@@ -12,12 +12,12 @@ from simtest._renamed import MODULES, NAMES
 DOCUMENTED = {
     "simtest.colour": ("detect_in_picture", "reconstruct_colour"),
     "simtest.engines": ("make_engine",),
-    "simtest.estimators.base": ("fit_isophotes",),
+    "simtest.estimators.base": ("Estimate", "FittedIsophote"),
     "simtest.gate.limits": ("Limits",),
     "simtest.gate.records": ("COMPARISONS", "FIGURES", "Verdict"),
     "simtest.imaging.depth": ("depth_points", "read_depth"),
     "simtest.learn": ("Crops", "read_crops"),
-    "simtest.report.nightly": ("Extras", "write_nightly_page"),
+    "simtest.report.nightly": ("write_nightly_page",),
 }
 
 
@@ -37,6 +37,15 @@ def test_every_new_name_exists():
     for name in NAMES.values():
         module, _, attribute = name.rpartition(".")
         assert hasattr(importlib.import_module(module), attribute)
+
+
+def test_old_names_that_went_elsewhere():
+    with pytest.warns(DeprecationWarning, match="isophote_fit"):
+        from simtest.estimators.base import fit_isophotes
+    assert fit_isophotes is importlib.import_module("simtest.estimators.isophote_fit").fit_isophotes
+    with pytest.warns(DeprecationWarning, match="NightlyRun"):
+        from simtest.gate.records import Night
+    assert Night is importlib.import_module("simtest.nightly.records").NightlyRun
 
 
 def test_old_names_in_modules_that_stayed():
