@@ -6,6 +6,7 @@ A viewpoint is a number, where ``surface.view`` is auto, or else a share of the 
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from simtest.errors import InputError
 from simtest.rendering import Session
@@ -23,17 +24,8 @@ Progress = Callable[[int, int, str], None]
 """Called with views found, views wanted, and what was tried last."""
 
 
-@dataclass(frozen=True)
-class WrittenView:
-    """The picture of a view.
-
-    Parameters
-    ----------
-    picture : str
-        Name of the file.
-    seed : int
-        Of its noise.
-    """
+class WrittenView(NamedTuple):
+    """The picture of a view: the file's name, and the seed of its noise."""
 
     picture: str
     seed: int
@@ -62,8 +54,11 @@ class SampledView:
 
     def to_json(self, key: str) -> dict[str, Json]:
         """Return the entry of views.json; `key` is the viewpoint's key path."""
-        entry: dict[str, Json] = {key: self.viewpoint, "isolated_highlights": self.isolated_highlights}
-        entry["model_from_camera"] = self.model_from_camera.tolist()
+        entry: dict[str, Json] = {
+            key: self.viewpoint,
+            "isolated_highlights": self.isolated_highlights,
+            "model_from_camera": self.model_from_camera.tolist(),
+        }
         if self.written is not None:
             entry |= {"picture": self.written.picture, "sensor.seed": self.written.seed}
         return entry
@@ -92,8 +87,7 @@ class SampledViews:
 
     def to_json(self, key: str) -> dict[str, Json]:
         """Return the content of views.json; `key` is the viewpoints' key path."""
-        accepted: list[Json] = [view.to_json(key) for view in self.views]
-        return {"tried": self.tried, "accepted": accepted, "rejected": dict(self.rejected)}
+        return {"tried": self.tried, "accepted": [view.to_json(key) for view in self.views], "rejected": self.rejected}
 
 
 def sample_views(
