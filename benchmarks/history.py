@@ -15,12 +15,12 @@ import polars as pl
 from benchmarks.measuring import Figure
 from simtest.nightly.baseline import accept
 from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
-from simtest.nightly.judge import verdict_on
 from simtest.nightly.layout import Reports
 from simtest.nightly.measure import RunOptions
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import COMPARISONS, JudgedRun, NightlyRun, Verdict
 from simtest.nightly.run import run_nightly
+from simtest.nightly.verdict import verdict_on
 from simtest.spec import Profile, load_profile
 
 NIGHTS = 1000

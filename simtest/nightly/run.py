@@ -7,11 +7,11 @@ from pathlib import Path
 from simtest.nightly.baseline import load_baseline
 from simtest.nightly.draw import draw
 from simtest.nightly.history import append, history_rows
-from simtest.nightly.judge import judge
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.measure import DEFAULTS, RunOptions, measure_run
 from simtest.nightly.records import JudgedRun
 from simtest.nightly.storage import disk_errors_in_one_line
+from simtest.nightly.verdict import judge
 from simtest.spec import Profile
 
 

@@ -16,9 +16,9 @@ import pytest
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
 from simtest.nightly import draw as draw_module
-from simtest.nightly import judge as judge_module
 from simtest.nightly import measure
 from simtest.nightly import run as run_module
+from simtest.nightly import verdict as verdict_module
 from simtest.nightly.baseline import accept, load_baseline
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
@@ -225,7 +225,7 @@ def test_a_night_is_measured_kept_and_published(small, reports):
 
 def test_a_regression_exits_1(measured, reports, monkeypatch):
     accept_first(reports)
-    monkeypatch.setattr(judge_module, "compare", lambda tonight, baseline: regression(tonight))
+    monkeypatch.setattr(verdict_module, "compare", lambda tonight, baseline: regression(tonight))
     outcome = run_nightly(quick(), reports)
     assert outcome.judged.verdict.exit_code == 1
     assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
@@ -497,7 +497,7 @@ def test_the_command_prints_a_table_and_the_page(measured, here, tmp_path):
 def test_the_command_prints_what_is_worse(measured, here, monkeypatch):
     assert here()[0] == 0
     assert here("accept", "--reason", "first")[0] == 0
-    monkeypatch.setattr(judge_module, "compare", lambda tonight, baseline: regression(tonight))
+    monkeypatch.setattr(verdict_module, "compare", lambda tonight, baseline: regression(tonight))
     code, output, _ = here()
     assert code == 1
     assert "worse: first, plane, tilt_deg=0, cone_axis, mean_deg: 1.1 deg, baseline 1 deg" in output.splitlines()

@@ -1,4 +1,4 @@
-"""Judges a run: compares it with the baseline, and puts it into its history."""
+"""The verdict on a run: compares it with the baseline, and puts it into its history."""
 
 import dataclasses
 
