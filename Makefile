@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
-	@echo "make test      fast tests (under 5 minutes on 2 cores)"
+	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make bench     speeds, as ratios within one run"
 	@echo "make lint      ruff, mypy, import-linter"
