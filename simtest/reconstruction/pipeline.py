@@ -200,6 +200,7 @@ def run_pipeline(
 def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
     """Take a user's region of interest for the one specularity; raise `InputError` where it leaves the frame."""
     patch = frame.patch(box)
+    # A user's region may overlap detected peaks, so it gets no contrast and no list of neighbours.
     x, y = box[:2] if isinstance(patch, Failure) else (int(v) for v in patch.peak_px)
     return Detection((Region(box, (x, y), None),), frame)
 

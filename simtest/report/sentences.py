@@ -18,8 +18,9 @@ def headline(run: Run, figures: list[LineFigure]) -> list[str]:
         misses = law_misses(figure).values()
         met, total = sum(miss.met for miss in misses), sum(miss.total for miss in misses)
         if total and figure.key in ("error_vs_curvature", "axis_ratio", "error_vs_offset"):
-            met_text = f"is met within {figure.rule} at {met} of {total} points"
-            sentences.append(f"{figure.title}: the law, without noise, {met_text} of the sweeps where it is not 0.")
+            # Points where the law is 0 measure the noise alone; they are not counted.
+            predicted = f"predicts {met} of {total} measured points to within {figure.rule}"
+            sentences.append(f"{figure.title}: the closed-form law, which knows no noise, {predicted}.")
     return [s for s in sentences if s]
 
 
@@ -80,13 +81,13 @@ def measured(figure: LineFigure) -> list[str]:
         text = f"{name}: means from {number(min(means))}{unit} to {number(max(means))}{unit}"
         if name in misses:
             miss = misses[name]
-            text += f"; law met within {figure.rule} at {miss.met} of {miss.total} points, "
+            text += f"; the law predicts {miss.met} of {miss.total} points to within {figure.rule}, "
             text += f"largest departure {number(miss.worst)}{unit} ({miss.where})"
         lines.append(text + ".")
     if figure.empty:
-        count = "one place" if len(figure.empty) == 1 else f"{len(figure.empty)} places"
+        count = "one setting" if len(figure.empty) == 1 else f"{len(figure.empty)} settings"
         shown = "; ".join(figure.empty[:6]) + ("; …" if len(figure.empty) > 6 else ".")
-        lines.append(f"No value, so no point, at {count}: {shown}")
+        lines.append(f"No value, and so no point, at {count}: {shown}")
     return lines
 
 
