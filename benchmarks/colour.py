@@ -18,7 +18,7 @@ LIMIT_S = 0.5
 
 
 def frame() -> npt.NDArray[np.float32]:
-    """Give a shaded, mottled tissue in a round view with 30 highlights of 2 to 9 px, 8 bits."""
+    """Return a shaded, mottled tissue in a round view with 30 highlights of 2 to 9 px, 8 bits."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     shading = 0.35 + 0.2 * np.sin(x / 170) * np.cos(y / 130)
@@ -34,7 +34,7 @@ def frame() -> npt.NDArray[np.float32]:
 
 
 def figures() -> list[Figure]:
-    """Give the figures."""
+    """Return the figures."""
     picture = frame()
     calibration = Calibration(Camera.from_fov(70.0, WIDTH, HEIGHT))
     names = default_estimators(calibration)

@@ -11,7 +11,7 @@ LIMITS_MS = {"cone_axis": 1.5, "curved": 2.5, "photometric": 25.0}
 
 
 def figures() -> list[Figure]:
-    """Give the figures, measured in turns on one core."""
+    """Return the figures, measured in turns on one core."""
     cv2.setNumThreads(1)
     pieces = {name: piece for name, piece in estimator_pieces().items() if name in LIMITS_MS}
     times = in_turns({"reference": reference_kernel(), **pieces}, ROUNDS)

@@ -32,7 +32,7 @@ _PROGRAM = "from simtest.cli.main import main; main()"
 
 
 def figures() -> list[Figure]:
-    """Give the figures: parts in turns on one core, then the whole command on two."""
+    """Return the figures: parts in turns on one core, then the whole command on two."""
     cv2.setNumThreads(1)
     cases = expand(load_experiment("paper"))
     shown = [

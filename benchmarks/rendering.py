@@ -41,7 +41,7 @@ def _scene(samples: int = 16, light: dict[str, Any] | None = None, exponent: flo
 
 
 def _reference(session: Session, samples: int) -> Callable[[], object]:
-    """Give the function that renders the session's scene by Mitsuba."""
+    """Return the function that renders the session's scene by Mitsuba."""
     mi, camera = session.mi, session.camera
     pose = session.surface.model_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {
@@ -62,7 +62,7 @@ def _reference(session: Session, samples: int) -> Callable[[], object]:
 
 
 def figures() -> list[Figure]:
-    """Give the figures."""
+    """Return the figures."""
     session = Session(_scene(), labelled=True)
     return [*_frames(session), _updates(session), _compiled(session), _first_frame(), _memory(session)]
 
@@ -162,7 +162,7 @@ def _memory(session: Session) -> Figure:
 
 
 def resident_bytes() -> int:
-    """Give the resident memory of this process; where the system does not tell, its peak."""
+    """Return the resident memory of this process; where the system does not tell, its peak."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:

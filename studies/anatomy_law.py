@@ -19,7 +19,7 @@ TOLERANCE_DEG, TOLERANCE = 0.3, 0.03
 
 
 def smoothed_law(rows: pl.DataFrame) -> np.ndarray:
-    """Give the law's error, deg, of the smoothed picture at each highlight."""
+    """Return the law's error, deg, of the smoothed picture at each highlight."""
     scene = load_scene("anatomy")
     camera = scene.camera.model()
     # c = 4 n of the Phong lobe.

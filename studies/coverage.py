@@ -46,7 +46,7 @@ Judged = tuple[Estimate | Failure, TrueHighlight]
 
 
 def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list[Figure]:
-    """Give coverage and size of each estimator's regions."""
+    """Return coverage and size of each estimator's regions."""
     judged: dict[str, list[Judged]] = {name: [] for name in ("cone_axis", "curved", "photometric", "bisector")}
     for patch, calibration, truth in _highlights(highlights, ()):
         for name, estimator in (("cone_axis", cone_axis), ("curved", curved), ("photometric", photometric)):
@@ -61,7 +61,7 @@ def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list
 
 
 def _say_so_far(judged: Mapping[str, Sequence[Judged]]) -> None:
-    """Say from time to time what a run that is cut short would give."""
+    """State from time to time what a run that is cut short would give."""
     if sum(map(len, judged.values())) % SAID_EVERY == 0:
         so_far = (_figures(name, results)[0] for name, results in judged.items() if results)
         print("; ".join(f"{figure.name}: {figure.about}" for figure in so_far), file=sys.stderr)
@@ -70,7 +70,7 @@ def _say_so_far(judged: Mapping[str, Sequence[Judged]]) -> None:
 def _highlights(
     count: int, lights: Sequence[Mapping[str, float]]
 ) -> Iterator[tuple[Patch, Calibration, TrueHighlight]]:
-    """Give detected highlights that are matched to the truth, of as many viewpoints as it takes."""
+    """Return detected highlights that are matched to the truth, of as many viewpoints as it takes."""
     session, found, viewpoint = None, 0, FIRST_VIEWPOINT
     while found < count:
         values = {"surface.path": "colon", "surface.viewpoint": viewpoint, "sensor.seed": viewpoint}

@@ -33,7 +33,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _answer(rows: pl.DataFrame, column: str, digits: int) -> str:
-    """Give the mean of the rows that answered, or why none did."""
+    """Return the mean of the rows that answered, or why none did."""
     mean = rows.filter(pl.col("status") == "ok")[column].mean()
     return f"{mean:.{digits}f}" if mean is not None else str(rows["status"][0])
 

@@ -50,7 +50,7 @@ class Observation:
 
 
 def spots(recipe: Path) -> list[Observation]:
-    """Give the specularities of the views that have the most, the brightest first, in equal parts."""
+    """Return the specularities of the views that have the most, the brightest first, in equal parts."""
     estimators, session, views = load_estimators(ESTIMATORS), None, []
     for viewpoint in range(TRIED):
         scene = scene_from_dict(
@@ -84,7 +84,7 @@ def spots(recipe: Path) -> list[Observation]:
 
 
 def moved(spot: Observation, middle: np.ndarray, error: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Give camera_from_model with a registration error of a length, mm, and an angle, deg."""
+    """Return camera_from_model with a registration error of a length, mm, and an angle, deg."""
     import cv2
 
     length, angle = error
@@ -98,7 +98,7 @@ def moved(spot: Observation, middle: np.ndarray, error: tuple[float, float], rng
 
 
 def study(found: list[Observation], model: Model, error: tuple[float, float]) -> dict[str, np.ndarray]:
-    """Give the angles by name, deg: each draw is one registration of each view; the better candidate counts."""
+    """Return the angles by name, deg: each draw is one registration of each view; the better candidate counts."""
     angles: dict[str, list[float]] = {}
     middle = model.vertices.mean(axis=0)
     for draw in range(DRAWS if any(error) else 1):

@@ -46,7 +46,7 @@ def _inside(mask: Mask, frame: StudyFrame) -> Mask:
 
 
 def figures(frames: int = FRAMES, tuning: int = TUNING_FRAMES) -> list[Figure]:
-    """Give the figures: ours with their limits, the others' beside them."""
+    """Return the figures: ours with their limits, the others' beside them."""
     with tempfile.TemporaryDirectory() as folder:
         tried = {f"threshold {t}": _fixed(t) for t in THRESHOLDS}
         tried |= {f"Arnold 2010, T2rel {t:g}": _arnold(t) for t in TUNED_T2_REL}
@@ -82,7 +82,7 @@ def _lines(name: str, part: str, scores: Scores, limit: bool = False) -> list[Fi
 def _run(
     split: str, count: int, folder: Path, detectors: dict[str, Detector], shares: tuple[float, ...]
 ) -> dict[tuple[str, str, float], Scores]:
-    """Give the scores by detector, kind of anatomy or all, and share of the peak."""
+    """Return the scores by detector, kind of anatomy or all, and share of the peak."""
     scores: dict[tuple[str, str, float], Scores] = {}
     for number, frame in enumerate(study_frames(split, count, folder), start=1):
         print(f"\r{split} frame {number} of {count}", end="", file=sys.stderr, flush=True)

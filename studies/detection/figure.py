@@ -20,7 +20,7 @@ TRUE, ISOLATED, OTHER = (255, 220, 0), (0, 255, 0), (0, 140, 255)
 
 
 def panel(frame: StudyFrame) -> np.ndarray:
-    """Give the frame, and beside it the same with outlines."""
+    """Return the frame, and beside it the same with outlines."""
     truth = specular_truth(frame.specular, frame.other, frame.noise, frame.camera.seen)
     found = detect_in_picture(frame.picture.astype(np.float32) / 255).detection
     plain = np.ascontiguousarray(frame.picture[:, :, ::-1])

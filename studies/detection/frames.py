@@ -182,7 +182,7 @@ def _frame(session: Session, scene: Scene, kind: str, name: str, seed: int) -> S
 
 
 def _texture(position: Image, rng: np.random.Generator) -> Image:
-    """Give the factor of the albedo at surface points, shape (H, W, 3): mottling, and vessels, which are redder."""
+    """Return the factor of the albedo at surface points, shape (H, W, 3): mottling, and vessels, which are redder."""
     points = np.nan_to_num(position).reshape(-1, 3)
     wavelengths = np.exp(rng.uniform(math.log(1.5), math.log(25), WAVES))
     directions = rng.normal(size=(WAVES, 3))

@@ -59,7 +59,7 @@ def arnold(picture: Picture, t2_rel: float = T2_REL) -> Mask:
 
 
 def _fill_with_colour_around(values: npt.NDArray[np.float32], mask: Mask) -> npt.NDArray[np.float32]:
-    """Give each region of a mask the mean colour of the ring 2 to 4 px around it."""
+    """Return each region of a mask the mean colour of the ring 2 to 4 px around it."""
     near = cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
     labels, count = ndimage.label(near)
     filled = values.copy()

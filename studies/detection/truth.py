@@ -95,7 +95,7 @@ def specular_truth(
 
 
 def _largest(values: npt.NDArray[np.floating], labels: Labels, count: int) -> npt.NDArray[np.floating]:
-    """Give the largest value of each label, shape (count,); infinity for label 0, which is none."""
+    """Return the largest value of each label, shape (count,); infinity for label 0, which is none."""
     largest = np.zeros(count, dtype=values.dtype)
     rows, columns = np.nonzero(labels)
     np.maximum.at(largest, labels[rows, columns], values[rows, columns])

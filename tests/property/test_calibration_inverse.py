@@ -16,7 +16,7 @@ STEPS = st.lists(st.floats(0.01, 1.0), min_size=1, max_size=12)
 
 @st.composite
 def tables(draw):
-    """Give a rising table from (0, 0) to (1, 1)."""
+    """Return a rising table from (0, 0) to (1, 1)."""
     light = np.cumsum([0.0, *draw(STEPS)])
     value = np.cumsum([0.0, *(draw(st.floats(0.01, 1.0)) for _ in light[1:])])
     ends = [tuple([*(axis / axis[-1])[:-1].tolist(), 1.0]) for axis in (light, value)]

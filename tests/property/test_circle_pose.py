@@ -65,7 +65,7 @@ def circles(draw, max_off_axis_deg=89.0):
 
 
 def solve(circle):
-    """Give the pose, the index of the right candidate, and its error, deg."""
+    """Return the pose, the index of the right candidate, and its error, deg."""
     pose = circle_pose(circle.cone())
     errors = angle_deg(pose.normals, circle.normal)
     return pose, int(errors.argmin()), float(errors.min())

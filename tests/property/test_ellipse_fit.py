@@ -23,7 +23,7 @@ def phases(count, start=0.3):
 
 
 def parameters(fitted):
-    """Give centre, half-axes and angle in pixels, through the centred coordinates, which keep their digits."""
+    """Return centre, half-axes and angle in pixels, through the centred coordinates, which keep their digits."""
     assert isinstance(fitted, FittedConic), fitted
     ellipse = ellipse_of_conic(fitted.normalised)
     T = fitted.normalised_from_image

@@ -43,7 +43,7 @@ class Bench:
         return radiance.total, highlight
 
     def errors(self, shape, light=None, camera=None):
-        """Give the errors, deg, of each estimator over the realisations."""
+        """Return the errors, deg, of each estimator over the realisations."""
         radiance, highlight = self.render(shape, light)
         camera = camera or self.session.camera
         found = {"cone_axis": [], "circle_pose": [], "brightest_point": []}

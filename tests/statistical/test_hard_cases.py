@@ -37,7 +37,7 @@ def surface(kind, kd=0.0, **more):
 
 @pytest.fixture(scope="module")
 def see():
-    """Give a function from the tables of a scene to what is seen of it, rendered once."""
+    """Return a function from the tables of a scene to what is seen of it, rendered once."""
     kept, session = {}, Session(scene_from_dict({"surface": surface("plane")}))
 
     def made(**tables):
@@ -50,7 +50,7 @@ def see():
 
 
 def found(frame, calibration, estimators=AXES):
-    """Give the estimates at the brightest peak, of whatever shape; None where no peak stands out."""
+    """Return the estimates at the brightest peak, of whatever shape; None where no peak stands out."""
     spots = reconstruct(frame, calibration, estimators, isolated=False)
     return spots[0].estimates if spots else None
 

@@ -54,21 +54,21 @@ def interaction(mi, wi, count):
 
 
 def lobe_edges(exponent):
-    """Give the edges in beta, rad: quantiles of cos^(n+1)(beta), then equal steps to the far side."""
+    """Return the edges in beta, rad: quantiles of cos^(n+1)(beta), then equal steps to the far side."""
     inside = np.arccos(np.array(QUANTILES) ** (1 / (exponent + 1)))
     steps = np.linspace(inside[-1], np.pi, 6)[1:]
     return np.concatenate([inside, steps])
 
 
 def lobe_frame(wi):
-    """Give the axes of coordinates about the mirror direction, as rows."""
+    """Return the axes of coordinates about the mirror direction, as rows."""
     mirror = np.array([-wi[0], -wi[1], wi[2]])
     side = np.array([0.0, 1.0, 0.0])
     return np.stack([np.cross(side, mirror), side, mirror])
 
 
 def cells(exponent, wi, fine=FINE):
-    """Give the cells' directions, shape (B, A, fine^2, 3), and solid angles, of B x A bins."""
+    """Return the cells' directions, shape (B, A, fine^2, 3), and solid angles, of B x A bins."""
     edges = lobe_edges(exponent)
     share = (np.arange(fine) + 0.5) / fine
     beta = edges[:-1, None] + np.diff(edges)[:, None] * share
@@ -91,7 +91,7 @@ def evaluated(mi, bsdf, wi, directions, method):
 
 
 def drawn(mi, bsdf, wi, seed, count=SAMPLES):
-    """Give the directions, densities and weights of samples."""
+    """Return the directions, densities and weights of samples."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
     si = interaction(mi, wi, count)
@@ -136,7 +136,7 @@ def p_value(mi, case, seed, drawn_exponent=None, factor=1.0):
 
 
 def chi_square(observed, expected):
-    """Give the p-value; the rarest bins are pooled until each pool is expected often enough."""
+    """Return the p-value; the rarest bins are pooled until each pool is expected often enough."""
     order = np.argsort(expected)
     observed, expected = observed[order], expected[order]
     few = np.searchsorted(np.cumsum(expected), LEAST_EXPECTED) + 1
@@ -257,7 +257,7 @@ FAMILY = [(n, angle, albedo, form) for n in (1.0, 20.0, 500.0) for angle in (0.0
 
 
 def furnace(mi, case, count=4000):
-    """Give the radiance that Mitsuba's `direct` samples off a plane under an even sky, by the lobe's samples alone."""
+    """Return the radiance that Mitsuba's `direct` samples off a plane under an even sky, by the lobe's samples alone."""
     import drjit as dr
 
     exponent, angle_deg, albedo, normalised = case
@@ -275,7 +275,7 @@ def furnace(mi, case, count=4000):
 
 
 def furnace_statistic(mi, case, bias=1.0):
-    """Give the mean's distance from the quadrature in standard errors."""
+    """Return the mean's distance from the quadrature in standard errors."""
     exponent, angle_deg, albedo, normalised = case
     scale = 1 - albedo if normalised else 1.0
     expected = scale * lobe_albedo(exponent, incidence(angle_deg), normalised) + albedo

@@ -24,7 +24,7 @@ SENSORS = {
 
 
 def levels(name):
-    """Give a frame for each level, full scale 3."""
+    """Return a frame for each level, full scale 3."""
     sensor = Sensor.model_validate(SENSORS[name])
     for i, level in enumerate(LEVELS):
         light = np.full(PIXELS, 3 * level, np.float32)
@@ -32,7 +32,7 @@ def levels(name):
 
 
 def scores(name, model):
-    """Give the z score of the mean and of the variance at each level."""
+    """Return the z score of the mean and of the variance at each level."""
     shot = 0 if model.full_well is None else 1
     means, variances = [], []
     for level, frame in levels(name):

@@ -22,7 +22,7 @@ def build(kind, pose=(0.0, 0.0, 0.0), **settings):
 
 
 def anchor_frame(pose):
-    """Give the anchor, its normal and the two principal directions, camera frame, by Rodrigues' formula.
+    """Return the anchor, its normal and the two principal directions, camera frame, by Rodrigues' formula.
 
     The normal is (0, 0, -1) turned by the tilt towards the azimuth; the principal directions turn along.
     """
@@ -41,7 +41,7 @@ def anchor_frame(pose):
 
 
 def cast(model, directions, near=None):
-    """Give the exact points on rays from the camera, camera frame; `near` stands in for the ray tracer's distance."""
+    """Return the exact points on rays from the camera, camera frame; `near` stands in for the ray tracer's distance."""
     rotation, centre = model.model_from_camera[:3, :3], model.model_from_camera[:3, 3]
     directions = np.atleast_2d(directions)
     count = len(directions)

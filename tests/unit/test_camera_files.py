@@ -421,7 +421,7 @@ def test_matlab_structs_that_are_none(tmp_path, case):
 
 
 def opaque_file():
-    """Give the bytes of a MATLAB file with one object: a variable of class 17, as a cameraParameters object is."""
+    """Return the bytes of a MATLAB file with one object: a variable of class 17, as a cameraParameters object is."""
 
     def text(word):
         return struct.pack("<II", 1, len(word)) + word.ljust(-(-len(word) // 8) * 8, b"\0")

@@ -238,7 +238,7 @@ TRUTH = {
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    """Give the folders of one scene rendered by two processes."""
+    """Return the folders of one scene rendered by two processes."""
     folder = tmp_path_factory.mktemp("frames")
     command = [sys.executable, "-c", MAIN, "render", "sphere", *SET_SMALL, "--out"]
     children = [

@@ -73,7 +73,7 @@ SURFACES = {
 
 
 def radiance(P, N, place, exponent, specular, albedo, normalised):
-    """Give the radiance of a light of power 1; 0 in its own shadow, where the normal turns away from it."""
+    """Return the radiance of a light of power 1; 0 in its own shadow, where the normal turns away from it."""
     to_camera = -P / np.linalg.norm(P, axis=-1, keepdims=True)
     to_light = np.asarray(place) - P
     squared = np.sum(to_light**2, axis=-1)
@@ -146,7 +146,7 @@ SAMPLED = [
 
 
 def differences(session, name, integrator, places, shares, seed):
-    """Give one random sample a pixel, of 3000 pixels, and its formula's mean over the pixel."""
+    """Return one random sample a pixel, of 3000 pixels, and its formula's mean over the pixel."""
     specular, albedo, normalised = shares
     surface, formula = SURFACES[name]
     session.update(described(surface, places, 20.0, specular, albedo, normalised))
@@ -170,7 +170,7 @@ def differences(session, name, integrator, places, shares, seed):
 
 
 def statistic(sampled, means):
-    """Give the pooled mean's distance from the formula's in standard errors."""
+    """Return the pooled mean's distance from the formula's in standard errors."""
     difference = sampled - means
     return difference.mean() / (difference.std(ddof=1) / np.sqrt(len(difference)))
 

@@ -14,7 +14,7 @@ MASK = ViewMask(325.0, 236.0, 220.0)
 
 
 def inside(camera, count=20):
-    """Give positions all over what the camera sees, its border included."""
+    """Return positions all over what the camera sees, its border included."""
     x, y = (np.linspace(0, size, count) for size in (camera.width, camera.height))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return points[camera.contains(points)]

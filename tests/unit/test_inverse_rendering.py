@@ -36,7 +36,7 @@ SURFACES = {
 
 @pytest.fixture(scope="module")
 def render():
-    """Give a function from a surface and more tables to session, radiance and true highlight."""
+    """Return a function from a surface and more tables to session, radiance and true highlight."""
     held = []
 
     def make(surface, **tables):

@@ -15,7 +15,7 @@ EXPONENT = 20.0
 
 
 def contours_on_plane(light, isovalue, tilt):
-    """Give isophote points of the specular term on the plane, and V and L in the plane's frame, all in mm."""
+    """Return isophote points of the specular term on the plane, and V and L in the plane's frame, all in mm."""
     session = Session(
         scene_from_dict(
             {

@@ -140,7 +140,7 @@ def test_bisector_angle_is_half_the_angle_at_the_surface():
 
 @pytest.fixture(scope="module")
 def measure():
-    """Give a function from a surface and a light to the estimates and the true highlight, without noise."""
+    """Return a function from a surface and a light to the estimates and the true highlight, without noise."""
     held = []
 
     def run(surface, light=None, size=300, smoothing_px=2.0):

@@ -183,7 +183,7 @@ def session():
 
 
 def tilted(kind, angle, pointed):
-    """Give a surface whose highlight is seen `angle` deg off the axis, or the same seen on it."""
+    """Return a surface whose highlight is seen `angle` deg off the axis, or the same seen on it."""
     depth = 10 * np.cos(np.radians(angle)) if pointed else 10.0
     surface = {"type": kind, "distance_mm": float(depth), "tilt_deg": 0.0 if pointed else angle, "azimuth_deg": 30.0}
     # Tilted along its straight direction, a cylinder's nearest point moves by the tilt.

@@ -60,7 +60,7 @@ def accept(profile, reports, reason):
 
 
 def kept(reports):
-    """Give the bytes of the history's files."""
+    """Return the bytes of the history's files."""
     return {path: path.read_bytes() for path in reports.history.rglob("*.parquet") if not path.name.startswith(".")}
 
 

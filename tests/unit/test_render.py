@@ -42,13 +42,13 @@ def sightlines():
 
 
 def leaned(tilt_deg, azimuth_deg):
-    """Give the anchor's normal."""
+    """Return the anchor's normal."""
     t, a = np.radians([tilt_deg, azimuth_deg])
     return np.array([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), -np.cos(t)])
 
 
 def plane(tilt=0.0, azimuth=0.0):
-    """Give positions and normals of a plane seen by the camera; NaN where it is not."""
+    """Return positions and normals of a plane seen by the camera; NaN where it is not."""
     s, N = sightlines(), leaned(tilt, azimuth)
     t = N[2] * D / (s @ N)
     return np.where(t > 0, t, np.nan)[..., None] * s, np.broadcast_to(N, s.shape)
@@ -76,7 +76,7 @@ def cylinder(radius, inside=False):
 
 
 def phong(P, N, light, power=1.0, exponent=50.0, specular=1.0, albedo=0.0, normalised=False):
-    """Give the two parts of the radiance of direct light [P75, theory.md section 1], without shadows."""
+    """Return the two parts of the radiance of direct light [P75, theory.md section 1], without shadows."""
     to_camera = -P / np.linalg.norm(P, axis=-1, keepdims=True)
     to_light = np.asarray(light, float) - P
     squared = np.sum(to_light**2, axis=-1)

@@ -40,7 +40,7 @@ def session():
 
 
 def errors(session, described, seeds=(0,)):
-    """Give each estimator's errors, deg, against the normal at the true BP."""
+    """Return each estimator's errors, deg, against the normal at the true BP."""
     seen = render_view(session, described)
     normal = seen.highlights[0].normal
     made = {name: [] for name in ESTIMATORS}

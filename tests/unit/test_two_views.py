@@ -33,7 +33,7 @@ def signs_of(kd):
 
 @pytest.fixture(scope="module")
 def view():
-    """Give a function from a shape and a place of the camera to estimates of the anchor's highlight and the pose."""
+    """Return a function from a shape and a place of the camera to estimates of the anchor's highlight and the pose."""
     held = []
 
     def look(kd, tilt_deg, azimuth_deg, sigma, seed, distance=D):

@@ -40,7 +40,7 @@ def truth_at(x, y, normal=NORTH, light=0):
 
 
 def detection(x, y, width, height, peak, estimates=None):
-    """Give a detection whose isophote does not close, so that its region decides."""
+    """Return a detection whose isophote does not close, so that its region decides."""
     failure = Failure(Reason.NO_CLOSED_ISOPHOTE)
     return Specularity(Region((x, y, width, height), peak, 1.0), failure, estimates or {})
 
