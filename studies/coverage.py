@@ -61,7 +61,7 @@ def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list
 
 
 def _say_so_far(judged: Mapping[str, Sequence[Judged]]) -> None:
-    """State from time to time what a run that is cut short would give."""
+    """Print from time to time what a run that is cut short would give."""
     if sum(map(len, judged.values())) % SAID_EVERY == 0:
         so_far = (_figures(name, results)[0] for name, results in judged.items() if results)
         print("; ".join(f"{figure.name}: {figure.about}" for figure in so_far), file=sys.stderr)

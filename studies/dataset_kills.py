@@ -1,4 +1,4 @@
-"""Kills a dataset's writing process and its workers at random moments, until it is finished; some 15 minutes."""
+"""Kill a dataset's writing process and its workers at random moments, until it is finished; some 15 minutes."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""Measures what triangulation alone does to a highlight: python -m studies.fineness OUT.png OUT.json [--quick].
+"""Measure what triangulation alone does to a highlight: python -m studies.fineness OUT.png OUT.json [--quick].
 
 OUT.json, as shipped simtest/report/fineness.json, is what the page of a run over anatomies shows.
 

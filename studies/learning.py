@@ -1,4 +1,4 @@
-"""Trains the network of docs/learning.md, compares it with the classical estimators; prints a table, draws a figure.
+"""Train the network of docs/learning.md, compare it with the classical estimators, print a table, draw a figure.
 
 simtest dataset learning --out data/learning
 python -m studies.learning data/learning docs/images/learning.png

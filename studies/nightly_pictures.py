@@ -1,4 +1,4 @@
-"""Takes pictures of a nightly page with the system's Chromium: a desktop's, a phone's in the dark, the trends.
+"""Take pictures of a nightly page with the system's Chromium: a desktop's, a phone's in the dark, the trends.
 
 python -m studies.nightly_pictures reports/nightly/full/index.html docs/images
 """

@@ -1,4 +1,4 @@
-"""Draws docs/images/detection.png: rendered frames with their true masks and what is detected.
+"""Draw docs/images/detection.png: rendered frames with their true masks and what is detected.
 
 python -m studies.detection.figure FIGURE
 """

@@ -56,7 +56,7 @@ def specular_truth(
     peak_share: float = SPECULAR_PEAK_SHARE,
     diffuse_ratio: float = SPECULAR_DIFFUSE_RATIO,
 ) -> SpecularTruth:
-    """Tell which pixels show a highlight.
+    """Mark the pixels that show a highlight.
 
     A pixel does where the direct specular light is at least `peak_share` of its own highlight's peak and at least
     `diffuse_ratio` times the light that comes from elsewhere at that pixel. Light beyond full scale does not count:

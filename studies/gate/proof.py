@@ -1,4 +1,4 @@
-"""Draws the nights and counts the gate's verdicts on them."""
+"""Draw the nights and counts the gate's verdicts on them."""
 
 import os
 import tempfile

@@ -153,7 +153,7 @@ def chi_square(observed, expected):
 
 
 def rejected(p_values, alpha=ALPHA):
-    """Tell which hypotheses Holm's procedure rejects."""
+    """Return which hypotheses Holm's procedure rejects."""
     p = np.asarray(p_values)
     order = np.argsort(p)
     passes = np.logical_and.accumulate(p[order] <= alpha / np.arange(len(p), 0, -1))
@@ -257,7 +257,7 @@ FAMILY = [(n, angle, albedo, form) for n in (1.0, 20.0, 500.0) for angle in (0.0
 
 
 def furnace(mi, case, count=4000):
-    """Return the radiance that Mitsuba's `direct` samples off a plane under an even sky, by the lobe's samples alone."""
+    """Return the radiance that Mitsuba's `direct` samples off a plane under an even sky, from the lobe alone."""
     import drjit as dr
 
     exponent, angle_deg, albedo, normalised = case
