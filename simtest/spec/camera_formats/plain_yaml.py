@@ -20,8 +20,8 @@ _NUMBER = re.compile(r"[-+]?((\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|\.?inf|\.?nan)", re
 class _CameraLoader(yaml.SafeLoader):
     """Builds maps, lists, numbers and text; refuses aliases, merge keys, other tags, and files that are too large."""
 
-    yaml_constructors: ClassVar = {}
-    yaml_multi_constructors: ClassVar = {}
+    yaml_constructors: ClassVar[dict[str | None, Any]] = {}
+    yaml_multi_constructors: ClassVar[dict[str | None, Any]] = {}
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
