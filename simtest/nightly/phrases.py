@@ -141,4 +141,5 @@ def _baseline(record: RunRecord | None) -> str:
 
 def counts(verdict: Verdict) -> list[tuple[str, int, str]]:
     """Return the outcomes that occur as (outcome, count, meaning), those first that a reader looks for first."""
-    return [(name, verdict.counts[name], meaning) for name, meaning in MEANINGS.items() if verdict.counts[name]]
+    found = verdict.counts
+    return [(name, found[name], meaning) for name, meaning in MEANINGS.items() if found[name]]
