@@ -227,6 +227,7 @@ print(json.dumps(means))
 """
 
 
+@pytest.mark.slow
 def test_all_integrators_and_variants_agree():
     """Direct, path, prb and a nested aov give one picture in colour, mono and scalar variants; prb its derivative."""
     found = {}
