@@ -39,7 +39,11 @@ class RenamedModules:
         for old, new in MODULES.items():
             if name == old or name.startswith(f"{old}."):
                 moved = new + name.removeprefix(old)
-                return ModuleSpec(name, cls, origin=moved, is_package=True) if find_spec(moved) else None  # type: ignore[arg-type]
+                try:
+                    there = find_spec(moved) is not None
+                except ModuleNotFoundError:
+                    there = False
+                return ModuleSpec(name, cls, origin=moved, is_package=True) if there else None  # type: ignore[arg-type]
         return None
 
     @staticmethod

@@ -42,4 +42,15 @@ def __getattr__(name: str) -> Any:
         DeprecationWarning,
         2,
     )
-    return Priors
+    return _known
+
+
+def _known(
+    lights_mm: tuple[tuple[float, float, float], ...] = (),
+    distance_mm: float | None = None,
+    distance_sd_mm: float = 0.0,
+    lobe_curvature: float | None = None,
+) -> Priors:
+    """Return the priors of bare numbers, as `Known` took them."""
+    distance = None if distance_mm is None else Normal(distance_mm, distance_sd_mm)
+    return Priors(lights_mm, distance, None if lobe_curvature is None else exactly(lobe_curvature))

@@ -68,7 +68,11 @@ class Frame:
             return self.calibration.correct(self.encoded)
         # Light is linear, so no response is left to undo; the falloff is.
         plain = replace(self.calibration, response=None, saturation_level=None)
-        return replace(plain.correct(self.light), saturated=self.clipped, channels=self.encoded.shape[2])
+        return replace(
+            plain.correct(self.light),
+            saturated=self.clipped,
+            channels=1 if self.encoded.ndim == 2 else self.encoded.shape[2],
+        )
 
     @cached_property
     def smoothed(self) -> Image:

@@ -11,6 +11,7 @@ from simtest.detection.blobs import MIN_AREA_PX, Highlight, highlights_of
 from simtest.detection.detector import Detection
 from simtest.detection.light_split import SplitLight, split_light
 from simtest.detection.view_mask import View, find_view
+from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask
 
 NOISE_FACTOR = 4.0
@@ -99,7 +100,9 @@ class ColourDetector:
     isolated: bool = True
 
     def detect(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> Detection:
-        """Find the highlights of a frame of three channels (see `simtest.detection.Detector`)."""
+        """Find the highlights of a frame; raise `InputError` where it has not three channels."""
+        if frame.encoded.ndim != 3 or frame.encoded.shape[2] != 3:
+            raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
         taken = tuple(found.isolated if self.isolated else found.highlights)

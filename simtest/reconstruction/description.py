@@ -181,7 +181,9 @@ class PictureRecord:
 
 def describe(made: Reconstruction, camera: Camera) -> list[SpecularityRecord]:
     """Describe each specularity of a reconstruction, with what the detector says of it."""
-    judged: Sequence[Highlight | None] = made.detection.highlights or [None] * len(made.specularities)
+    # Estimates that no region took stand behind those of the regions, and no detector judged them.
+    judged: list[Highlight | None] = [*made.detection.highlights]
+    judged += [None] * (len(made.specularities) - len(judged))
     return [_describe(i, *pair, camera) for i, pair in enumerate(zip(made.specularities, judged, strict=True))]
 
 

@@ -67,6 +67,7 @@ def reconstruct(
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float = DEFAULT_SMOOTHING_PX,
     isolated: bool = True,
+    detector: str | Detector | None = None,
 ) -> list[Specularity]:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -87,6 +88,8 @@ def reconstruct(
     isolated : bool
         Detect only specularities whose isophote at t = 0.5 closes inside the frame and the camera's view mask, and
         whose shape is that of one point highlight (`simtest.detection.peak_shape`).
+    detector : str or Detector, optional
+        Name as registered, or the detector itself; default `peaks`, to which alone `isolated` applies.
 
     Returns
     -------
@@ -101,7 +104,8 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN or infinity; if an
         argument is of the wrong kind or out of range.
     """
-    return run_pipeline(frame, camera, PeakDetector(isolated), estimators, roi, smoothing_px).specularities
+    finder = PeakDetector(isolated) if detector is None else detector
+    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px).specularities
 
 
 def reconstruct_colour(
@@ -189,12 +193,31 @@ def run_pipeline(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    if box is not None:
-        detection = _cut_region(frame, box)
-    else:
-        detection = load_detector(detector).detect(frame, calibration.camera, calibration.priors)
+    detection = _detect(load_detector(detector), frame) if box is None else _cut_region(frame, box)
     # estimate
     return _estimate(detection, chosen)
+
+
+def _detect(detector: Detector, frame: Frame) -> Detection:
+    """Run a detector; raise `InputError` with its name where it fails or returns what is no detection of the frame."""
+    name, (height, width) = type(detector).__qualname__, frame.encoded.shape[:2]
+    try:
+        found = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"detector {name}: {type(error).__name__}: {error}") from error
+    if not isinstance(found, Detection):
+        raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
+    if len(found.highlights) not in (0, len(found.regions)):
+        raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
+    for box in (region.box for region in found.regions):
+        if not (isinstance(box, tuple) and len(box) == 4 and all(isinstance(v, int) for v in box)):
+            raise InputError(f"detector {name}: box {shown(box, 80)}: must be a tuple of four integers x, y, w, h")
+        x, y, w, h = box
+        if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
+            raise InputError(f"detector {name}: box {box} leaves the frame of {width} x {height} px")
+    return found
 
 
 def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:

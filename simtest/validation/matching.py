@@ -24,13 +24,19 @@ def match(specularities: Sequence[Specularity], truths: Sequence[HighlightPoint]
     for i, specularity in enumerate(specularities):
         for j, truth in enumerate(truths):
             if _encloses(specularity, truth.bp_px):
-                pairs.append((float(np.hypot(*(truth.bp_px - peak_px(specularity)))), i, j))
-    # The nearest pair first; each detection and each truth once.
+                distance = float(np.hypot(*(truth.bp_px - peak_px(specularity))))
+                pairs.append((_is_undetected(specularity), distance, i, j))
+    # Detections before what a frame estimator alone saw, the nearest pair first; each detection and each truth once.
     matched: dict[int, int] = {}
-    for _, i, j in sorted(pairs):
+    for _, _, i, j in sorted(pairs):
         if i not in matched and j not in matched.values():
             matched[i] = j
     return matched
+
+
+def _is_undetected(specularity: Specularity) -> bool:
+    """Return whether no detector found it: it has neither a patch nor a contrast."""
+    return isinstance(specularity.patch, Failure) and specularity.region.contrast is None
 
 
 def peak_px(specularity: Specularity) -> np.ndarray:

@@ -63,11 +63,12 @@ def rows(
                 continue
             answered = _estimate_row(replace(row, estimator=name), result)
             made.append(answered if truth is None else _error_row(answered, session, patch, result, truth))
-    # Truths that nothing found.
+    # Truths without a row of some estimator: no detection found them, or one of a frame estimator alone.
+    held = {(row.true_id, row.estimator) for row in made}
     for j, truth in enumerate(truths):
-        if j not in matched.values():
+        if missing := [name for name in estimators if (j, name) not in held]:
             row = replace(_scene_row(scene, common, truth), true_id=j, status=unfound)
-            made += [replace(row, estimator=name) for name in estimators]
+            made += [replace(row, estimator=name) for name in missing]
     return made
 
 

@@ -1,5 +1,7 @@
 """The built-in detectors find what the pipelines find, and hand on the frame that patches are cut from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Respo
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
 from simtest.detection.colour import ColourDetector, colour
 from simtest.detection.peaks import PeakDetector, peaks
-from simtest.errors import InputError
+from simtest.errors import Failure, InputError
 from simtest.geometry import Camera, Patch, ViewMask
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
@@ -107,3 +109,42 @@ def test_a_region_that_was_given_has_no_contrast_and_still_a_shape():
     (spot,) = reconstruct(lobes(), CAMERA, {}, roi=detected.box)
     assert spot.region.contrast is None
     assert isinstance(Detection((given,), frame).regions[0], Region)
+
+
+# What a detector of another package may do wrong ----------------------------------------------------------------------
+
+
+def found_by(detect, picture=None):
+    finder = type("Finder", (), {"detect": lambda self, frame, camera, priors: detect(frame)})()
+    return reconstruct(lobes() if picture is None else picture, CAMERA, {}, detector=finder)
+
+
+def fails(frame):
+    raise RuntimeError("no model")
+
+
+@pytest.mark.parametrize(
+    ("detect", "said"),
+    [
+        (lambda frame: None, "returned a NoneType; must be a Detection"),
+        (lambda frame: Detection((Region((0.5, 0, 9, 9), (3, 3), 1.0),), frame), "a tuple of four integers"),
+        (lambda frame: Detection((Region((CAMERA.width - 3, 0, 9, 9), (3, 3), 1.0),), frame), "leaves the frame"),
+        (fails, "RuntimeError: no model"),
+    ],
+)
+def test_a_detector_that_fails_is_named(detect, said):
+    with pytest.raises(InputError, match=rf"detector Finder: .*{said}"):
+        found_by(detect)
+
+
+def test_a_detector_may_hand_on_other_light_of_a_grey_frame():
+    box = (0, 0, CAMERA.width, CAMERA.height)
+    (spot,) = found_by(lambda f: Detection((Region(box, (3, 3), None),), replace(f, light=f.smoothed)))
+    assert not isinstance(spot.patch, Failure)
+
+
+@pytest.mark.parametrize("channels", [None, 1, 2, 4])
+def test_colour_takes_three_channels(channels):
+    shape = (CAMERA.height, CAMERA.width) if channels is None else (CAMERA.height, CAMERA.width, channels)
+    with pytest.raises(InputError, match=r"takes \(H, W, 3\)"):
+        reconstruct_colour(np.full(shape, 0.5, dtype=np.float32), CAMERA, {})

@@ -2,20 +2,22 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame
-from simtest.detection import Region
-from simtest.detection.detector import Detection
+from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimator, load_estimators
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.geometry import Camera, Patch, smooth
+from simtest.reconstruction.description import describe
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline
+from simtest.validation.matching import match
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
 SIGMA, SMOOTHING_PX = 0.02, 2.0
@@ -184,6 +186,20 @@ def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
 
     made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((10.0, 90.0),))}, None, SMOOTHING_PX)
     assert [list(spot.estimates) for spot in made.specularities] == [["frame"]]
+
+
+def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
+    class Blind:
+        def detect(self, frame, camera, priors):
+            return Detection((Region((0, 0, 100, 100), (50, 49), 1.0),), frame)
+
+    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((50.2, 49.5), (50.4, 49.6)))}, None, SMOOTHING_PX)
+    detected, alone = made.specularities
+    assert len(describe(made, CAMERA)) == 2
+    # The truth lies at the second estimate's pixel; the detection keeps it all the same.
+    true = SimpleNamespace(bp_px=np.array([50.45, 49.6]))
+    assert match([alone, detected], [true]) == {1: 0}
+    assert match([alone], [true]) == {0: 0}
 
 
 # What counts as an estimator ------------------------------------------------------------------------------------------

@@ -64,6 +64,9 @@ def parse_yaml(text: str) -> Any:
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise ValueError(f"line {line}: {error.reason}") from None
+    except ValueError as error:
+        # An escape that names no character.
+        raise ValueError(f"line 1: {error}") from None
 
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
