@@ -28,7 +28,7 @@ PENALISED = "mean_penalised_deg"
 class Quantity:
     """A compared quantity.
 
-    `span` is the most less the least harm of a row, where most rows have one of both: two invented units then keep
+    `span` is the range of a row's harm, where most rows are at one of its ends: two invented units then keep
     small samples, which may all be alike by chance, from showing no variance. It is 0 where rows differ by nature.
     """
 
