@@ -64,7 +64,7 @@ def _reference(session: Session, samples: int) -> Callable[[], object]:
 def figures() -> list[Figure]:
     """Return the figures."""
     session = Session(_scene(), labelled=True)
-    return [*_frames(session), _updates(session), _compiled(session), _first_frame(), _memory(session)]
+    return [*_frames(session), *_tissue(), _updates(session), _compiled(session), _first_frame(), _memory(session)]
 
 
 def _frames(session: Session) -> Iterator[Figure]:
@@ -83,6 +83,37 @@ def _frames(session: Session) -> Iterator[Figure]:
         yield Figure(f"labelled frame: {name}", times["mitsuba"] / times["labelled"], limit, True, "x", about)
         if (samples, offset) == (16, 0.0):
             yield Figure(f"radiance alone: {name}", times["mitsuba"] / times["radiance"], 3.5, True, "x", about)
+
+
+def _tissue() -> Iterator[Figure]:
+    """Compare labelled frames of tissue and of the smooth surface in turns; and the search for glints with a frame."""
+    disc = {"offset_mm": OFFSET_MM, "source": {"type": "disc", "radius_mm": 1.0}}
+    relief = {"bands": [{"slope_deg": 5.0, "wavelength_mm": 1.5}]}
+    tables = _scene(16, disc).model_dump(mode="json", exclude={"surface", "reflectance"}, exclude_defaults=True)
+    tissue = scene_from_dict(
+        {
+            **tables,
+            "surface": {"type": "anatomy", "path": "colon", "relief": relief},
+            "reflectance": {"type": "tissue", "film": {"index": 1.36}, "albedo": {"preset": "colon_mucosa"}},
+        }
+    )
+    smooth = Session(_scene(16, {"offset_mm": OFFSET_MM}), "llvm_ad_rgb", labelled=True)
+    rough = Session(tissue, labelled=True)
+    radiance = rough.radiance()
+
+    def search() -> None:
+        rough._misfits = None
+        rough.highlights(radiance)
+
+    functions: dict[str, Callable[[], object]] = {
+        "smooth": smooth.frame, "tissue": rough.frame, "radiance": rough.radiance, "glints": search,
+    }  # fmt: skip
+    times = in_turns(functions, ROUNDS)
+    about = ", ".join(f"{key} {1e3 * value:.0f} ms" for key, value in times.items())
+    name = "labelled tissue frame (relief, film, vessels, disc) over a smooth one, light aside"
+    yield Figure(name, times["tissue"] / times["smooth"], 2.5, False, "x", about)
+    yield Figure("search for glints over the frame's radiance", times["glints"] / times["radiance"], 0.8, False, "x",
+                 about)  # fmt: skip
 
 
 def _updates(session: Session) -> Figure:

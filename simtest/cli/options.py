@@ -25,7 +25,11 @@ SceneName = Annotated[str, Parameter(help="A scene file, or the name of a shippe
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
-    str | None, Parameter(help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono.")
+    str | None,
+    Parameter(
+        help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono, or llvm_ad_rgb for "
+        "the colours of tissue."
+    ),
 ]
 Estimators = Annotated[
     list[str] | None, Parameter(name="--estimator", negative="", help="Estimator by name; may be repeated.")

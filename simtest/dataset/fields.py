@@ -11,7 +11,7 @@ from io import BytesIO
 import cv2
 import numpy as np
 
-from simtest.dataset.metadata import SampleMeta
+from simtest.dataset.metadata import SampleMeta, has_relief
 from simtest.dataset.png import decode, encode
 from simtest.runtime.arrays import AnyArray
 
@@ -183,6 +183,17 @@ def _decode_curvature(data: bytes, _: SampleMeta) -> AnyArray:
     return np.asarray(cv2.merge(np.split(both, 2, axis=0)))
 
 
+# Pools ---------------------------------------------------------------------------------------------------------------
+
+
+def _encode_mask(mask: AnyArray) -> bytes:
+    return encode(np.where(mask, np.uint8(255), np.uint8(0)), "none")
+
+
+def _decode_mask(data: bytes, _: SampleMeta) -> AnyArray:
+    return decode(data) > 0
+
+
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 
@@ -225,11 +236,23 @@ FIELDS = (
           "distance from the camera centre along the pixel's ray (not z); NaN where there is no surface",
           "16-bit PNG; count times the sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),
     Field("normal", "normal.png", "(H, W, 3)", "float32", "1",
-          "unit normal, camera frame (x right, y down, z forward), facing the camera: N . ray < 0; NaN off the surface",
+          "unit normal of the fine surface, camera frame (x right, y down, z forward); without a relief it faces the "
+          "camera: N . ray < 0; NaN off the surface",
           _OCTAHEDRAL, _encode_normal, _decode_normal),
     Field("curvature", "curvature.png", "(H, W, 2)", "float32", "1/mm",
-          "principal curvatures k_min <= k_max, convex towards the camera positive; NaN where unknown",
+          "principal curvatures k_min <= k_max of the fine surface, convex towards the camera positive; NaN where "
+          "unknown",
           _CURVATURE, _encode_curvature, _decode_curvature),
+    Field("normal_base", "normal_base.png", "(H, W, 3)", "float32", "1",
+          "unit normal of the base, without the relief, facing the camera; stored where there is a relief, elsewhere "
+          "it is normal",
+          _OCTAHEDRAL, _encode_normal, _decode_normal),
+    Field("curvature_base", "curvature_base.png", "(H, W, 2)", "float32", "1/mm",
+          "curvature of the base; stored where there is a relief, elsewhere it is curvature",
+          _CURVATURE, _encode_curvature, _decode_curvature),
+    Field("pool", "pool.png", "(H, W)", "bool", "1",
+          "where the liquid film fills a valley; stored where there is a relief, elsewhere it is false everywhere",
+          "8-bit PNG; 255: pool, 0: none", _encode_mask, _decode_mask),
     Field("specular", "specular.png", "(H, W, 3)", "uint8", "full scale",
           "direct light off the specular lobe, before lens and noise", _PART, _encode_picture, _decode_picture),
     Field("diffuse", "diffuse.png", "(H, W, 3)", "uint8", "full scale",
@@ -247,3 +270,19 @@ FIELDS = (
 
 BY_NAME = {field.name: field for field in FIELDS}
 BY_SUFFIX = {field.suffix: field for field in FIELDS}
+
+FINE_OF = {"normal_base": "normal", "curvature_base": "curvature"}
+"""Field of the fine surface that each field of the base equals where there is no relief."""
+
+BASE_FIELDS = (*FINE_OF, "pool")
+"""Fields that are stored where there is a relief alone."""
+
+
+def smooth_base(name: str, fine: AnyArray | None, meta: SampleMeta) -> AnyArray | None:
+    """Return a field of `BASE_FIELDS` of a sample without a relief, which does not store it; None where it has one.
+
+    `fine` is the field that `FINE_OF` names, and is returned as it is: one array under two names.
+    """
+    if has_relief(meta):
+        return None
+    return np.zeros((meta["camera"]["height"], meta["camera"]["width"]), dtype=bool) if name == "pool" else fine

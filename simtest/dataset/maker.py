@@ -5,10 +5,11 @@ from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
+from pydantic import JsonValue
 
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import depth_scale_mm
-from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta
+from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.errors import Failure
@@ -18,6 +19,7 @@ from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Picture
 from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
@@ -25,10 +27,11 @@ from simtest.surfaces import forget_meshes
 from simtest.validation.matching import match
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
+from simtest.validation.rough_truth import rough_truth
 
 MAX_INSTANCES = 255
 
-DEFAULT_VARIANT = "llvm_ad_rgb"
+DEFAULT_VARIANT = backend.COLOUR_VARIANT
 """Learners want colour."""
 
 
@@ -54,31 +57,33 @@ class Maker:
         picture = seen.frame(scene.sensor.seed)
         specularities = reconstruct(picture, seen.calibration, self._estimators) if seen.full_scale > 0 else []
         images = self._images(drawn, seen, frame, picture)
-        return Sample(
-            {
-                "key": sample_key(index),
-                "index": index,
-                "dataset": self.plan.dataset.name,
-                "split": self.plan.split(index),
-                "anatomy": {
-                    "family": anatomy.family,
-                    "number": anatomy.number,
-                    "seed": anatomy.seed,
-                    "surface": scene.surface.label,
-                },
-                "drawn": drawn.values,
-                "camera": describe_camera(scene.camera.model()),
-                "lights_mm": scene.rig.true_mm().tolist(),
-                "full_scale": seen.full_scale,
-                "scene": scene.model_dump(mode="json"),
-                "attempt": attempt,
-                "highlights": [_highlight(truth) for truth in seen.highlights],
-                "detections": [_detection(specularity) for specularity in specularities],
-                "estimates": self._estimates(index, session, seen, specularities),
-                "depth_scale_mm": depth_scale_mm(images["depth"]),
+        meta: SampleMeta = {
+            "key": sample_key(index),
+            "index": index,
+            "dataset": self.plan.dataset.name,
+            "split": self.plan.split(index),
+            "anatomy": {
+                "family": anatomy.family,
+                "number": anatomy.number,
+                "seed": anatomy.seed,
+                "surface": scene.surface.label,
             },
-            images,
-        )
+            "drawn": drawn.values,
+            "camera": describe_camera(scene.camera.model()),
+            "lights_mm": scene.rig.true_mm().tolist(),
+            "full_scale": seen.full_scale,
+            "scene": scene.model_dump(mode="json"),
+            "attempt": attempt,
+            "highlights": [_highlight(truth) for truth in seen.highlights],
+            "detections": [_detection(specularity) for specularity in specularities],
+            "estimates": self._estimates(index, session, seen, specularities),
+            "depth_scale_mm": depth_scale_mm(images["depth"]),
+        }
+        if seen.is_rough:
+            spots = [spot.to_json() for spot in seen.visible_highlights]
+            meta["clouds"] = cast("list[dict[str, JsonValue]]", [cloud_json(centre) for centre in seen.clouds])
+            meta["visible_highlights"] = cast("list[dict[str, JsonValue]]", spots)
+        return Sample(meta, images)
 
     def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
         """Draw until the frame shows enough isolated highlights, judged by one ray per pixel and direct light."""
@@ -121,7 +126,19 @@ class Maker:
         truths = [seen.highlights[i] for i in counted]
         common = ResultRow(experiment=self.plan.dataset.name, label=scene.surface.label, realisation=index,
                            setting=self.plan.split(index), seed=scene.sensor.seed)  # fmt: skip
-        made = rows(session, common, specularities, truths, match(specularities, truths), list(self._estimators))
+        rough = None
+        if seen.is_rough:
+            found = match(specularities, [spot.peak_px for spot in seen.visible_highlights])
+            rough = rough_truth(session, seen, counted, found)
+        made = rows(
+            session,
+            common,
+            specularities,
+            truths,
+            match(specularities, [truth.bp_px for truth in truths]),
+            list(self._estimators),
+            rough=rough,
+        )
         estimates = []
         for row in made:
             columns = row.to_row() | {"true_id": None if row.true_id is None else counted[row.true_id]}
@@ -142,19 +159,19 @@ class Maker:
         return images
 
     def _truth(self, drawn: Drawn, frame: Frame) -> dict[str, AnyArray]:
-        if self.plan.dataset.exact:
-            truth = self._at(drawn).truth()
-            curvature = np.stack([truth.k_min, truth.k_max], axis=-1)
-            return {"depth": truth.depth, "normal": truth.normal, "curvature": curvature}
-        labels = frame.labels
-        # An interpolated normal may lean away from the camera next to a silhouette; the triangle's own does not.
-        away = np.sum(labels.normal * labels.position, axis=-1, keepdims=True) >= 0
-        normal = np.where(away, labels.geometric_normal, labels.normal)
-        return {
-            "depth": labels.depth,
-            "normal": normal,
-            "curvature": np.stack([labels.k_min, labels.k_max], axis=-1),
-        }
+        seen = self._at(drawn).truth() if self.plan.dataset.exact else frame.labels
+        normal, base = seen.normal, seen.normal_base
+        if not self.plan.dataset.exact:
+            # An interpolated normal may lean away from the camera next to a silhouette; the triangle's own does not.
+            # A fine normal may lean away on a sound base, and stays.
+            away = np.sum(base * seen.position, axis=-1, keepdims=True) >= 0
+            normal, base = (np.where(away, seen.geometric_normal, own) for own in (normal, base))
+        truth = {"depth": seen.depth, "normal": normal, "curvature": np.stack([seen.k_min, seen.k_max], axis=-1)}
+        if drawn.scene.surface.relief is None:
+            # The base is the fine surface: it is not stored twice.
+            return truth
+        curvature_base = np.stack([seen.k_min_base, seen.k_max_base], axis=-1)
+        return {**truth, "normal_base": base, "curvature_base": curvature_base, "pool": seen.pool}
 
 
 def _encoded(picture: AnyArray, encoded: bool) -> AnyArray:

@@ -30,6 +30,11 @@ class HighlightMeta(TypedDict):
     why_not: str | None
     direction_min: list[float] | None
     peak_snr: float | None
+    # Of the base; older datasets, all of smooth surfaces, lack them.
+    normal_base: NotRequired[list[float]]
+    kd_min_base: NotRequired[float]
+    kd_max_base: NotRequired[float]
+    pool: NotRequired[bool]
 
 
 class EllipseMeta(TypedDict):
@@ -68,7 +73,15 @@ class SampleMeta(TypedDict):
     scene: dict[str, JsonValue]
     attempt: int
     highlights: list[HighlightMeta]
+    clouds: NotRequired[list[dict[str, JsonValue]]]  # highlight points of the base below a relief
+    visible_highlights: NotRequired[list[dict[str, JsonValue]]]  # of a surface with relief
     detections: list[DetectionMeta]
     estimates: list[EstimateMeta]
     depth_scale_mm: float
     sha256: NotRequired[dict[str, str]]
+
+
+def has_relief(meta: SampleMeta) -> bool:
+    """Return whether a sample's surface has a relief, so that the truth of its base is stored beside the fine one."""
+    surface = meta["scene"].get("surface")
+    return isinstance(surface, dict) and surface.get("relief") is not None

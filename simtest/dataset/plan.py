@@ -24,6 +24,9 @@ ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 BYTES_PER_PIXEL = 4.5
 """Size of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
 
+RELIEF_BYTES_PER_PIXEL = 6.0
+"""What a relief adds: normals and curvatures of the base, and more detail in those of the fine surface."""
+
 RADIANCE_BYTES_PER_PIXEL = 6.0
 """Size of the linear radiance: three values of 16 bits."""
 
@@ -114,6 +117,15 @@ class Plan:
         self._blocks = self._lay_out()
         self._splits = self._assign()
 
+    @cached_property
+    def has_relief(self) -> bool:
+        """Whether some surfaces have a relief, so that samples hold the truth of the base as well."""
+        scenes = (scene_from_dict(base, f"families.{k}") for k, base in enumerate(self._bases))
+        drawn = (key for family in self.dataset.families for key in (*family.per_anatomy, *family.per_sample))
+        # A whole relief may be drawn, one of a list.
+        is_drawn = any(key.startswith("surface.relief") for key in (*drawn, *self.dataset.per_sample))
+        return is_drawn or any(scene.surface.relief is not None for scene in scenes)
+
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")
         base = apply_settings(read_toml(path), family.set, f"families.{number}.set")
@@ -129,7 +141,9 @@ class Plan:
         if family.seeds is not None and not isinstance(scene.surface, AnatomySurface):
             raise InputError(f"{where}.seeds: surface.type = {scene.surface.type} has no seed; leave it out")
         for path in (*family.per_sample, *self.dataset.per_sample):
-            if isinstance(scene.surface, AnatomySurface) and path.startswith(ANATOMY_KEYS):
+            # The key itself, or one below it; surface.path_share places the camera.
+            named = any(f"{path}.".startswith(f"{key}.") for key in ANATOMY_KEYS)
+            if isinstance(scene.surface, AnatomySurface) and named:
                 raise InputError(
                     f"{where}: {path} is drawn for each sample, which makes anatomies that may be in two splits; "
                     "must be drawn by seeds or per_anatomy"
@@ -240,6 +254,7 @@ class Plan:
         """How many samples of the expected size a shard holds; depends on the dataset alone."""
         camera = scene_from_dict(self._bases[0]).camera
         size = BYTES_PER_PIXEL + (RADIANCE_BYTES_PER_PIXEL if self.dataset.radiance else 0)
+        size += RELIEF_BYTES_PER_PIXEL if self.has_relief else 0
         return max(1, int(self.dataset.shard_mb * 1e6 / (size * camera.width * camera.height)))
 
     @cached_property

@@ -13,6 +13,7 @@ import polars as pl
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.dataset.index import HIGHLIGHTS, SAMPLES
+from simtest.dataset.metadata import has_relief
 from simtest.dataset.reader import open_manifest, read_samples, shard_names
 from simtest.dataset.sample import Sample
 from simtest.errors import InputError
@@ -89,6 +90,9 @@ def _facts(index: pl.DataFrame, highlights: pl.DataFrame) -> list[tuple[str, str
 def _card(sample: Sample) -> Card:
     meta, images = sample.meta, sample.images
     isolated = [highlight for highlight in meta["highlights"] if highlight["isolated"]]
+    base = []
+    if has_relief(meta):
+        base = [("normal of the base, without the relief", _data_url(_normal_colours(images["normal_base"])))]
     drawn = ", ".join(f"{key} = {_short(value)}" for key, value in sorted(meta["drawn"].items()))
     return Card(
         f"{meta['index']}: {meta['anatomy']['surface']}, {meta['split']}",
@@ -96,6 +100,7 @@ def _card(sample: Sample) -> Card:
         [
             ("frame, isolated highlights outlined", _data_url(_outlined(images["image"], images["instance"]))),
             ("normal, as colour (x, y, z)", _data_url(_normal_colours(images["normal"]))),
+            *base,
             ("depth, near is bright", _data_url(_depth_colours(images["depth"]))),
             (
                 f"curvature k_max, -{CURVATURE_END} to {CURVATURE_END} per mm",

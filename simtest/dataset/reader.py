@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from simtest.dataset.fields import BY_NAME
+from simtest.dataset.fields import BASE_FIELDS, BY_NAME, FINE_OF, Field, smooth_base
 from simtest.dataset.manifest import Manifest, ManifestError, read_manifest
 from simtest.dataset.sample import Sample
-from simtest.dataset.shard import BrokenShardError, read_member, samples
+from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
 from simtest.errors import InputError
+from simtest.runtime.arrays import AnyArray
 from simtest.runtime.resources import shown
 
 Record = dict[str, Any]
@@ -37,7 +38,9 @@ def read(
     Yields
     ------
     dict
-        Array by field name (units and frames in the card), and ``meta``: the sample's metadata.
+        Array by field name (units and frames in the card), and ``meta``: the sample's metadata. Where there is no
+        relief, ``normal_base`` and ``curvature_base`` are the arrays ``normal`` and ``curvature``, and ``pool`` is
+        false.
 
     Raises
     ------
@@ -90,9 +93,9 @@ def _read_shards(folder: Path, names: list[str], fields: list[str], required: bo
                 for stored in samples(file, check=False):
                     sample = Sample(stored.meta, {})
                     for field in (BY_NAME[n] for n in fields):
-                        if field.suffix in stored.members:
-                            data = read_member(file, stored, field.suffix)
-                            sample.images[field.name] = field.decode(data, stored.meta)
+                        image = _image(file, stored, field, sample.images)
+                        if image is not None:
+                            sample.images[field.name] = image
                         elif required:
                             raise InputError(f"{name}: sample {stored.key} has no {field.name}")
                     yield sample
@@ -102,3 +105,17 @@ def _read_shards(folder: Path, names: list[str], fields: list[str], required: bo
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{folder / name}: {error}; simtest dataset verify --repair mends it") from error
+
+
+def _image(file: IO[bytes], stored: StoredSample, field: Field, read_before: dict[str, AnyArray]) -> AnyArray | None:
+    """Decode a field; None where the sample has none. `read_before` holds the sample's other fields, by name."""
+    if field.suffix in stored.members:
+        return field.decode(read_member(file, stored, field.suffix), stored.meta)
+    if field.name not in BASE_FIELDS:
+        return None
+    # On a smooth surface the base is the fine surface.
+    twin = FINE_OF.get(field.name)
+    fine = read_before.get(twin) if twin else None
+    if twin and fine is None:
+        fine = _image(file, stored, BY_NAME[twin], read_before)
+    return smooth_base(field.name, fine, stored.meta)

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BY_SUFFIX, FIELDS
+from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS
 from simtest.dataset.index import TABLES, make_tables
 from simtest.dataset.manifest import (
     NAME,
@@ -20,17 +20,19 @@ from simtest.dataset.manifest import (
     new_manifest,
     read_manifest,
 )
-from simtest.dataset.metadata import SampleMeta
+from simtest.dataset.metadata import SampleMeta, has_relief
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample, decode, sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.dataset.shard_writer import PART, remake
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.engines import Engine
 from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.relief import Relief
 from simtest.validation.runner import Progress
 
 MAX_DEPTH_NORMAL_DEG = 5.0
@@ -39,7 +41,11 @@ MAX_DEPTH_NORMAL_DEG = 5.0
 MAX_DEPTH_ERROR = 0.05
 """The nearest pixel's depth differs from a highlight's distance by less than this share, unless units differ."""
 
-REQUIRED = tuple(field.name for field in FIELDS if field.name != "radiance")
+MAX_SLOPES = 4.0
+"""The median angle between fine normals and those of the base is 1.2 slopes of the relief, and far below this many."""
+
+REQUIRED = tuple(field.name for field in FIELDS if field.name not in ("radiance", *BASE_FIELDS))
+"""Images of every sample; with a relief also those of the base."""
 
 
 @dataclass(frozen=True)
@@ -175,10 +181,12 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
         sample = decode(members, meta)
         camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
         highlights = meta["highlights"]
+        relief = _relief(meta)
     except (ValueError, KeyError, TypeError) as error:
         yield f"cannot be decoded ({error})"
         return
-    if lacking := [name for name in REQUIRED if name not in sample.images]:
+    required = REQUIRED if relief is None else (*REQUIRED, *BASE_FIELDS)
+    if lacking := [name for name in required if name not in sample.images]:
         yield f"has no {', '.join(lacking)}"
         return
     # sizes
@@ -188,7 +196,7 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
             yield f"{name} is {array.shape[:2]}; must be {size}"
             return
     # depth, normals and curvatures
-    yield from _surface(sample, camera)
+    yield from _surface(sample, camera, relief)
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]
     if instance.max() > len(highlights):
@@ -203,8 +211,16 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
             yield f"highlight {number}: depth is {seen:g} mm and its distance {highlight['distance_mm']:g} mm"
 
 
-def _surface(sample: Sample, camera: Camera) -> Iterator[str]:
-    depth, normal, curvature = (sample.images[name] for name in ("depth", "normal", "curvature"))
+def _relief(meta: SampleMeta) -> Relief | None:
+    """Return the relief of a sample's surface; None where it is smooth."""
+    surface = meta["scene"]["surface"]
+    return Relief.model_validate(surface["relief"]) if has_relief(meta) and isinstance(surface, dict) else None
+
+
+def _surface(sample: Sample, camera: Camera, relief: Relief | None) -> Iterator[str]:
+    # Depth is that of the base.
+    base = "" if relief is None else "_base"
+    depth, normal, curvature = (sample.images[name] for name in ("depth", f"normal{base}", f"curvature{base}"))
     there = np.isfinite(depth)
     if not there.any():
         yield "shows no surface"
@@ -225,6 +241,21 @@ def _surface(sample: Sample, camera: Camera) -> Iterator[str]:
     angle = _angle_to_depth(depth[..., None] * rays, normal)
     if angle > MAX_DEPTH_NORMAL_DEG:
         yield f"normals are {angle:.1f} deg from those of the depth map (median); at most {MAX_DEPTH_NORMAL_DEG:g}"
+    if relief is not None:
+        yield from _fine(sample, relief)
+
+
+def _fine(sample: Sample, relief: Relief) -> Iterator[str]:
+    """Check the fine surface against the base."""
+    base, normal, curvature = (sample.images[name] for name in ("normal_base", "normal", "curvature"))
+    if (np.isfinite(base[..., 0]) != np.isfinite(normal[..., 0])).any():
+        yield "normals of the fine surface and of the base are not there at the same pixels"
+        return
+    if (curvature[..., 0] > curvature[..., 1]).any():
+        yield "k_min of the fine surface is above k_max"
+    angle, most = float(np.nanmedian(angle_deg(base, normal))), MAX_SLOPES * relief.slope_deg
+    if angle > most:
+        yield f"fine normals are {angle:.1f} deg from those of the base (median); at most {most:.1f} on this relief"
 
 
 def _angle_to_depth(points: AnyArray, normal: AnyArray) -> float:

@@ -24,6 +24,7 @@ from simtest.errors import BackendError
 from simtest.runtime.files import Json, write_json
 
 DEFAULT_VARIANT = "llvm_ad_mono"
+COLOUR_VARIANT = "llvm_ad_rgb"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "SIMTEST_VARIANT"
 PIP_PACKAGE = "karellen-llvm-core"
@@ -69,9 +70,12 @@ class Candidate:
     verdict: str = ""
 
 
-def requested_variant(variant: str | None = None) -> str:
-    """Return the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default."""
-    return variant or os.environ.get(VARIANT_VARIABLE) or DEFAULT_VARIANT
+def requested_variant(variant: str | None = None, coloured: bool = False) -> str:
+    """Return the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default.
+
+    The default of a `coloured` scene has three channels.
+    """
+    return variant or os.environ.get(VARIANT_VARIABLE) or (COLOUR_VARIANT if coloured else DEFAULT_VARIANT)
 
 
 def candidates() -> list[Candidate]:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering import lobes
+from simtest.rendering import light_points, lobes
 from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
+from simtest.runtime.arrays import Array
 from simtest.spec.falloff import CosineProfile, TableProfile
 from simtest.spec.rig import LightSpec
 
@@ -32,31 +33,54 @@ class LightKind:
         Whether the emission is cut off.
     plain : bool
         Whether Mitsuba's own point light is the same light.
+    source : {"point", "disc", "ring", "crescent"}
+        Form of its exit.
     """
 
     profile: str
     entries: int
     spot: bool
     plain: bool
+    source: str = "point"
+
+
+@dataclass(frozen=True)
+class LightPose:
+    """Where a light is in the model frame.
+
+    Parameters
+    ----------
+    position : ndarray, shape (3,)
+        Of its centroid, mm.
+    axis : ndarray, shape (3,)
+        Unit vector.
+    across : ndarray, shape (2, 3)
+        Unit vectors x and y of its source's plane.
+    """
+
+    position: Array
+    axis: Array
+    across: Array
 
 
 def kind_of(light: LightSpec) -> LightKind:
     """Return the kind of a light."""
-    plain = light.is_isotropic and len(set(light.colour)) == 1
+    source = light_points.kind_of(light.source)
+    plain = light.is_isotropic and len(set(light.colour)) == 1 and source == "point"
     match light.profile:
         case TableProfile():
-            return LightKind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain)
+            return LightKind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain, source)
         case CosineProfile():
             uniform = light.profile.power == 0
-            return LightKind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain)
+            return LightKind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain, source)
 
 
-def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
-    """Return the emitter's parameters by name; position, mm, and unit axis, shape (3,), are in the model frame."""
+def parameters(mi: Any, light: LightSpec, pose: LightPose) -> MitsubaDict:
+    """Return the emitter's parameters by name."""
     # Angles in radians.
     values = {
-        "position": mi.Point3f(*position.tolist()),
-        "axis": mi.Vector3f(*axis.tolist()),
+        "position": mi.Point3f(*pose.position.tolist()),
+        "axis": mi.Vector3f(*pose.axis.tolist()),
         "intensity": mi.Spectrum(spectrum(mi, [light.power * c for c in light.colour])),
         "exponent": mi.Float(light.profile.power if isinstance(light.profile, CosineProfile) else 0.0),
         "rim": mi.Float(math.radians((light.spot_deg or 360.0) / 2)),
@@ -65,6 +89,8 @@ def parameters(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDi
     if isinstance(light.profile, TableProfile):
         values["angles"] = mi.Float(np.radians(light.profile.angle_deg).astype(np.float32))
         values["values"] = mi.Float(np.array(light.profile.value, dtype=np.float32))
+    if light.source is not None:
+        values |= light_points.parameters(mi, light.source, pose.position, pose.across)
     return values
 
 
@@ -107,14 +133,16 @@ def emitter_dict(kind: LightKind) -> MitsubaDict:
     """Describe a light of a kind to `mi.load_dict`; `emitter_values` sets its parameters afterwards."""
     if kind.plain:
         return {"type": "point", "intensity": {"type": "uniform", "value": 1.0}}
-    return {"type": PLUGIN, "profile": kind.profile, "entries": kind.entries, "spot": kind.spot}
+    return {
+        "type": PLUGIN, "profile": kind.profile, "entries": kind.entries, "spot": kind.spot, "source": kind.source,
+    }  # fmt: skip
 
 
-def emitter_values(mi: Any, light: LightSpec, position: Any, axis: Any) -> MitsubaDict:
+def emitter_values(mi: Any, light: LightSpec, pose: LightPose) -> MitsubaDict:
     """Return the values for the emitter that `emitter_dict` describes, by parameter path (see `parameters`)."""
     if kind_of(light).plain:
-        return {"position": mi.Point3f(*position.tolist()), "intensity.value": light.power * light.colour[0]}
-    return parameters(mi, light, position, axis)
+        return {"position": mi.Point3f(*pose.position.tolist()), "intensity.value": light.power * light.colour[0]}
+    return parameters(mi, light, pose)
 
 
 @cache
@@ -125,21 +153,26 @@ def register(mi: Any, variant: str) -> str:
 
 
 @cache
-def _make_class(mi: Any, variant: str) -> Any:
+def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
     import drjit as dr
 
     class Light(mi.Emitter):
-        """A point light with an angular profile, a cut-off and a colour."""
+        """A light with an angular profile, a cut-off and a colour: a point, or a source of finite size.
+
+        A source of finite size takes a point of its area by the sample and is a point light there. The mean is that of
+        the area, at any distance; no ray can hit the source by chance.
+        """
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.kind = LightKind(props["profile"], props["entries"], props["spot"], False)
+            self.kind = LightKind(props["profile"], props["entries"], props["spot"], False, props["source"])
             self.parts: MitsubaDict = {
                 "position": mi.Point3f(0), "axis": mi.Vector3f(0, 0, 1), "intensity": mi.Spectrum(1),
                 "exponent": mi.Float(0), "rim": mi.Float(dr.pi), "edge": mi.Float(0),
             }  # fmt: skip
             if self.kind.entries:
                 self.parts |= {name: dr.zeros(mi.Float, self.kind.entries) for name in ("angles", "values")}
+            self.parts |= light_points.blank(mi, self.kind.source)
             self.m_flags = mi.EmitterFlags.DeltaPosition
             self.parameters_changed()
 
@@ -153,13 +186,16 @@ def _make_class(mi: Any, variant: str) -> Any:
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
             # A point light has one direction, of density 1.
             ds = dr.zeros(mi.DirectionSample3f, dr.width(it.p))
-            towards = self.parts["position"] - it.p
+            position, weight = self.parts["position"], mi.Float(1)
+            if self.kind.source != "point":
+                position, weight = light_points.point(mi, self.kind.source, self.parts, sample.x, sample.y)
+            towards = position - it.p
             squared = dr.squared_norm(towards)
-            ds.p, ds.dist = self.parts["position"], dr.sqrt(squared)
+            ds.p, ds.dist = position, dr.sqrt(squared)
             ds.d = towards / ds.dist
             ds.time, ds.pdf, ds.delta = it.time, mi.Float(1), mi.Bool(True)
             ds.emitter = mi.EmitterPtr(self)
-            emitted = self.parts["intensity"] * factor(mi, self.kind, self.parts, -ds.d)
+            emitted = self.parts["intensity"] * (weight * factor(mi, self.kind, self.parts, -ds.d))
             return ds, dr.select(active & (squared > 0), emitted / squared, 0)
 
         def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:

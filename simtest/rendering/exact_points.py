@@ -6,17 +6,24 @@ from typing import Any
 import numpy as np
 
 from simtest.rendering.frames import TruthMaps
+from simtest.rendering.hits import make_hit
+from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
 
-_OF_POINTS = ("position", "normal", "k_min", "k_max", "direction_min", "direction_max")
+_OF_POINTS = (
+    "position", "normal", "k_min", "k_max", "direction_min", "direction_max",
+    "normal_base", "k_min_base", "k_max_base",
+)  # fmt: skip
 """Truth maps that are named as in `SurfacePoints`."""
 
 
-def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
+def trace_hits(
+    mi: Any, scene: Any, shape: Shape, origins: Array, directions: Array, relief: ReliefKernel | None
+) -> tuple[RayHits, Array, Array]:
     """Trace rays, shape (N, 3), model frame, mm, against the rendered shape, the scene's only surface.
 
-    Directions are unit, NaN where there is no ray.
+    Directions are unit, NaN where there is no ray. With a `relief` the shading normals are those of the fine surface.
 
     Returns
     -------
@@ -42,7 +49,7 @@ def trace_hits(mi: Any, scene: Any, shape: Shape, origins: Array, directions: Ar
     preliminary = scene.ray_intersect_preliminary(ray, False, mi.Bool(asked))
     si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(asked))
     valid = si.is_valid()
-    normals = (mi.Vector3f(si.sh_frame.n), mi.Vector3f(si.n))
+    normals = (mi.Vector3f(make_hit(mi, si, relief).fine.sh_frame.n), mi.Vector3f(si.n))
     dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
     # Back to arrays; a miss becomes NaN.
     missed = ~np.array(valid)
@@ -72,9 +79,12 @@ def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
     )
 
 
-def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-    """Compute the exact points, in the camera frame, on rays of the model frame, shape (N, 3)."""
-    exact = surface.points(np.asarray(origins), directions, hits)
+def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits, fine: bool = True) -> SurfacePoints:
+    """Compute the exact points, in the camera frame, on rays of the model frame, shape (N, 3).
+
+    Normals and curvatures are those of the `fine` surface, or else of its base.
+    """
+    exact = (surface.fine_points if fine else surface.points)(np.asarray(origins), directions, hits)
     rotation = surface.model_from_camera[:3, :3]
     return replace(
         exact,
@@ -82,6 +92,7 @@ def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHit
         normal=exact.normal @ rotation,
         direction_min=exact.direction_min @ rotation,
         direction_max=exact.direction_max @ rotation,
+        normal_base=exact.normal_base @ rotation,
     )
 
 
@@ -90,7 +101,7 @@ def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tu
     maps = {"depth": points.distance, "shading_normal": shading, "geometric_normal": geometric}
     maps |= {name: getattr(points, name) for name in _OF_POINTS}
     images = {name: values.reshape(*size, *values.shape[1:]) for name, values in maps.items()}
-    return TruthMaps(**images, mask=points.valid.reshape(size))
+    return TruthMaps(**images, pool=points.pool.reshape(size), mask=points.valid.reshape(size))
 
 
 def _columns(values: Array) -> Any:

@@ -53,9 +53,17 @@ class Labels:
     position : ndarray of float32, shape (H, W, 3)
         mm.
     normal, geometric_normal : ndarray of float32, shape (H, W, 3)
-        Unit normals: that of the shading, as it is, and that of the triangle, facing the camera.
+        Unit normals: that of the shading off the lobe, as it is (on a relief the fine one), and that of the triangle,
+        facing the camera.
     k_min, k_max : ndarray of float32, shape (H, W)
-        Principal curvatures, 1/mm, convex towards the camera positive; NaN also where a mesh's could not be fitted.
+        Principal curvatures of the fine surface, 1/mm, convex towards the camera positive; NaN also where a mesh's
+        could not be fitted.
+    normal_base : ndarray of float32, shape (H, W, 3)
+        Unit normal of the base, without the relief; `normal` itself on a smooth surface.
+    k_min_base, k_max_base : ndarray of float32, shape (H, W)
+        Principal curvatures of the base, 1/mm; `k_min` and `k_max` themselves on a smooth surface.
+    pool : ndarray of bool, shape (H, W)
+        Where the liquid film fills a valley.
     instance : ndarray of int32, shape (H, W)
         Number of the surface, from 0; -1 where there is none.
     face : ndarray of int32, shape (H, W)
@@ -68,6 +76,10 @@ class Labels:
     geometric_normal: Image
     k_min: Image
     k_max: Image
+    normal_base: Image
+    k_min_base: Image
+    k_max_base: Image
+    pool: Mask
     instance: npt.NDArray[np.int32]
     face: npt.NDArray[np.int32]
 
@@ -102,13 +114,20 @@ class TruthMaps:
     depth : ndarray, shape (H, W)
         Distance along the ray, mm.
     position, normal : ndarray, shape (H, W, 3)
-        Point, mm, and unit normal of the smooth surface facing the camera.
+        Point of the smooth surface, mm, and unit normal of the fine surface; without a relief it faces the camera.
     shading_normal, geometric_normal : ndarray, shape (H, W, 3)
-        Normals that the renderer used: interpolated, and of the triangle.
+        Normals that the renderer used: interpolated, for light off the lobe (on a relief the fine one; the base below
+        the lobe is shaded by that of the smoothed relief), and of the triangle.
     k_min, k_max : ndarray, shape (H, W)
         Principal curvatures, 1/mm, convex towards the camera positive.
     direction_min, direction_max : ndarray, shape (H, W, 3)
         Unit principal directions.
+    normal_base : ndarray, shape (H, W, 3)
+        Unit normal of the base, without the relief, facing the camera; `normal` where there is no relief.
+    k_min_base, k_max_base : ndarray, shape (H, W)
+        Principal curvatures of the base, 1/mm.
+    pool : ndarray of bool, shape (H, W)
+        Where the liquid film fills a valley.
     mask : ndarray of bool, shape (H, W)
         Where there is a surface.
     """
@@ -122,12 +141,38 @@ class TruthMaps:
     k_max: Array
     direction_min: Array
     direction_max: Array
+    normal_base: Array
+    k_min_base: Array
+    k_max_base: Array
+    pool: Mask
     mask: Mask
 
     @property
     def larger_curvature(self) -> Array:
         """Principal curvature of larger size, 1/mm, shape (H, W)."""
         return np.where(np.abs(self.k_max) >= np.abs(self.k_min), self.k_max, self.k_min)
+
+
+@dataclass(frozen=True)
+class MisfitMaps:
+    """Normal minus bisector across the sightline (`highlights.misfit`) of the rendered shape, a map for each light.
+
+    The maps reach beyond the frame, so that a zero next to its border lies between pixels too.
+
+    Parameters
+    ----------
+    distance : ndarray of float32, shape (h, w)
+        Distance along the ray, mm; NaN where there is no surface.
+    fine, base : ndarray of float32, shape (L, 2, h, w)
+        Of the fine normal and of the base's; one array where there is no relief.
+    margin : int
+        Cells beyond the frame on each side.
+    """
+
+    distance: Image
+    fine: Image
+    base: Image
+    margin: int
 
 
 @dataclass(frozen=True)
@@ -141,15 +186,22 @@ class HighlightPoint:
     bp_px : ndarray, shape (2,)
         Sub-pixel position in the image.
     position, normal, direction_min : ndarray, shape (3,)
-        Camera frame: point, mm, unit normal, and unit principal direction of the smaller curvature.
+        Camera frame: point, mm, unit normal, and unit principal direction of the smaller curvature; of the fine
+        surface.
     distance : float
         d, mm.
     kd_min, kd_max : float
-        Distance times principal curvatures.
+        Distance times principal curvatures of the fine surface.
     lit : bool
         Whether the light reaches the point.
     radiance : float
         Radiance at the nearest pixel.
+    normal_base : ndarray, shape (3,)
+        Unit normal of the base, without the relief, at the same point; `normal` on a smooth surface.
+    kd_min_base, kd_max_base : float
+        Distance times the base's principal curvatures.
+    pool : bool
+        Whether the point lies in a pool of the liquid film.
     """
 
     light: int
@@ -162,6 +214,10 @@ class HighlightPoint:
     kd_max: float
     lit: bool
     radiance: float
+    normal_base: Array
+    kd_min_base: float
+    kd_max_base: float
+    pool: bool
 
     @property
     def min_gain(self) -> float:

@@ -93,7 +93,12 @@ def find(session: Caster, radiance: Radiance, stride: int) -> list[HighlightPoin
         # Reject what left the frame and what was found twice.
         solutions = _distinct(solutions[camera.contains(solutions)])
         if len(solutions):
-            found += _describe(session, radiance, solutions, index)
+            found += describe(session, radiance, solutions, index)
+    return brightest_first(found)
+
+
+def brightest_first(found: list[HighlightPoint]) -> list[HighlightPoint]:
+    """Sort highlight points by the radiance of their pixels."""
     return sorted(found, key=lambda highlight: -highlight.radiance)
 
 
@@ -208,7 +213,8 @@ def _distinct(points: Array) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[HighlightPoint]:
+def describe(session: Caster, radiance: Radiance, solutions: Array, light: int) -> list[HighlightPoint]:
+    """Describe the highlight points of a light at their pixels, shape (N, 2), with the frame's radiance."""
     points, _, _ = session.cast(solutions)
     lit = session.lit(points.position, light)
     # Radiance at the pixel that holds the point.
@@ -225,6 +231,10 @@ def _describe(session: Caster, radiance: Radiance, solutions: Array, light: int)
             distance=float(points.distance[i]),
             kd_min=float(points.distance[i] * points.k_min[i]),
             kd_max=float(points.distance[i] * points.k_max[i]),
+            normal_base=points.normal_base[i],
+            kd_min_base=float(points.distance[i] * points.k_min_base[i]),
+            kd_max_base=float(points.distance[i] * points.k_max_base[i]),
+            pool=bool(points.pool[i]),
             lit=bool(lit[i]),
             radiance=float(total[rows[i], columns[i]]),
         )

@@ -11,14 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from simtest.conventions import PIXEL_CENTRE
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import Radiance
+from simtest.rendering.frames import MisfitMaps, Radiance
 from simtest.rendering.hit_refinement import Refinement
+from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
+from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
+from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import ShapeLabels
-from simtest.runtime.arrays import Image
+from simtest.runtime.arrays import Array, Image
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
@@ -29,10 +33,20 @@ LANES = 2**22
 RAYS = 2**24
 """Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between launches."""
 
+MARGIN_PX = 2
+"""How far maps of the misfit reach beyond the frame."""
+
+PAINT_EVERY, SAME_PATCH = 3, 0.02
+"""Samples that share an albedo, and how far apart they may lie, as a share of the distance. Every fourth sample of the
+sequence would stand in one column of the pixel."""
+
 SUMMED = 64
 """Samples of a pixel that are summed in single precision; these sums are added in double precision."""
 
 Sums = npt.NDArray[np.float64]
+
+Painted = tuple[Any, Any]
+"""An albedo, mitsuba.Spectrum, and the point, mitsuba.Point3f, where it was computed."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,8 @@ class Tracer:
         The surface's.
     refinement : Refinement
         Solves the hits again in double precision.
+    relief : ReliefKernel or None
+        The surface's relief.
     """
 
     mi: Any
@@ -61,22 +77,29 @@ class Tracer:
     light: DirectLight
     material: Material
     refinement: Refinement
+    relief: ReliefKernel | None
 
-    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Any]:
+    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
         flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
         si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
         self.refinement.apply(rays.origin, rays.direction, si)
-        return rays, preliminary, si
+        return rays, preliminary, make_hit(self.mi, si, self.relief, bent)
 
-    def _parts(self, si: Any, bounces: Bounces | None, count: int, block: int, sample: int) -> list[Any]:
-        """Compute the channels of direct light off the lobe and off the base and, if asked for, of further bounces."""
-        specular, diffuse = self.light.radiance(self.scene, self.material, si)
-        parts = [*specular, *diffuse]
+    def _direct(self, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
+        """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`."""
+        specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw, albedo)
+        return [*specular, *diffuse]
+
+    def _parts(
+        self, hit: Hit, draw: Draw | None, bounces: Bounces | None, count: int, block: int, sample: int
+    ) -> list[Any]:
+        """Compute the channels of direct light and, if asked for, of further bounces."""
+        parts = self._direct(hit, draw)
         if bounces is not None:
-            parts += [*bounces.radiance(si, count, block, sample)]
+            parts += [*bounces.radiance(hit.fine, count, block, sample)]
         return parts
 
     # One sample --------------------------------------------------------------------------------------------------
@@ -97,12 +120,14 @@ class Tracer:
         count_of_parts = 0
         for block, (first, count) in enumerate(_blocks(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
-            rays, preliminary, si = self._hit(*self.sightlines.centre(lanes), labels is not None)
+            rays, preliminary, hit = self._hit(*self.sightlines.centre(lanes), labels is not None)
             # Radiance and labels of one launch go into one kernel.
-            parts = self._parts(si, bounces, count, block, 0) if radiance else []
+            drawer = self.light.drawer(None)
+            draw = None if drawer is None else drawer.at(0)
+            parts = self._parts(hit, draw, bounces, count, block, 0) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
-                parts = parts + labels.trace(preliminary, si, rays, self.sightlines.camera_from_model)
+                parts = parts + labels.trace(preliminary, hit, rays, self.sightlines.camera_from_model, self.relief)
             rows.append(_evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
@@ -111,6 +136,36 @@ class Tracer:
         maps = [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
                 for pieces in zip(*rows, strict=True)]  # fmt: skip
         return maps[:count_of_parts], maps[count_of_parts:]
+
+    def misfits(self, lights: Array, division: int, base: bool) -> MisfitMaps:
+        """Trace the misfits for lights, shape (L, 3), camera frame, mm, at the centres of pixels divided both ways.
+
+        Without `base` only those of the fine normal.
+        """
+        import drjit as dr
+
+        mi, camera = self.mi, self.sightlines.camera
+        margin = MARGIN_PX * division
+        height, width = camera.height * division + 2 * margin, camera.width * division + 2 * margin
+        sources = [mi.Vector3f(*light.tolist()) for light in lights]
+        dr.make_opaque(sources)
+        rows: list[list[Image]] = []
+        for first, count in _blocks(height * width):
+            start, across = mi.UInt32(first), mi.UInt32(width)
+            dr.make_opaque(start, across)
+            index = dr.arange(mi.UInt32, count) + start
+            row = index // across
+            x, y = ((mi.Float(i) + PIXEL_CENTRE) / division - MARGIN_PX for i in (index - row * across, row))
+            rays, _, hit = self._hit(x, y)
+            values = [hit.base.t]
+            for si in (hit.fine, hit.base) if base and self.relief is not None else (hit.fine,):
+                normal = self.sightlines.camera_from_model @ mi.Vector3f(si.sh_frame.n)
+                values += [part for light in sources for part in _misfit(mi, rays.sightline, hit.base.t, normal, light)]
+            rows.append(_evaluate([dr.select(hit.base.is_valid(), value, dr.nan) for value in values], count))
+        channels = [np.concatenate(pieces).reshape(height, width) for pieces in zip(*rows, strict=True)]
+        shape = (-1, len(lights), 2, height, width)
+        both = np.stack(channels[1:]).reshape(shape)
+        return MisfitMaps(channels[0], both[0], both[-1], margin)
 
     # Several samples ---------------------------------------------------------------------------------------------
 
@@ -125,12 +180,13 @@ class Tracer:
         # Trace: sums over the samples of each block of pixels.
         for block, (first, count) in enumerate(_blocks(height * width)):
             lanes = self.sightlines.lanes(first, count, True, seed)
+            drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
             for start, stop in self._runs(samples, count, bounces):
                 if bounces is None and self.sightlines.in_kernel:
-                    parts = self._looped(lanes, start, stop)
+                    parts = self._looped(lanes, drawer, start, stop)
                 else:
-                    parts = self._single(lanes, start, bounces, count, block)
+                    parts = self._single(lanes, drawer, start, bounces, count, block)
                 added = np.stack(_evaluate(parts, count)).astype(np.float64)
                 sums = added if sums is None else sums + added
                 if progress:
@@ -149,7 +205,7 @@ class Tracer:
         for start in range(0, samples, step):
             yield start, min(start + step, samples)
 
-    def _looped(self, lanes: Lanes, start: int, stop: int) -> list[Any]:
+    def _looped(self, lanes: Lanes, drawer: Drawer | None, start: int, stop: int) -> list[Any]:
         """Sum direct light over samples by a loop inside the kernel."""
         import drjit as dr
 
@@ -157,22 +213,68 @@ class Tracer:
         number, end = mi.UInt32(start), mi.UInt32(stop)
         dr.make_opaque(number, end)
 
-        def step(number: Any, *sums: Any) -> tuple[Any, ...]:
-            _, _, si = self._hit(*self.sightlines.sample(lanes, number))
-            parts = self._parts(si, None, 0, 0, 0)
-            return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
+        def light(hit: Hit, number: Any, albedo: Any, sums: Any) -> list[Any]:
+            parts = self._direct(hit, None if drawer is None else drawer.at(number), albedo)
+            return [total + part for total, part in zip(sums, parts, strict=True)]
 
-        _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
+        def step(number: Any, *sums: Any) -> tuple[Any, ...]:
+            _, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            return number + 1, *light(hit, number, None, sums)
+
+        def painted_step(number: Any, held: Painted, *sums: Any) -> tuple[Any, ...]:
+            _, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            held = self._paint(hit, number, held)
+            return number + 1, held, *light(hit, number, held[0], sums)
+
+        if self.material.albedo is None:
+            _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
+            return sums
+        held = mi.Spectrum(-1), mi.Point3f(0)
+        _, _, *sums = dr.while_loop((number, held, *zeros), lambda number, *_: number < end, painted_step)
         return sums
 
-    def _single(self, lanes: Lanes, number: int, bounces: Bounces | None, count: int, block: int) -> list[Any]:
+    def _paint(self, hit: Hit, number: Any, held: Painted) -> Painted:
+        """Return the albedo of tissue for a sample: every `PAINT_EVERY`-th one's, which the samples after it share.
+
+        The samples of a pixel lie in one patch of tissue, and its shading hardly varies. One that lies elsewhere, as at
+        the edge of a fold, takes the albedo of its own point.
+        """
+        import drjit as dr
+
+        mi, position, seen = self.mi, hit.base.p, hit.base.is_valid()
+        near = dr.squared_norm(position - held[1]) < dr.square(SAME_PATCH * hit.base.t)
+        old = number % PAINT_EVERY != 0
+        fresh = seen & ~(old & near & (held[0][0] >= 0))
+
+        kernel = self.material.albedo
+        assert kernel is not None
+
+        def paint(albedo: Any, at: Any) -> Painted:
+            return kernel.at(position, fresh), position
+
+        return dr.if_stmt((mi.Spectrum(held[0]), mi.Point3f(held[1])), fresh, paint, lambda albedo, at: (albedo, at))
+
+    def _single(
+        self, lanes: Lanes, drawer: Drawer | None, number: int, bounces: Bounces | None, count: int, block: int
+    ) -> list[Any]:
         """Trace the sample of one number of each pixel."""
         import drjit as dr
 
         which = self.mi.UInt32(number)
         dr.make_opaque(which)
-        _, _, si = self._hit(*self.sightlines.sample(lanes, which))
-        return self._parts(si, bounces, count, block, number)
+        _, _, hit = self._hit(*self.sightlines.sample(lanes, which))
+        draw = None if drawer is None else drawer.at(which)
+        return self._parts(hit, draw, bounces, count, block, number)
+
+
+def _misfit(mi: Any, sightline: Any, distance: Any, normal: Any, light: Any) -> tuple[Any, Any]:
+    """Compute normal minus bisector across sightlines, camera frame, as `highlights.misfit` does."""
+    import drjit as dr
+
+    bisector = dr.normalize(dr.normalize(light - sightline * distance) - sightline)
+    first, second = mi.coordinate_system(-sightline)
+    gap = normal - bisector
+    return dr.dot(first, gap), dr.dot(second, gap)
 
 
 def _blocks(pixels: int) -> Iterator[tuple[int, int]]:

@@ -2,21 +2,26 @@
 
 from typing import Any
 
+from simtest.rendering import tissue
 from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
 from simtest.spec.reflectance import (
     PhongReflectance,
     PrincipledReflectance,
     RoughConductorReflectance,
     RoughPlasticReflectance,
+    TissueReflectance,
 )
 
-AnyReflectance = PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance
+AnyReflectance = (
+    PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance | TissueReflectance
+)
 
 
 def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> MitsubaDict:
     """Describe a reflectance to `mi.load_dict`; `phong_plugin` is the registered name of the Phong plugin.
 
-    With `diffuse_only` the specular part is left out: the difference between both radiances is the specular one.
+    With `diffuse_only` the specular part is left out: the difference between both radiances is the specular one. Not
+    for tissue, whose parts are evaluated one by one.
     """
     specular = 0.0 if diffuse_only else 1.0
     base = {"type": "rgb", "value": [reflectance.diffuse * c for c in reflectance.colour]}
@@ -58,11 +63,27 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
                 },
                 "matt": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(reflectance.colour)}},
             }
+        case TissueReflectance():
+            assert not diffuse_only
+            return {
+                "type": tissue.PLUGIN,
+                "alpha": reflectance.film.alpha,
+                "index": reflectance.film.index,
+                "distribution": reflectance.film.distribution,
+                "diffuse_reflectance": base,
+            }
 
 
 def parts_alone(reflectance: AnyReflectance) -> bool:
     """Return whether components 0 and 1 of the BSDF are the lobe and the base."""
-    return isinstance(reflectance, PhongReflectance)
+    return isinstance(reflectance, PhongReflectance | TissueReflectance)
+
+
+def compiled_form(reflectance: AnyReflectance) -> tuple[object, ...]:
+    """Return what of a reflectance is compiled into the kernels."""
+    if isinstance(reflectance, TissueReflectance):
+        return type(reflectance), reflectance.film.distribution
+    return type(reflectance), getattr(reflectance, "normalised", None)
 
 
 def parameter_updates(mi: Any, reflectance: AnyReflectance) -> MitsubaDict:
@@ -82,3 +103,6 @@ def parameter_updates(mi: Any, reflectance: AnyReflectance) -> MitsubaDict:
         case RoughConductorReflectance():
             matt = {"bsdf_1.reflectance.value": spectrum(mi, list(reflectance.colour))}
             return {"weight.value": reflectance.diffuse, "bsdf_0.alpha.value": reflectance.alpha, **matt}
+        case TissueReflectance():
+            film = {"alpha": reflectance.film.alpha, "index": reflectance.film.index}
+            return {**film, "diffuse_reflectance.value": base}

@@ -12,7 +12,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.rendering import backend, phong
+from simtest.rendering import backend, phong, tissue
 from simtest.rendering.materials import bsdf_dict
 from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.shapes import make_shape
@@ -20,7 +20,10 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec import Scene
-from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.falloff import CosineProfile
+from simtest.spec.light_source import DiscSource
+from simtest.spec.reflectance import PhongReflectance, TissueReflectance
+from simtest.spec.rig import LightSpec
 from simtest.spec.spec_model import Spec
 from simtest.surfaces import Shape, SurfaceModel, make_surface
 
@@ -38,12 +41,16 @@ CLIP = (1e-4, 1e4)
 VIEW_MARGIN = 1.05
 """Half-size of an exported plane over the farthest point that is seen of it."""
 
+MAX_DISC_DEPTH_MM = 1e-6
+"""How far in front of the camera's plane a disc may lie: rounding, and nothing else."""
+
 _CAMERA_KEYS = frozenset({"width", "height", "fx", "fy", "cx", "cy", "skew"})
 # A preset's lights stand in `lights`; the seed draws the positions that are rendered.
 _RIG_KEYS = frozenset(
     {"lights", "preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each", "seed", "emission_known"}
 )
 _LIGHT_KEYS = frozenset({"position_mm", "offset_mm", "azimuth_deg", "power", "direction", "position_error_mm"})
+_DISC_KEYS = _LIGHT_KEYS | {"source", "profile"}
 
 
 def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Path]:
@@ -64,6 +71,7 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
         raise InputError(f"scene {scene.name}: {key} = {value!r}: cannot be exported; {why}")
     mi = backend.load(variant)
     plugin = phong.register(mi, str(mi.variant()))
+    tissue.register(mi, str(mi.variant()))
     surface = make_surface(scene.surface)
     shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
     text = _xml(mi, scene, surface, shape, plugin)
@@ -82,16 +90,48 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
 
 
 def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
-    """Yield key, value and reason of everything that Mitsuba's perspective camera and point lights cannot express."""
+    """Yield key, value and reason of everything that Mitsuba's camera and lights cannot express."""
     camera = scene.camera
     if camera.fx != camera.fy:
         yield "camera.fx", camera.fx, f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
     if camera.skew != 0:
         yield "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"
+    relief = scene.surface.relief
+    if relief is not None:
+        yield (
+            "surface.relief",
+            relief.model_dump(exclude_defaults=True),
+            "Mitsuba does not know simtest's relief: must be left out",
+        )
+    if scene.translucency is not None:
+        yield "reflectance.translucency", "a table", "it acts on simtest's picture: must be left out"
+    if scene.albedo is not None:
+        yield "reflectance.albedo", scene.albedo.preset, "Mitsuba has no such pattern: must be left out"
     yield from _beyond(camera, _CAMERA_KEYS, "camera", "Mitsuba's perspective camera")
     yield from _beyond(scene.rig, _RIG_KEYS, "rig", "Mitsuba's point light")
     for i, light in enumerate(scene.rig.lights):
-        yield from _beyond(light, _LIGHT_KEYS, f"rig.lights.{i}", "Mitsuba's point light")
+        path = f"rig.lights.{i}"
+        if light.source is None:
+            yield from _beyond(light, _LIGHT_KEYS, path, "Mitsuba's point light")
+        else:
+            yield from _beyond(light, _DISC_KEYS, path, "Mitsuba's area light")
+            yield from _beyond_disc(scene, i, path)
+
+
+def _beyond_disc(scene: Scene, index: int, path: str) -> Iterator[tuple[str, Any, str]]:
+    """Yield what a source of finite size has beyond Mitsuba's disc, which is Lambertian, a body, and in sight."""
+    light, profile = scene.rig.lights[index], scene.rig.lights[index].profile
+    if not isinstance(light.source, DiscSource):
+        yield f"{path}.source.type", light.source and light.source.type, 'Mitsuba\'s area lights here are discs: "disc"'
+        return
+    if not isinstance(profile, CosineProfile) or profile.power != 1:
+        shown = profile.power if isinstance(profile, CosineProfile) else profile.type
+        yield f"{path}.profile", shown, 'Mitsuba\'s area light is Lambertian: must be { type = "cosine", power = 1.0 }'
+    # A disc behind the camera's centre cannot be seen; one in front might, and might hide the tissue.
+    depth = (light.source.rim() @ light.across + scene.rig.true_mm()[index])[:, 2].max()
+    if depth > MAX_DISC_DEPTH_MM:
+        why = "Mitsuba's disc is a body that the camera could see: must nowhere lie in front of the camera (z > 0)"
+        yield f"{path}.source", f"disc up to z = {depth:.3g} mm", why
 
 
 def _beyond(spec: Spec, known: frozenset[str], path: str, what: str) -> Iterator[tuple[str, Any, str]]:
@@ -155,9 +195,10 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
 
 
 def _through_centres(scene: Scene) -> bool:
-    """Return whether one ray through each pixel's centre renders the picture: with one light that does not bounce."""
+    """Return whether one ray through each pixel's centre renders the picture: one point light that does not bounce."""
     effort = scene.render
-    return effort.samples_per_pixel == 1 and effort.path_depth == 2 and len(scene.rig.lights) == 1
+    points = len(scene.rig.lights) == 1 and scene.rig.lights[0].source is None
+    return effort.samples_per_pixel == 1 and effort.path_depth == 2 and points
 
 
 def _sampler(scene: Scene) -> MitsubaDict:
@@ -170,14 +211,32 @@ def _sampler(scene: Scene) -> MitsubaDict:
 
 def _lights(scene: Scene, surface: SurfaceModel) -> MitsubaDict:
     pose = surface.model_from_camera
+    places = zip(scene.rig.lights, scene.rig.true_mm(), strict=True)
     return {
-        f"light_{i}": {
-            "type": "point",
-            "position": (pose[:3, :3] @ position + pose[:3, 3]).tolist(),
-            "intensity": {"type": "uniform", "value": light.power},
-        }
-        for i, (light, position) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
+        f"light_{i}": _light(light, pose[:3, :3] @ position + pose[:3, 3]) for i, (light, position) in enumerate(places)
     }
+
+
+def _light(light: LightSpec, position: Array) -> MitsubaDict:
+    """Describe a point light, or a disc; `_xml` writes the place of the latter."""
+    if light.source is None:
+        intensity = {"type": "uniform", "value": light.power}
+        return {"type": "point", "position": position.tolist(), "intensity": intensity}
+    # Of a Lambertian disc the radiance is the intensity along the axis over the area. It reflects nothing.
+    radiance = {"type": "uniform", "value": light.power / light.source.area_mm2}
+    return {
+        "type": "disk",
+        "emitter": {"type": "area", "radiance": radiance},
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+    }
+
+
+def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> Array:
+    """Return the matrix, shape (4, 4), from Mitsuba's unit disc to a light's disc in the model frame."""
+    assert light.source is not None
+    local = np.eye(4)
+    local[:3, :2], local[:3, 2], local[:3, 3] = light.source.radius_mm * light.across.T, light.axis, position_mm
+    return np.asarray(surface.model_from_camera @ local)
 
 
 def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
@@ -194,7 +253,7 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
     # Let Mitsuba write its XML.
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
     for node in state.nodes:
-        if node.props.plugin_name() == plugin:
+        if node.props.plugin_name() in (plugin, tissue.PLUGIN):
             # Mitsuba does not know the kind of a plugin written in Python.
             node.type = mi.ObjectType.BSDF
     written = mi.parser.write_string(state, add_section_headers=True)
@@ -203,15 +262,18 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
     _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
     # A mesh is stored in the model frame already.
     if not shape.mesh:
-        _set_transform(root, "shape", shape.parameters["to_model"])
+        _set_transform(root, "surface", shape.parameters["to_model"])
+    for i, (light, position) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True)):
+        if light.source is not None:
+            _set_transform(root, f"light_{i}", _disc_pose(light, position, surface))
     root.insert(0, ET.Comment(_head(scene)))
     ET.indent(root, " " * 4)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _set_transform(root: ET.Element, tag: str, world_from_local: Array) -> None:
+def _set_transform(root: ET.Element, name: str, world_from_local: Array) -> None:
     """Write an object's transform as a matrix: Mitsuba's writer decomposes it, wrongly where it is anisotropic."""
-    element = root.find(tag)
+    element = root.find(f"*[@name='{name}']")
     assert element is not None
     for written in element.findall("transform"):
         element.remove(written)
@@ -226,13 +288,16 @@ def _head(scene: Scene) -> str:
         f'Scene "{scene.name}", written by simtest {provenance.version()}. World: model frame of the surface, mm.',
         "Without the sensor: no noise, no exposure, linear radiance.",
     ]
-    if isinstance(scene.reflectance, PhongReflectance):
+    if isinstance(scene.reflectance, PhongReflectance | TissueReflectance):
+        name = phong.PLUGIN if isinstance(scene.reflectance, PhongReflectance) else tissue.PLUGIN
         lines += [
-            f'The reflectance "{phong.PLUGIN}" is a plugin of simtest. After mitsuba.set_variant and before loading:',
+            f'The reflectance "{name}" is a plugin of simtest. After mitsuba.set_variant and before loading:',
             "    from simtest.rendering.plugins import register; register()",
         ]
     if _through_centres(scene):
         lines.append("One ray through each pixel's centre: a sampler of one stratum without jitter.")
     elif scene.render.samples_per_pixel == 1:
         lines.append(f"simtest sends one ray through each pixel's centre; here {SAMPLES} spread over the pixel.")
+    if any(light.source for light in scene.rig.lights):
+        lines.append("Discs are bodies here, which block light and reflect none.")
     return "\n" + "\n".join(f"        {re.sub('-(?=-)', '- ', line)}" for line in lines) + "\n    "

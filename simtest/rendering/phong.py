@@ -37,6 +37,8 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             self.specular = mi.Float(props.get("specular", 1.0))
             self.normalised = bool(props.get("normalised", False))
             self.base = props.get_texture("diffuse_reflectance", 0.0)
+            # Called with surface points and a mask in place of the texture, where it is set.
+            self.albedo_at: Any = None
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components = [glossy, diffuse]
@@ -51,6 +53,9 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
         def parameters_changed(self, keys: Any = ()) -> None:
             # Literal parameters would be baked into the kernel, and each change would recompile it.
             dr.make_opaque(self.exponent, self.specular)
+
+        def _albedo(self, si: Any, active: Any) -> Any:
+            return self.base.eval(si, active) if self.albedo_at is None else self.albedo_at(si, active)
 
         def _enabled(self, ctx: Any) -> tuple[bool, bool]:
             """Return whether the lobe and the base are asked for."""
@@ -75,7 +80,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
                 n = dr.detach(self.exponent)
                 density += dr.select(ahead, share * (n + 1) * dr.inv_two_pi * dr.exp(n * log_cosine), 0)
             if diffuse:
-                value += self.base.eval(si, active) * dr.inv_pi * cos_o
+                value += self._albedo(si, active) * dr.inv_pi * cos_o
                 density += (1 - share) * dr.inv_pi * cos_o
             return dr.select(active, value, 0), dr.select(active, density, 0)
 
@@ -88,7 +93,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             if not (glossy and diffuse):
                 return mi.Float(float(glossy))
             lobe = self.specular if self.normalised else self.specular * dr.two_pi / (self.exponent + 1)
-            base = dr.mean(self.base.eval(si, active))
+            base = dr.mean(self._albedo(si, active))
             whole = lobe + base
             return dr.detach(dr.select(whole > 0, lobe / dr.select(whole > 0, whole, 1), 0.5))
 
@@ -122,7 +127,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             return self._values(ctx, si, wo, mi.Bool(active))
 
         def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
-            return self.base.eval(si, active)
+            return self._albedo(si, active)
 
         def to_string(self) -> str:
             return f"Phong[exponent={self.exponent}, specular={self.specular}, normalised={self.normalised}]"

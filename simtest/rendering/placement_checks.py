@@ -8,6 +8,9 @@ from simtest.spec.rig import Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
 
+RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
+"""Scales of a source's rim at which its clearance is asked for."""
+
 
 def check_camera(scene: Scene, surface: SurfaceModel) -> None:
     """Raise `InputError` where the camera lies in the wall."""
@@ -20,10 +23,15 @@ def check_camera(scene: Scene, surface: SurfaceModel) -> None:
 
 
 def check_lights(scene: Scene, surface: SurfaceModel) -> None:
-    """Raise `InputError` where a light lies inside a body; beyond the wall of a shell it is merely unseen."""
+    """Raise `InputError` where a light lies inside a body, or a source of finite size touches tissue.
+
+    Beyond the wall of a shell a point is merely unseen. A source of finite size is a body itself: its rim must be in
+    free space there too.
+    """
+    positions = scene.rig.true_mm()
+    _check_rims(scene, surface, positions)
     if not surface.solid:
         return
-    positions = scene.rig.true_mm()
     clearances = _clearances(surface, positions)
     for i in np.flatnonzero(~(clearances > 0)):
         position = ", ".join(f"{value:.4g}" for value in positions[i])
@@ -31,6 +39,25 @@ def check_lights(scene: Scene, surface: SurfaceModel) -> None:
             f"scene {scene.name}: rig.lights.{i} at ({position}) mm: lies {-clearances[i]:.3g} mm inside the "
             f"{scene.surface.label}; a light must be in free space{_advice(scene.rig, surface, int(i))}"
         )
+
+
+def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
+    """Raise `InputError` where the rim of a source, or what it encloses, touches tissue."""
+    for i, light in enumerate(scene.rig.lights):
+        if light.source is None:
+            continue
+        # The rim about the centroid, and smaller copies of it: a fold may rise through a disc.
+        rim = light.source.rim() - light.source.centroid_mm
+        points = np.concatenate([share * rim for share in RIM_COPIES]) @ light.across + positions[i]
+        clearances = _clearances(surface, points)
+        worst = int(np.argmin(clearances))
+        if not clearances[worst] > 0:
+            position = ", ".join(f"{value:.4g}" for value in points[worst])
+            raise InputError(
+                f"scene {scene.name}: rig.lights.{i}.source: its {light.source.type} of radius_mm = "
+                f"{light.source.radius_mm:g} touches the {scene.surface.label}: at ({position}) mm its clearance is "
+                f"{clearances[worst]:.3g} mm, must be above 0; move it away or make it smaller"
+            )
 
 
 def _clearances(surface: SurfaceModel, positions: Array) -> Array:

@@ -6,7 +6,7 @@ One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 """
 
 from simtest.errors import BackendError
-from simtest.rendering import emission, phong
+from simtest.rendering import emission, phong, tissue
 
 
 def register() -> None:
@@ -23,4 +23,5 @@ def register() -> None:
     if variant is None:
         raise BackendError("no Mitsuba variant is set; call mitsuba.set_variant before register")
     phong.register(mitsuba, variant)
+    tissue.register(mitsuba, variant)
     emission.register(mitsuba, variant)

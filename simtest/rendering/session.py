@@ -5,28 +5,36 @@ structure is new, and write the values that may differ. Then it renders radiance
 the ground truth.
 """
 
-from dataclasses import dataclass
-from typing import Any
+import weakref
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtest.rendering import backend, emission, highlights, phong
+from simtest.rendering import backend, emission, glints, highlights, phong, tissue
 from simtest.rendering import exact_points as exact
+from simtest.rendering.albedo import AlbedoKernel
+from simtest.rendering.base_caster import BaseCaster
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import Frame, HighlightPoint, Radiance, TruthMaps
+from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
-from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
+from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
+from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.shapes import make_shape
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.surface import AnatomySurface
+from simtest.spec.translucency import Translucency
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
+
+if TYPE_CHECKING:
+    from simtest.surfaces.tissue_pattern import TissuePattern
 
 FINE_STRIDE_PX = 2
 """Seeds' grid for anatomies, whose highlights are small and many."""
@@ -73,12 +81,14 @@ class Session:
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
-        self._mitsuba = backend.load(variant)
+        self._mitsuba = backend.load(backend.requested_variant(variant, coloured=scene.albedo is not None))
         self.variant = str(self._mitsuba.variant())
         self.plugin = phong.register(self.mi, self.variant)
+        tissue.register(self.mi, self.variant)
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
         self._labelled = labelled
+        self._albedo: AlbedoKernel | None = None
         self._load_surface(scene)
         self._set_camera(scene)
         self._built = self._build(self._structure())
@@ -100,14 +110,17 @@ class Session:
             As for the session itself; it then stays at its scene.
         """
         # Surface, camera and lights: refused here if they are not sound.
-        if scene.surface != self.scene.surface:
+        if scene.surface != self.scene.surface or scene.film_level != self.scene.film_level:
             self._load_surface(scene)
             self._set_camera(scene)
         else:
             if scene.rig != self.scene.rig:
                 check_lights(scene, self.surface)
+                self._forget_misfits()
             if scene.camera != self._camera_spec:
                 self._set_camera(scene)
+            if scene.albedo != self.scene.albedo:
+                self._set_tissue(scene)
         self.scene: Scene = scene
         key = self._structure()
         if self._built.key != key:
@@ -119,13 +132,23 @@ class Session:
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.
-        surface = make_surface(scene.surface)
+        surface = make_surface(scene.surface, scene.film_level)
         check_camera(scene, surface)
         check_lights(scene, surface)
         self._shape = surface.shape()
+        self._relief = None if surface.relief is None else ReliefKernel(self.mi, surface.relief)
         self.surface: SurfaceModel = surface
+        self._set_tissue(scene)
         self.scene = scene
         self._forget()
+
+    def _set_tissue(self, scene: Scene) -> None:
+        self._pattern: TissuePattern | None = None
+        if scene.albedo is not None:
+            # Imported here: it loads more of SciPy, which other scenes do not need.
+            from simtest.surfaces.tissue_pattern import make_pattern
+
+            self._pattern = make_pattern(self.surface, scene.albedo)
 
     def _set_camera(self, scene: Scene) -> None:
         self._camera_spec, self.camera = scene.camera, scene.camera.model()
@@ -135,12 +158,17 @@ class Session:
     def _forget(self) -> None:
         self._truth: TruthMaps | None = None
         self._centre: list[Image] = []
+        self._forget_misfits()
+
+    def _forget_misfits(self) -> None:
+        self._misfits: MisfitMaps | None = None
 
     def _structure(self) -> tuple[Any, ...]:
         """Return everything of the scene that is compiled into the kernels."""
-        reflectance = self.scene.reflectance
-        material = (type(reflectance), getattr(reflectance, "normalised", None))
-        return self._shape.key, material, tuple(emission.kind_of(light) for light in self.scene.rig.lights)
+        material = compiled_form(self.scene.reflectance)
+        relief = None if self._relief is None else self._relief.key
+        lights = tuple(emission.kind_of(light) for light in self.scene.rig.lights)
+        return self._shape.key, relief, material, self._pattern is not None, lights
 
     def _build(self, key: tuple[Any, ...]) -> _Built:
         self.rebuilds += 1
@@ -168,9 +196,14 @@ class Session:
         # Lights, in the model frame.
         lights = self.scene.rig.lights
         positions = self.to_model(self.scene.rig.true_mm())
-        axes = np.array([light.axis for light in lights]) @ self.surface.model_from_camera[:3, :3].T
+        rotation = self.surface.model_from_camera[:3, :3]
+        axes = np.array([light.axis for light in lights]) @ rotation.T
+        poses = [
+            emission.LightPose(position, axis, light.across @ rotation.T)
+            for light, position, axis in zip(lights, positions, axes, strict=True)
+        ]
         for i, light in enumerate(lights):
-            for name, value in emission.emitter_values(self.mi, light, positions[i], axes[i]).items():
+            for name, value in emission.emitter_values(self.mi, light, poses[i]).items():
                 _set(parameters, f"light_{i}.{name}", value)
         # Material: the whole and its base alone.
         for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
@@ -180,7 +213,17 @@ class Session:
         parameters.update()
         if built.base is not None:
             built.base_parameters.update()
-        self._light = DirectLight(self.mi, self.scene.rig, positions, axes)
+        self._apply_tissue(built)
+        self._light = DirectLight(self.mi, self.scene.rig, poses)
+
+    def _apply_tissue(self, built: _Built) -> None:
+        """Upload the pattern of the tissue, unless it is there, and let bounces find the albedo by their own points."""
+        if self._albedo is None or self._albedo.pattern is not self._pattern:
+            self._albedo = AlbedoKernel(self.mi, self._pattern) if self._pattern else None
+        if self._pattern is not None:
+            # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
+            albedo = weakref.proxy(self._albedo)
+            built.scene.shapes()[0].bsdf().albedo_at = lambda si, active: albedo.at(si.p, active)
 
     def to_model(self, points: Array) -> Array:
         """Transform points, shape (N, 3), from the camera frame to the model frame, mm."""
@@ -223,13 +266,27 @@ class Session:
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
-        return as_radiance(parts), channels
+        radiance = as_radiance(parts)
+        if self.scene.translucency is not None:
+            radiance = self._translucent(radiance, channels, self.scene.translucency)
+        return radiance, channels
+
+    def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
+        """Return radiance whose diffuse part has spread below the surface."""
+        # Imported here: smooth scenes do not need its fits.
+        from simtest.rendering.subsurface import spread
+
+        if channels:
+            self._centre = channels
+        labels = as_labels(self._centre_hits())
+        diffuse = spread(radiance.diffuse, labels.depth, labels.normal_base, self.camera, spec)
+        return replace(radiance, diffuse=diffuse)
 
     def _tracer(self) -> Tracer:
         built = self._built
-        material = Material(built.scene.shapes()[0].bsdf(), built.base)
+        material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
         refinement = Refinement(self.mi, self._shape)
-        return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement)
+        return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement, self._relief)
 
     def _centre_hits(self) -> list[Image]:
         """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""
@@ -248,28 +305,52 @@ class Session:
         points : SurfacePoints
             Exact, in the camera frame.
         shading_normal, geometric_normal : ndarray, shape (N, 3)
-            Normals of the rendered shape, camera frame; NaN where the ray misses.
+            Normals of the rendered shape, camera frame, without its relief; NaN where the ray misses.
         """
         return self._cast(*self.sightlines.in_model(points_px))
 
     def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
         """Cast rays through pixel positions, shape (N, 2), onto the rendered shape.
 
-        Returns points, mm, and shading normals, shape (N, 3), camera frame; NaN where the ray misses.
+        Returns points, mm, and shading normals, with the relief, shape (N, 3), camera frame; NaN where the ray misses.
         """
-        hits, shading, _ = self._hits(*self.sightlines.in_model(points_px))
+        return self._cast_rendered(points_px, self._relief)
+
+    def _cast_rendered(self, points_px: Array, relief: ReliefKernel | None) -> tuple[Array, Array]:
+        hits, shading, _ = self._hits(*self.sightlines.in_model(points_px), relief)
         distance = np.where(np.isfinite(hits.distance), hits.distance, np.nan)
         position = self.camera.unproject(points_px) * distance[:, None]
         return position, shading @ self.surface.model_from_camera[:3, :3]
 
-    def _cast(self, origins: Array, directions: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays of the model frame (see `cast`); a NaN direction hits nothing."""
-        hits, shading, geometric = self._hits(origins, directions)
+    def _cast(
+        self, origins: Array, directions: Array, relief: ReliefKernel | None = None
+    ) -> tuple[SurfacePoints, Array, Array]:
+        """Cast rays of the model frame (see `cast`); a NaN direction hits nothing.
+
+        With a `relief` the shading normals follow it; the exact points always do.
+        """
+        hits, shading, geometric = self._hits(origins, directions, relief)
         rotation = self.surface.model_from_camera[:3, :3]
         return exact.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
 
-    def _hits(self, origins: Array, directions: Array) -> tuple[RayHits, Array, Array]:
-        return exact.trace_hits(self.mi, self._built.scene, self._shape, origins, directions)
+    def _hits(
+        self, origins: Array, directions: Array, relief: ReliefKernel | None = None
+    ) -> tuple[RayHits, Array, Array]:
+        return exact.trace_hits(self.mi, self._built.scene, self._shape, origins, directions, relief)
+
+    def base_points(self, origins: Array, directions: Array) -> SurfacePoints:
+        """Return the exact points of the base on rays of the model frame, shape (N, 3), in the model frame."""
+        return self.surface.points(np.asarray(origins), directions, self._hits(origins, directions)[0])
+
+    def misfits(self) -> MisfitMaps:
+        """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
+        if self._misfits is None:
+            self._misfits = self._tracer().misfits(self.scene.rig.true_mm(), 1, base=True)
+        return self._misfits
+
+    def fine_misfits(self, division: int, light: int) -> MisfitMaps:
+        """Return the fine misfit of one light at the centres of pixels that are divided along both axes."""
+        return self._tracer().misfits(self.scene.rig.true_mm()[[light]], division, base=False)
 
     def truth(self, stride: int = 1) -> TruthMaps:
         """Return the ground truth at the centre of every pixel, or of every `stride`-th along both axes.
@@ -290,7 +371,7 @@ class Session:
             hits, shading, geometric = as_hits(self._centre_hits())
             points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
-            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels))
+            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])
 
     def lit(self, positions: Array, light: int) -> Any:
@@ -311,9 +392,22 @@ class Session:
         return emitted & (hits.distance > distance * (1 - 1e-3))
 
     def highlights(self, radiance: Radiance) -> list[HighlightPoint]:
-        """Find the highlight points of every light in view, the brightest first, with the frame's radiance."""
-        is_anatomy = isinstance(self.scene.surface, AnatomySurface)
-        return highlights.find(self, radiance, stride=FINE_STRIDE_PX if is_anatomy else COARSE_STRIDE_PX)
+        """Find the highlight points of every light in view, the brightest first, with the frame's radiance.
+
+        On a surface with relief these are its glints (theory.md 7.1). Where no part of the frame resolves the relief it
+        acts as roughness, and the highlight points are the base's.
+        """
+        if self.surface.relief is not None:
+            return glints.find(self, radiance) if glints.is_resolved(self) else self.base_highlights(radiance)
+        return highlights.find(self, radiance, stride=self._stride)
+
+    def base_highlights(self, radiance: Radiance) -> list[HighlightPoint]:
+        """Find the highlight points of the base, without the relief: the centres of the clouds of glints."""
+        return highlights.find(BaseCaster(self), radiance, stride=self._stride)
+
+    @property
+    def _stride(self) -> int:
+        return FINE_STRIDE_PX if isinstance(self.scene.surface, AnatomySurface) else COARSE_STRIDE_PX
 
 
 def _set(parameters: Any, suffix: str, value: Any) -> None:

@@ -60,16 +60,20 @@ def _plural(word: str, count: int) -> str:
 
 
 def _counts(rows: pl.DataFrame) -> str:
-    false = rows["true_id"].is_null() & (rows["status"] != "missed").fill_null(True)
+    unmatched = rows["true_id"].is_null() & (rows["status"] != "missed").fill_null(True)
+    # On a relief a spot may melt several glints, or hold none: it is no single highlight, but it is there.
+    melted = unmatched & rows["visible_id"].is_not_null() if "visible_id" in rows.columns else unmatched & False
+    false = unmatched & ~melted
     missed = (rows["status"] == "missed").fill_null(False)
-    failed = rows.filter((pl.col("status") != "ok") & (pl.col("status") != "missed") & ~false)
+    failed = rows.filter((pl.col("status") != "ok") & (pl.col("status") != "missed") & ~unmatched)
     total = rows.height
     reasons = failed["status"].value_counts(sort=True).iter_rows()
     detail = f" ({', '.join(f'{name} {count}' for name, count in reasons)})" if failed.height else ""
-    return (
-        f"Of {total} {_plural('row', total)}, {failed.height} gave no normal{detail}, {int(missed.sum())} missed "
-        f"a true highlight and {int(false.sum())} belong to false detections."
-    )
+    parts = [f"{failed.height} gave no normal{detail}", f"{int(missed.sum())} missed a true highlight"]
+    if melted.any():
+        parts.append(f"{int(melted.sum())} belong to spots of several glints or of none")
+    parts.append(f"{int(false.sum())} belong to false detections")
+    return f"Of {total} {_plural('row', total)}, {', '.join(parts[:-1])} and {parts[-1]}."
 
 
 def measured(figure: LineFigure) -> list[str]:

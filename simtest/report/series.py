@@ -105,7 +105,7 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigu
             continue
         part = pl.concat(kept).with_columns(pl.col(name).cast(pl.Float64))
         part = part.with_columns(setting=pl.lit(f"{name} = ") + pl.col(name).cast(pl.String))
-        x = Axis(_axis_title(name))
+        x = Axis(axis_title(name))
         curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg"), x)
         if curves:
             slug = "".join(c if c.isalnum() else "_" for c in name)
@@ -117,7 +117,7 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigu
     return figures
 
 
-def _axis_title(name: str) -> str:
+def axis_title(name: str) -> str:
     """Return a swept parameter's name with its unit, or with the start of its description where it has none."""
     short, meaning = name_key(name), describe_key(name).split(";")[0]
     return short if short.endswith(")") or not meaning or len(meaning) > MOST_TITLE else f"{short}: {meaning}"

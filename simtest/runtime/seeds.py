@@ -18,6 +18,7 @@ class Stage(IntEnum):
     SENSOR = 2
     VIEWPOINT = 3
     RIG = 4
+    RELIEF = 5
 
 
 def key(text: str) -> int:

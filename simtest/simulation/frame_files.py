@@ -13,6 +13,7 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
 from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
 from simtest.spec import Scene, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
@@ -23,13 +24,24 @@ FIELDS = {
     "radiance.exr": "linear radiance, power per steradian over mm^2",
     "depth_mm": "distance along the ray from the camera centre, mm; NaN off the surface, as in all fields below",
     "position_mm": "surface point, camera frame (x right, y down, z forward), mm",
-    "normal": "unit normal of the smooth surface, facing the camera (N . P < 0), camera frame",
-    "shading_normal": "unit normal that shading used, camera frame",
+    "normal": "unit normal of the fine surface, with the relief, camera frame; facing the camera (N . P < 0) where "
+    "there is no relief",
+    "normal_base": "unit normal of the base, without the relief, facing the camera, camera frame; equal to normal "
+    "where there is no relief",
+    "shading_normal": "unit normal that the shading off the lobe used, camera frame; on a relief the fine one",
     "geometric_normal": "unit normal of the rendered triangle or shape, camera frame",
-    "curvature": "principal curvatures k_min, k_max, 1/mm, convex towards the camera positive",
-    "direction_min, direction_max": "unit principal directions, camera frame",
+    "curvature": "principal curvatures k_min, k_max of the fine surface, 1/mm, convex towards the camera positive",
+    "curvature_base": "the same of the base; equal to curvature where there is no relief",
+    "direction_min, direction_max": "unit principal directions of the fine surface, camera frame",
+    "pool": "where the liquid film fills a valley of the relief",
     "radiance_specular, radiance_diffuse, radiance_indirect": "parts of the radiance: direct off lobe, base; bounced",
     "mask": "where there is a surface",
+    "highlights": "frame.json: points where the fine normal bisects light and camera, camera frame, mm; radius_px by "
+    "the surface's shape and the lobe alone, cloud an index in clouds, why_not the first condition of an isolated one "
+    "that fails",
+    "clouds": "frame.json: the same points of the base, without the relief; on a smooth surface the highlights",
+    "visible_highlights": "frame.json: spots of the noise-free frame; value and specular are radiance, glints indices "
+    "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
 }
 
 
@@ -106,14 +118,17 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "depth_mm": truth.depth.astype(np.float32),
         "position_mm": truth.position.astype(np.float32),
         "normal": truth.normal.astype(np.float32),
+        "normal_base": truth.normal_base.astype(np.float32),
         "shading_normal": truth.shading_normal.astype(np.float32),
         "geometric_normal": truth.geometric_normal.astype(np.float32),
         "curvature": np.stack([truth.k_min, truth.k_max], axis=-1).astype(np.float32),
+        "curvature_base": np.stack([truth.k_min_base, truth.k_max_base], axis=-1).astype(np.float32),
         "direction_min": truth.direction_min.astype(np.float32),
         "direction_max": truth.direction_max.astype(np.float32),
         "radiance_specular": radiance.specular,
         "radiance_diffuse": radiance.diffuse,
         "radiance_indirect": radiance.indirect,
+        "pool": truth.pool,
         "mask": truth.mask,
     }
 
@@ -135,5 +150,7 @@ def _description(frame: LabelledFrame) -> Json:
     if rig.preset is not None or rig.is_drawn:
         described["lights_mm"] = rig.true_mm().tolist()
     described["highlights"] = [{**own.to_json(), "radiance": own.radiance} for own in frame.highlights]
+    described["clouds"] = [cloud_json(centre) for centre in frame.clouds]
+    described["visible_highlights"] = [spot.to_json() for spot in frame.visible_highlights]
     origin = cast("dict[str, Json]", provenance.environment())
     return {**described, "fields": fields, "provenance": {**origin, "variant": frame.variant}}

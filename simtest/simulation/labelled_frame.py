@@ -1,13 +1,15 @@
 """One labelled frame: picture, radiance, ground truth and highlights."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.rendering import Progress, Radiance, Session, TruthMaps
+from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.runtime.arrays import Image
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.visible_highlights import VisibleHighlight
 from simtest.spec import Scene
 
 
@@ -29,6 +31,10 @@ class LabelledFrame:
         At each pixel's centre, camera frame.
     highlights : list of TrueHighlight
         All of them; those with `isolated` count.
+    clouds : sequence of HighlightPoint
+        Highlight points of the base, around which the glints of a relief lie; on a smooth surface the highlights.
+    visible_highlights : list of VisibleHighlight
+        The spots that can be seen in the noise-free frame, the brightest first.
     full_scale : float
         Radiance behind the lens that became 1.
     variant : str
@@ -41,6 +47,8 @@ class LabelledFrame:
     radiance: Radiance
     truth: TruthMaps
     highlights: list[TrueHighlight]
+    clouds: Sequence[HighlightPoint]
+    visible_highlights: list[VisibleHighlight]
     full_scale: float
     variant: str
 
@@ -64,5 +72,14 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
     view = render_view(session, scene, radiance)
     image = view.frame(scene.sensor.seed)
     return LabelledFrame(
-        scene, session.camera, image, radiance, truth, view.highlights, view.full_scale, session.variant
+        scene=scene,
+        camera=session.camera,
+        image=image,
+        radiance=radiance,
+        truth=truth,
+        highlights=view.highlights,
+        clouds=view.clouds,
+        visible_highlights=view.visible_highlights,
+        full_scale=view.full_scale,
+        variant=session.variant,
     )

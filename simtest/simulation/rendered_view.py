@@ -1,16 +1,20 @@
 """A rendered scene with its true highlights, exposed and ready for the camera's noise."""
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from simtest.calibration import Calibration, NoiseModel
-from simtest.rendering import HighlightPoint, Radiance, Session
+from simtest.rendering import HighlightPoint, Radiance, Session, glints
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
+from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect
 from simtest.simulation.true_highlights import TrueHighlight, judge
+from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
 
 LEAST_SHARE = 1e-12
@@ -30,7 +34,9 @@ class RenderedView:
     light : ndarray of float32, shape (H, W) or (H, W, 3)
         Noise-free radiance behind the lens: what reaches the sensor.
     highlights : list of TrueHighlight
-        All of them, including those that do not count.
+        All of them, including those that do not count; on a relief these are the glints.
+    clouds : list of HighlightPoint
+        Highlight points of the base, around which the glints lie; on a smooth surface the highlights themselves.
     full_scale : float
         Radiance behind the lens that becomes 1 (`Exposure`); 0 where no light reaches the sensor.
     calibration : Calibration
@@ -41,8 +47,27 @@ class RenderedView:
     radiance: Radiance
     light: Image
     highlights: list[TrueHighlight]
+    clouds: Sequence[HighlightPoint]
     full_scale: float
     calibration: Calibration
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether the surface carries a relief."""
+        return self.scene.surface.relief is not None
+
+    @cached_property
+    def visible_highlights(self) -> list[VisibleHighlight]:
+        """The spots that can be seen in the noise-free frame, the brightest first (theory.md 7.1b)."""
+        sensor, camera = self.scene.sensor, self.calibration.camera
+        light = _mean(self.light)
+        specular = _mean(collect(self.radiance.specular, sensor, camera))
+        spots = find_spots(light, specular, camera.seen)
+        at = light[spots.rows, spots.columns]
+        scale = self.full_scale
+        noise = sensor.noise_model().at(at / scale, self.radiance.channels) if scale > 0 else np.zeros_like(at)
+        sigma = np.broadcast_to(np.asarray(noise, dtype=float) * scale, at.shape)
+        return describe(spots, light, specular, sigma, self.highlights, camera.seen)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
@@ -56,18 +81,43 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
         radiance = session.radiance()
     # Lens.
     light = collect(radiance.total, scene.sensor, session.camera)
-    mean = light if light.ndim == 2 else light.mean(axis=2, dtype=np.float32)
+    mean = _mean(light)
     # Truth and exposure. Noise is independent in each channel; estimators see the channels' mean.
     points, seen = session.highlights(radiance), session.camera.seen
-    full_scale = _full_scale(scene, mean, points, seen)
-    highlights = judge(points, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen)
+    rough = session.surface.relief is not None
+    full_scale = _full_scale(scene, mean, points, seen, rough)
+    highlights = judge(points, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen, single=rough)
+    highlights, clouds = _placed(session, radiance, highlights)
     # What reconstruction is told may include the distance of the brightest highlight.
     brightest = max((h for h in highlights if h.lit), key=lambda h: h.radiance, default=None)
     calibration = scene.calibration(None if brightest is None else brightest.distance)
-    return RenderedView(scene, radiance, light, highlights, full_scale, calibration)
+    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration)
 
 
-def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: Mask | None) -> float:
+def _placed(
+    session: Session, radiance: Radiance, highlights: list[TrueHighlight]
+) -> tuple[list[TrueHighlight], Sequence[HighlightPoint]]:
+    """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
+    radii = glints.radii_px(session, highlights, session.scene.reflectance.half_width)
+    if session.surface.relief is None:
+        own = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
+        return own, own
+    centres = session.base_highlights(radiance)
+    lights, pixels = np.array([h.light for h in highlights], dtype=int), [h.bp_px for h in highlights]
+    numbers = glint_clouds.assign(session, lights, np.array(pixels).reshape(-1, 2), centres)
+    placed = [
+        replace(h, radius_px=float(radius), cloud=number)
+        for h, radius, number in zip(highlights, radii, numbers, strict=True)
+    ]
+    return placed, centres
+
+
+def _mean(image: Image) -> Image:
+    """Return the mean of an image's channels, shape (H, W)."""
+    return image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
+
+
+def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: Mask | None, single: bool) -> float:
     """Return the radiance that becomes 1; 0, with a warning, where there is no light at all."""
     exposure, peak = scene.sensor.exposure, float(light.max())
     if peak <= 0:
@@ -87,7 +137,7 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
             radiance = peak
     else:
         # Which highlights are isolated is judged without noise first.
-        isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen) if h.isolated]
+        isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen, single) if h.isolated]
         radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
     return radiance / exposure.gain
 

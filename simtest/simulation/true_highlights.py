@@ -1,5 +1,6 @@
 """Which of a surface's highlight points are isolated, visible highlights (theory.md section 6)."""
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Image, Mask
+from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.files import Json
 
 Pixel = tuple[int, int]
@@ -32,10 +33,17 @@ class TrueHighlight(HighlightPoint):
         where it has no closed isophote.
     why_not : str
         Empty for a true isolated highlight, else the first condition that it fails.
+    radius_px : float
+        Of the circle that has the highlight's area above half height, from its shape alone (theory.md 7.3), px; NaN
+        where it was not computed.
+    cloud : int or None
+        Number of its cloud, an index in `RenderedView.clouds`; None where its cloud's centre is not in view.
     """
 
     peak_snr: float
     why_not: str
+    radius_px: float = math.nan
+    cloud: int | None = None
 
     @property
     def isolated(self) -> bool:
@@ -49,7 +57,7 @@ class TrueHighlight(HighlightPoint):
         return self
 
     def to_json(self) -> dict[str, Json]:
-        """Return position, normal, curvature and verdict."""
+        """Return position, normal and curvature of the fine surface and of the base, and verdict."""
         return {
             "light": self.light,
             "bp_px": self.bp_px.tolist(),
@@ -58,6 +66,12 @@ class TrueHighlight(HighlightPoint):
             "distance_mm": self.distance,
             "kd_min": self.kd_min,
             "kd_max": self.kd_max,
+            "normal_base": self.normal_base.tolist(),
+            "kd_min_base": self.kd_min_base,
+            "kd_max_base": self.kd_max_base,
+            "pool": self.pool,
+            "radius_px": self.radius_px if math.isfinite(self.radius_px) else None,
+            "cloud": self.cloud,
             "isolated": self.isolated,
             "why_not": self.why_not or None,
         }
@@ -70,6 +84,7 @@ def judge(
     full_scale: float,
     channels: int = 1,
     seen: Mask | None = None,
+    single: bool = False,
 ) -> list[TrueHighlight]:
     """Judge each highlight point by the noise-free frame.
 
@@ -85,6 +100,8 @@ def judge(
         Radiance at full scale; 0 where there is no light at all.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
+    single : bool
+        Whether an isolated highlight holds one lit highlight point alone: on a relief, where glints melt.
     """
     # The maximum that each point makes in the frame as detectors see it, and whose it is.
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
@@ -94,7 +111,8 @@ def judge(
     highlights = []
     for point, peak in zip(points, peaks, strict=True):
         sigma = float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale if full_scale > 0 else 0.0
-        snr, why_not = _verdict(point, smoothed, seen, peak, owners.get(peak) is point, sigma)
+        others = [own.bp_px for own in points if own.lit and own is not point] if single else []
+        snr, why_not = _verdict(point, smoothed, seen, peak, owners.get(peak) is point, sigma, others)
         highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=why_not))
     return highlights
 
@@ -122,9 +140,18 @@ def _owners(points: list[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, Hig
 
 
 def _verdict(
-    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, sigma: float
+    point: HighlightPoint,
+    smoothed: Image,
+    seen: Mask | None,
+    peak: Pixel,
+    owns_peak: bool,
+    sigma: float,
+    others: list[Array],
 ) -> tuple[float, str]:
-    """Return peak SNR and the first condition that a highlight point fails; `sigma` is the noise at its peak."""
+    """Return peak SNR and the first condition that a highlight point fails.
+
+    `sigma` is the noise at its peak; `others` are the points that may not lie in its half-height region, px.
+    """
     # Without a maximum of its own it has no SNR.
     if not point.lit:
         return 0.0, "in shadow"
@@ -133,6 +160,8 @@ def _verdict(
         return 0.0, "part of a brighter one"
     height = contrast(smoothed, component, float(smoothed[peak]), seen)
     snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
+    if any(component.holds(other) for other in others):
+        return snr, "holds several glints"
     # Shape, frame, noise: in the order of theory.md section 6.
     if point.min_gain <= HIGHLIGHT_MIN_GAIN:
         return snr, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"

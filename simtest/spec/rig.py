@@ -11,6 +11,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec.falloff import CosineProfile, Profile, TableProfile
+from simtest.spec.light_source import Source
 from simtest.spec.spec_model import Coordinate, Spec
 
 Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -44,6 +45,11 @@ class Emission(Spec):
     )
     soft_edge_deg: float = Field(
         0.0, ge=0, description="the spot's emission falls to 0 over this angle inside its rim, linearly in the angle"
+    )
+    source: Source | None = Field(
+        None,
+        description="exit of finite size across direction: disc, ring or crescent, each of its points emits alike; "
+        "default a point",
     )
     position_error_mm: float = Field(
         0.0,
@@ -80,6 +86,18 @@ class Emission(Spec):
         return np.asarray(axis / np.linalg.norm(axis))
 
     @property
+    def across(self) -> Array:
+        """Unit vectors x and y of the source's plane, shape (2, 3), camera frame.
+
+        They are those of the camera, turned with z onto the axis by the shortest rotation; for an axis towards the
+        camera's back y is flipped first.
+        """
+        x, y, z = self.axis
+        sign = 1.0 if z >= 0 else -1.0
+        a = -1 / (sign + z)
+        return np.array([[1 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]])
+
+    @property
     def is_isotropic(self) -> bool:
         """Whether the light emits alike in all directions."""
         return self.spot_deg is None and self.profile.model().is_uniform
@@ -104,9 +122,10 @@ class Emission(Spec):
 
 
 class LightSpec(Emission):
-    """A light, small enough to be a point, in the camera frame.
+    """A light in the camera frame: a point, or a source of finite size.
 
-    Its nominal position is `position_mm`, or `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0.
+    It lies at `position_mm`, or at `offset_mm` from the camera centre along `azimuth_deg` in the plane z = 0. Of a
+    source of finite size this is the centre of its (outer) disc; its nominal position is the centroid of its area.
     """
 
     position_mm: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
@@ -124,7 +143,16 @@ class LightSpec(Emission):
 
     @property
     def nominal_mm(self) -> Vector:
-        """Nominal position in the camera frame, mm, as estimators know it."""
+        """Nominal position in the camera frame, mm, as estimators know it: of a source's centroid."""
+        position = self._place_mm
+        if self.source is None or not any(self.source.centroid_mm):
+            return position
+        x, y, z = (np.array(position) + self.source.centroid_mm @ self.across).tolist()
+        return (x, y, z)
+
+    @property
+    def _place_mm(self) -> Vector:
+        """Position as given, mm."""
         if self.position_mm is not None:
             return self.position_mm
         angle = math.radians(self.azimuth_deg)
@@ -135,7 +163,8 @@ class LightSpec(Emission):
         """The emission as a function of the sightline's angle from the optical axis; None if it is no such function.
 
         It is one for a light at the camera that shines along the optical axis. A spot is left out: beyond its rim
-        there is nothing to divide by.
+        there is nothing to divide by. Of a source of finite size it is the profile about its centre: what a disc of
+        radius r sends to the distance d differs by terms of (r / d)^2.
         """
         along = not any(self.direction[:2]) and self.direction[2] > 0
         return self.profile if along and self.spot_deg is None and is_at_camera(self.nominal_mm) else None

@@ -10,12 +10,14 @@ from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Respons
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.reflectance import PhongReflectance, Reflectance
+from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surface import Surface
+from simtest.spec.tissue_colour import TissueColour
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
+from simtest.spec.translucency import Translucency
 
 
 class Effort(Spec):
@@ -30,7 +32,10 @@ class KnownSpec(Spec):
     """What estimators are told beside the picture and the camera's calibration."""
 
     lights: bool = Field(True, description="whether they are told the lights' nominal positions")
-    lobe: bool = Field(True, description="whether they are told the exponent of a Phong lobe")
+    lobe: bool = Field(
+        True,
+        description="whether they are told the width of a lobe that has one: Phong's exponent, a Beckmann film's alpha",
+    )
     distance_mm: Millimetres | None = Field(None, description="working distance that they are told, mm")
     distance_error: float | None = Field(
         None,
@@ -62,6 +67,30 @@ class Scene(Spec):
     render: Effort = Effort()
     known: KnownSpec = KnownSpec()
 
+    @property
+    def film_level(self) -> float | None:
+        """Up to where a liquid film fills the valleys of the relief, in standard deviations of its height."""
+        return self.reflectance.film.level if isinstance(self.reflectance, TissueReflectance) else None
+
+    @property
+    def translucency(self) -> Translucency | None:
+        """How diffuse light spreads below the surface; None where it leaves where it entered."""
+        return self.reflectance.translucency if isinstance(self.reflectance, TissueReflectance) else None
+
+    @model_validator(mode="after")
+    def _has_valleys(self) -> "Scene":
+        if self.film_level is not None and self.surface.relief is None:
+            raise ValueError(
+                f"reflectance.film.level = {self.film_level:g}: there are no valleys to fill; must be left out where "
+                "surface.relief is not given"
+            )
+        return self
+
+    @property
+    def albedo(self) -> TissueColour | None:
+        """The colour of the tissue, where the albedo varies over the surface."""
+        return getattr(self.reflectance, "albedo", None)
+
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.
 
@@ -91,14 +120,14 @@ class Scene(Spec):
         # distance, off by a stated share of the truth
         if self.known.distance_error is not None and distance_mm is not None:
             mean = distance_mm * (1 + self.known.distance_error)
-        # lobe, which only Phong's model states by one number
-        lobe = None
-        if self.known.lobe and isinstance(self.reflectance, PhongReflectance):
-            lobe = exactly(self.reflectance.lobe_curvature)
+        # lobe, where one number states it
+        curvature = None
+        if self.known.lobe and isinstance(self.reflectance, PhongReflectance | TissueReflectance):
+            curvature = self.reflectance.lobe_curvature
         return Priors(
             tuple(light.nominal_mm for light in self.rig.lights) if self.known.lights else (),
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
-            lobe,
+            None if curvature is None else exactly(curvature),
         )
 
 

@@ -7,12 +7,19 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.runtime.resources import find
+from simtest.spec.relief import Relief
 from simtest.spec.spec_model import Curvature, Millimetres, Spec
 
 EdgeLength = Annotated[float, Field(ge=0.01, le=100)]
 
 
-class _Placed(Spec):
+class _Rough(Spec):
+    """A surface that may carry a relief."""
+
+    relief: Relief | None = Field(None, description="fine relief of the surface; default smooth")
+
+
+class _Placed(_Rough):
     """An analytic surface whose anchor point lies on the optical axis, its normal tilted away from the camera's axis.
 
     The anchor is (0, 0, distance_mm); at tilt 0 its normal is (0, 0, -1).
@@ -86,7 +93,7 @@ class QuadricSurface(_Placed):
     k2_per_mm: Curvature = Field(description="curvature along the second principal direction, 1/mm, convex positive")
 
 
-class AnatomySurface(Spec):
+class AnatomySurface(_Rough):
     """A colon or liver made from a recipe in meshes/, or a mesh that the user names."""
 
     type: Literal["anatomy"] = "anatomy"

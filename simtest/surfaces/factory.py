@@ -18,8 +18,31 @@ from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatu
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 
-def make_surface(spec: Surface) -> SurfaceModel:
-    """Make the model of a scene's surface; raise `InputError` if a recipe or mesh file is missing or malformed."""
+def make_surface(spec: Surface, film_level: float | None = None) -> SurfaceModel:
+    """Make the model of a scene's surface.
+
+    Parameters
+    ----------
+    spec : Surface
+        Its description.
+    film_level : float, optional
+        Up to where a liquid film fills the valleys of its relief, in standard deviations of the height.
+
+    Raises
+    ------
+    InputError
+        If a recipe or mesh file is missing or malformed.
+    """
+    surface = _make_base(spec)
+    if spec.relief is not None:
+        # Imported here: its filters are slow to load, and smooth scenes do not need them.
+        from simtest.surfaces.relief_field import make_relief
+
+        surface.relief = make_relief(spec.relief, film_level)
+    return surface
+
+
+def _make_base(spec: Surface) -> SurfaceModel:
     match spec:
         case PlaneSurface():
             return Plane(spec)
@@ -41,10 +64,11 @@ def make_surface(spec: Surface) -> SurfaceModel:
 
 def forget_meshes() -> None:
     """Free the meshes that are cached for further scenes of the last few anatomies."""
-    from simtest.surfaces import centreline, colon, liver
+    from simtest.surfaces import centreline, colon, liver, relief_field, tissue_pattern, vessels
     from simtest.surfaces import mesh_surface as mesh
 
-    for cached in (centreline._camera_path, colon.build, liver.build, mesh._prepare):
+    meshes = (centreline._camera_path, colon.build, liver.build, mesh._prepare)
+    for cached in (*meshes, relief_field._make_field, tissue_pattern._make, vessels.grow_vessels):
         cached.cache_clear()
 
 

@@ -44,7 +44,10 @@ EDGE_QUANTILE = 0.05
 """``edge_mm = "auto"`` is what all but this share of the surface needs."""
 
 SMOOTHING_EDGES = 2.0
-"""With ``edge_mm``, relief shorter than this many median edges of the file is smoothed: it is the mesh's own."""
+"""Median edges of the file in the shortest wave that it can hold. With ``edge_mm``, shorter ones are smoothed."""
+
+SAME_HIT = 1e-4
+"""A solution in double precision farther than this from the renderer's hit, as a share of the distance, is another."""
 
 MAX_CROSSING_FACES = 250_000
 """A mesh of up to this many faces is checked for self-intersections before it is used (about a second)."""
@@ -62,11 +65,14 @@ class PreparedMesh(BuiltMesh):
         Whether the camera belongs inside.
     subdivisions : int
         How often the mesh was subdivided.
+    shortest_mm : float
+        Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left.
     """
 
     operators: Array
     lumen: bool
     subdivisions: int
+    shortest_mm: float
 
     @property
     def shape_operators(self) -> Array:
@@ -83,6 +89,8 @@ class PreparedMesh(BuiltMesh):
         The normal is the normalised barycentric mean of the vertex normals; S is that of the vertices' tensors,
         projected on the plane perpendicular to that normal.
         """
+        # The renderer's hits are single precision: too coarse for the derivatives of a fine relief.
+        hits = on_triangles(origins, directions, hits, self.mesh)
         # Linear between the corners, as the renderer shades it
         corners = self.mesh.faces[hits.face]
         normal = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners])
@@ -90,6 +98,23 @@ class PreparedMesh(BuiltMesh):
         operator = np.einsum("nc,ncij->nij", hits.weights, self.operators[corners])
         projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
         return hits.distance, normal, projector @ operator @ projector
+
+
+def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: TriangleMesh) -> RayHits:
+    """Solve hits again in double precision, on the planes of the hit triangles (Moeller and Trumbore 1997)."""
+    corner, second, third = np.moveaxis(mesh.vertices[mesh.faces[hits.face]], 1, 0)
+    first_edge, second_edge, start = second - corner, third - corner, origins - corner
+    across, along = np.cross(directions, second_edge), np.cross(start, first_edge)
+    determinant = np.einsum("ni,ni->n", first_edge, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v, distance = (
+            np.einsum("ni,ni->n", a, b) / determinant
+            for a, b in ((start, across), (directions, along), (second_edge, along))
+        )
+        # A triangle seen edge on has no better solution.
+        better = np.abs(distance - hits.distance) < SAME_HIT * hits.distance
+    barycentric = np.where(better[:, None], np.stack([u, v], axis=1), hits.barycentric)
+    return RayHits(np.where(better, distance, hits.distance), hits.face, barycentric)
 
 
 @dataclass(frozen=True)
@@ -138,13 +163,14 @@ def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) ->
     _warn(path, vertices, faces, list(repairs.sentences(lumen)))
     # smooth and fine
     times, smoothing = _plan(path, vertices, faces, how, lumen)
+    shortest = max(smoothing, SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces))))
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
         # Everything turned inward, to the camera's side
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
     digest = blake2b(repr((path, mtime_ns, size, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
-    return PreparedMesh(TriangleMesh(vertices, faces, normals), f"mesh-{digest}", operators, lumen, times)
+    return PreparedMesh(TriangleMesh(vertices, faces, normals), f"mesh-{digest}", operators, lumen, times, shortest)
 
 
 def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
@@ -195,12 +221,14 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
 class MeshSurface(MeshedSurface):
     """A user's mesh with a camera inside its lumen or outside the organ.
 
-    Raises `InputError` if the file is missing or malformed, or no camera can be placed.
+    Raises `InputError` if the file is missing or malformed, no camera can be placed, or the relief has waves as long as
+    the mesh's own.
     """
 
     def __init__(self, spec: AnatomySurface) -> None:
         how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)
         self._build = self.prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), how, spec.kind)
+        _check_relief(spec, self.prepared.shortest_mm)
         probe, lumen = self.prepared.probe, self.prepared.lumen
         if lumen:
             pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
@@ -208,3 +236,14 @@ class MeshSurface(MeshedSurface):
             pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
         self.solid = not lumen
         self.model_from_camera = pose
+
+
+def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:
+    """Raise `InputError` for waves that the mesh holds itself: both would claim the same forms."""
+    for i, band in enumerate(spec.relief.bands if spec.relief else ()):
+        if band.wavelength_mm > shortest_mm:
+            raise InputError(
+                f"surface.relief.bands.{i}.wavelength_mm = {band.wavelength_mm:g}: {spec.path} holds waves from "
+                f"{shortest_mm:.3g} mm on itself (two of its median edges, or smoothing_mm); the relief's must be "
+                "shorter, or surface.smoothing_mm longer"
+            )

@@ -2,11 +2,15 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
+
+if TYPE_CHECKING:
+    from simtest.surfaces.relief_field import ReliefField
 
 
 @dataclass(frozen=True)
@@ -38,18 +42,27 @@ class RayHits:
 class SurfacePoints:
     """Exact points of a surface, in the frame of the rays that found them.
 
+    Normal and curvatures are those of the fine surface where there is a relief; those of the base stand beside them,
+    equal without a relief. Positions are on the base.
+
     Parameters
     ----------
     distance : ndarray, shape (N,)
         Distance along the ray, mm; NaN if there is no point.
     position, normal : ndarray, shape (N, 3)
-        Point, mm, and unit normal facing the ray's origin.
+        Point, mm, and unit normal; that of the base faces the ray's origin.
     k_min, k_max : ndarray, shape (N,)
         Principal curvatures, 1/mm, convex towards the ray's origin positive.
     direction_min, direction_max : ndarray, shape (N, 3)
         Unit principal directions.
+    normal_base : ndarray, shape (N, 3)
+        Unit normal of the base.
+    k_min_base, k_max_base : ndarray, shape (N,)
+        Principal curvatures of the base, 1/mm.
+    pool : ndarray of bool, shape (N,)
+        Whether the point lies in a pool of the liquid film.
     valid : ndarray of bool, shape (N,)
-        False if the ray misses or no solution was found; all other fields are NaN there.
+        False if the ray misses or no solution was found; all other fields are NaN there (`pool` is False).
     """
 
     distance: Array
@@ -59,6 +72,10 @@ class SurfacePoints:
     k_max: Array
     direction_min: Array
     direction_max: Array
+    normal_base: Array
+    k_min_base: Array
+    k_max_base: Array
+    pool: Mask
     valid: Mask
 
 
@@ -116,10 +133,13 @@ class SurfaceModel(ABC):
     solid : bool
         Whether the far side is matter, in which no light can be; a shell (a lumen, a sphere seen from inside) has
         free space beyond its wall.
+    relief : ReliefField or None
+        Its fine relief; `points` are those of the base without it (see `fine_points`).
     """
 
     model_from_camera: Array
     solid: bool = True
+    relief: "ReliefField | None" = None
 
     @abstractmethod
     def shape(self) -> Shape:
@@ -136,9 +156,14 @@ class SurfaceModel(ABC):
         """Return S at the rendered mesh's vertices for its normals, 1/mm, shape (V, 3, 3); None without a mesh."""
         return None
 
+    def fine_points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Return the points of `points`, with normals and curvatures of the fine surface where there is a relief."""
+        points = self.points(origins, directions, hits)
+        return points if self.relief is None else self.relief.apply(points)
+
     @abstractmethod
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-        """Return the exact points where rays meet the surface, in the model frame.
+        """Return the exact points where rays meet the base surface, in the model frame.
 
         Parameters
         ----------
@@ -190,14 +215,19 @@ def pack_points(
         return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
     position = origins + np.where(valid, distance, np.nan)[:, None] * directions
+    normal, k_min, k_max = only_valid(normal), only_valid(mean - half), only_valid(mean + half)
     return SurfacePoints(
         distance=only_valid(distance),
         position=position,
-        normal=only_valid(normal),
-        k_min=only_valid(mean - half),
-        k_max=only_valid(mean + half),
+        normal=normal,
+        k_min=k_min,
+        k_max=k_max,
         direction_min=only_valid(direction_min),
         direction_max=only_valid(direction_max),
+        normal_base=normal,
+        k_min_base=k_min,
+        k_max_base=k_max,
+        pool=np.zeros(len(valid), dtype=bool),
         valid=valid,
     )
 

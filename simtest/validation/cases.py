@@ -17,6 +17,8 @@ from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
 from simtest.validation.results_table import Value
 
+RELIEF_SEED = "surface.relief.seed"
+
 Tables = dict[str, Any]
 """A scene's tables, as read from TOML."""
 
@@ -105,11 +107,20 @@ class Case:
         if scene.render.samples_per_pixel > 1 or scene.render.path_depth > 2:
             seed = integer(experiment.seed, experiment.name, self.name, realisation if drawn else 0, Stage.RENDER)
             scene = scene.model_copy(update={"render": scene.render.model_copy(update={"seed": seed % 2**32})})
-        # ... and the rig's deviations, which they do not.
+        # ... and the rig's deviations and the relief, which they do not.
         if scene.rig.is_drawn:
             seed = integer(experiment.seed, experiment.name, self.name, realisation, Stage.RIG)
             scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"seed": seed})})
+        if scene.surface.relief is not None and not self._relief_is_given:
+            seed = integer(experiment.seed, experiment.name, self.name, realisation, Stage.RELIEF) % 2**32
+            relief = scene.surface.relief.model_copy(update={"seed": seed})
+            scene = scene.model_copy(update={"surface": scene.surface.model_copy(update={"relief": relief})})
         return scene, drawn
+
+    @property
+    def _relief_is_given(self) -> bool:
+        """Whether the experiment itself names the relief's seed, so that none is drawn."""
+        return RELIEF_SEED in self.settings or RELIEF_SEED in self.random
 
     def noise_seed(self, experiment: Experiment, realisation: int) -> int:
         """Return the seed of a realisation's noise: the `seed` column, and ``sensor.seed`` of a scene made alone."""
@@ -125,6 +136,8 @@ class Case:
             values["render.seed"] = scene.render.seed
         if scene.rig.is_drawn:
             values["rig.seed"] = scene.rig.seed
+        if scene.surface.relief is not None and not self._relief_is_given:
+            values[RELIEF_SEED] = scene.surface.relief.seed
         return f"simtest render {shlex.quote(self.source)} {_set_options(values)} --out frame"
 
 

@@ -8,25 +8,27 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.geometry.isophotes import encloses
 from simtest.reconstruction.pipeline import Specularity
-from simtest.rendering import HighlightPoint
+from simtest.runtime.arrays import Array
 
 
-def match(specularities: Sequence[Specularity], truths: Sequence[HighlightPoint]) -> dict[int, int]:
-    """Match each detection to the nearest true BP inside its isophote at t = 0.5 (theory.md section 6).
+def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> dict[int, int]:
+    """Match each detection to the nearest true point, px, inside its isophote at t = 0.5 (theory.md section 6).
+
+    The points are the BPs of true highlights, or the peaks of visible ones.
 
     Returns
     -------
     dict
-        Index of the truth by index of the detection; a truth is matched to the nearest of its detections only.
+        Index of the point by index of the detection; a point is matched to the nearest of its detections only.
     """
-    # Candidates: truths that an isophote encloses, with their distance from its peak.
+    # Candidates: points that an isophote encloses, with their distance from its peak.
     pairs = []
     for i, specularity in enumerate(specularities):
-        for j, truth in enumerate(truths):
-            if _encloses(specularity, truth.bp_px):
-                distance = float(np.hypot(*(truth.bp_px - peak_px(specularity))))
+        for j, point in enumerate(points_px):
+            if _encloses(specularity, point):
+                distance = float(np.hypot(*(point - peak_px(specularity))))
                 pairs.append((_is_undetected(specularity), distance, i, j))
-    # Detections before what a frame estimator alone saw, the nearest pair first; each detection and each truth once.
+    # Detections before what a frame estimator alone saw, the nearest pair first; each detection and each point once.
     matched: dict[int, int] = {}
     for _, _, i, j in sorted(pairs):
         if i not in matched and j not in matched.values():

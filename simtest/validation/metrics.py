@@ -17,8 +17,9 @@ from simtest.runtime.arrays import Array
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
-from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, law_deg, look_law_deg
-from simtest.validation.results_table import ResultRow
+from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
+from simtest.validation.results_table import FINE, ResultRow
+from simtest.validation.rough_truth import RoughTruth
 
 MISSED = "missed"
 
@@ -31,6 +32,7 @@ def rows(
     matched: Mapping[int, int],
     estimators: Sequence[str],
     unfound: str = MISSED,
+    rough: RoughTruth | None = None,
 ) -> list[ResultRow]:
     """Make the rows of one realisation: of each detection, and of each truth that no detection found.
 
@@ -46,7 +48,10 @@ def rows(
         Index of the truth by index of the detection.
     estimators, unfound
         Names and status for the rows of truths that no detection found.
+    rough : RoughTruth, optional
+        What stands beside the true highlights on a surface with relief.
     """
+    rough = rough or RoughTruth()
     made = []
     scene = session.scene
     # Detections: matched, or false.
@@ -54,6 +59,7 @@ def rows(
         true_id = matched.get(i)
         truth = None if true_id is None else truths[true_id]
         row = replace(_scene_row(scene, common, truth), specularity=i, true_id=true_id)
+        row = rough.filled(row, i, truth)
         if not isinstance(patch := specularity.patch, Failure):
             bp_x, bp_y = patch.peak_px.tolist()
             row = replace(row, bp_x_px=bp_x, bp_y_px=bp_y, saturated_share=patch.saturated_share(HIGHLIGHT_ISOVALUE))
@@ -68,6 +74,7 @@ def rows(
     for j, truth in enumerate(truths):
         if missing := [name for name in estimators if (j, name) not in held]:
             row = replace(_scene_row(scene, common, truth), true_id=j, status=unfound)
+            row = rough.filled(row, None, truth)
             made += [replace(row, estimator=name) for name in missing]
     return made
 
@@ -77,6 +84,8 @@ def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> 
     # Scene.
     row = replace(
         common,
+        # All estimators state the fine surface's normal.
+        target=FINE,
         surface=scene.surface.label,
         reflectance=scene.reflectance.type,
         noise_sigma=scene.sensor.noise_sigma,
@@ -93,6 +102,8 @@ def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> 
         distance_mm=truth.distance,
         kd_min=truth.kd_min,
         kd_max=truth.kd_max,
+        kd_min_base=truth.kd_min_base,
+        kd_max_base=truth.kd_max_base,
         eps_over_d=float(np.linalg.norm(light)) / truth.distance,
         peak_snr=truth.peak_snr if np.isfinite(truth.peak_snr) else None,
         axis_ratio_law=float(laws.axis_ratio(truth.kd_min, truth.kd_max)),
@@ -141,16 +152,20 @@ def _error_row(
     error_look_deg = None
     if np.isfinite(estimate.look_px).all() and (look := session.cast(estimate.look_px[None])[0]).valid[0]:
         error_look_deg = float(angle_deg(estimate.normal, look.normal[0]))
+    error_fine_deg = float(angle_deg(estimate.normal, truth.normal))
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
     return replace(
         row,
         axis_ratio_seen_law=axis_ratio_seen(scene, estimate, truth, smoothing_px),
-        error_deg=float(angle_deg(estimate.normal, truth.normal)),
+        error_deg=error_fine_deg,
+        error_fine_deg=error_fine_deg,
+        error_base_deg=float(angle_deg(estimate.normal, truth.normal_base)),
         error_oracle_deg=float(to_truth.min()),
         error_look_deg=error_look_deg,
         error_law_deg=law_deg(scene, estimate, truth),
         error_look_law_deg=look_law_deg(scene, estimate, truth),
+        error_base_law_deg=base_law_deg(scene),
         rank_correct=int(to_truth.argmin()),
         mahalanobis2=mahalanobis2(estimate, truth.normal),
         gain_error=curvature.gain_error,

@@ -1,4 +1,4 @@
-"""Predictions of the laws of theory.md section 4 for an estimate at a true highlight."""
+"""Predictions of the laws of theory.md sections 4 and 7 for an estimate at a true highlight."""
 
 import numpy as np
 
@@ -8,10 +8,11 @@ from simtest.geometry.vectors import angle_deg
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
 from simtest.spec.falloff import CosineProfile
-from simtest.spec.reflectance import PhongReflectance
+from simtest.spec.reflectance import PhongReflectance, TissueReflectance
+from simtest.spec.relief import Relief
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
-from simtest.validation import laws
+from simtest.validation import laws, relief_laws
 
 SAME_DEG = 1e-4
 """Directions that differ by less are equal up to rounding."""
@@ -28,6 +29,9 @@ def law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> floa
     camera for those that take the reversed sightline for the normal; for others, which were told a distance, the
     effect of the distance's error.
     """
+    # The lobe of a source of finite size is another one: no law.
+    if scene.rig.lights[highlight.light].source is not None:
+        return None
     # Offset light and unknown falloff together: no law.
     light = scene.rig.true_mm()[highlight.light]
     offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
@@ -80,9 +84,8 @@ def _vignetting_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPo
 def lobe_curvature(scene: Scene) -> float:
     """Return c = -(log f)''(0) of a scene's lobe; that of a very narrow lobe where it has no closed form."""
     reflectance = scene.reflectance
-    if isinstance(reflectance, PhongReflectance):
-        return reflectance.lobe_curvature
-    return 1e6
+    known = isinstance(reflectance, PhongReflectance | TissueReflectance) and reflectance.lobe_curvature
+    return known or 1e6
 
 
 def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint, light: Array) -> float | None:
@@ -106,7 +109,8 @@ def axis_ratio_seen(scene: Scene, estimate: Estimate, highlight: HighlightPoint,
     isovalues = [isophote.isovalue for isophote in estimate.isophotes]
     if not isinstance(reflectance, PhongReflectance) or reflectance.normalised or reflectance.diffuse != 0:
         return None
-    at_camera = is_at_camera(scene.rig.true_mm()[highlight.light])
+    light = scene.rig.lights[highlight.light]
+    at_camera = is_at_camera(scene.rig.true_mm()[highlight.light]) and light.source is None
     if not (isovalues and at_camera and _takes_ratio_as_seen(estimate)):
         return None
     kd_min, kd_max = highlight.kd_min, highlight.kd_max
@@ -147,3 +151,50 @@ def look_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) ->
     first, second = highlight.direction_min, np.cross(highlight.normal, highlight.direction_min)
     miss = np.array([across @ first, across @ second])
     return float(np.degrees(laws.look_error(miss, highlight.kd_min, highlight.kd_max)))
+
+
+def base_law_deg(scene: Scene) -> float | None:
+    """Predict the mean error against the base's normal of the glints of a whole cloud, deg (theory.md 7.4).
+
+    For isotropic gaussian relief without pools; None for other surfaces.
+    """
+    relief = _lawful_relief(scene)
+    return None if relief is None else float(np.degrees(relief_laws.relief_error(np.radians(relief.slope_deg))))
+
+
+def glint_count_law(scene: Scene, centre: HighlightPoint) -> float | None:
+    """Predict the number of glints of the cloud around a highlight point of the base (theory.md 7.2).
+
+    For isotropic gaussian relief without pools under a light at the camera; None for others.
+    """
+    relief = _lawful_relief(scene)
+    if relief is None or not is_at_camera(scene.rig.true_mm()[centre.light]):
+        return None
+    # Bands are independent: their moments add.
+    squared = np.array([np.radians(band.slope_deg) ** 2 for band in relief.bands])
+    waves = np.array([band.wavelength_mm for band in relief.bands])
+    wave = np.sqrt(squared.sum() / np.sum(squared / waves**2))
+    gains = 1 + centre.kd_min, 1 + centre.kd_max
+    return relief_laws.glint_count(float(np.sqrt(squared.sum())), float(wave), centre.distance, gains)
+
+
+def centroid_law_deg(scene: Scene, centre: HighlightPoint, glints: int) -> float | None:
+    """Predict the mean error of the mean normal of so many glints, if they were independent, deg (theory.md 7.5).
+
+    Where `glint_count_law` holds; None elsewhere.
+    """
+    relief = _lawful_relief(scene)
+    if relief is None or not is_at_camera(scene.rig.true_mm()[centre.light]):
+        return None
+    gains = 1 + centre.kd_min, 1 + centre.kd_max
+    return float(np.degrees(relief_laws.independent_centroid_error(np.radians(relief.slope_deg), glints, gains)))
+
+
+def _lawful_relief(scene: Scene) -> Relief | None:
+    """Return a scene's relief where it is isotropic, gaussian and without pools, as the laws of glints take it."""
+    relief = scene.surface.relief
+    if relief is None or scene.film_level is not None:
+        return None
+    if any(band.kind != "gaussian" or band.anisotropy != 1 for band in relief.bands):
+        return None
+    return relief

@@ -15,6 +15,7 @@ from simtest.validation.cases import Case
 from simtest.validation.matching import match
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
+from simtest.validation.rough_truth import rough_truth
 
 
 @dataclass(frozen=True)
@@ -87,8 +88,14 @@ def realise(
     dark = view.full_scale <= 0
     # Without light whatever is found is noise; no highlight counts as isolated, and all count as failures.
     specularities = [] if dark else reconstruct(frame, view.calibration, estimators, isolated=case.isolated)
-    truths = [truth for truth in view.highlights if truth.isolated or not case.isolated or dark]
-    matched = match(specularities, truths)
+    counted = [i for i, truth in enumerate(view.highlights) if truth.isolated or not case.isolated or dark]
+    truths = [view.highlights[i] for i in counted]
+    matched = match(specularities, [truth.bp_px for truth in truths])
+    rough = None
+    if view.is_rough:
+        # Detection is scored on what can be seen: the relief melts and hides glints.
+        seen = match(specularities, [spot.peak_px for spot in view.visible_highlights])
+        rough = rough_truth(session, view, counted, seen)
     common = ResultRow(
         experiment=experiment.name,
         label=case.label,
@@ -99,5 +106,5 @@ def realise(
         swept={**case.swept, **drawn},
     )
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
-    made = rows(session, common, specularities, truths, matched, list(estimators), unfound)
+    made = rows(session, common, specularities, truths, matched, list(estimators), unfound, rough)
     return Realisation(number, view, made, frame, specularities, truths, matched)

@@ -8,6 +8,9 @@ import polars as pl
 Value = bool | int | float | str | None
 """What a column of results holds."""
 
+FINE = "fine"
+"""Target of an estimate that states the fine surface's normal, with the relief."""
+
 SCHEMA: dict[str, pl.DataType] = {
     "experiment": pl.String(), "label": pl.String(), "surface": pl.String(), "reflectance": pl.String(),
     "setting": pl.String(), "realisation": pl.Int64(), "specularity": pl.Int64(), "true_id": pl.Int64(),
@@ -24,6 +27,14 @@ SCHEMA: dict[str, pl.DataType] = {
     "n_lights": pl.Int64(), "saturated_share": pl.Float64(), "gain_1": pl.Float64(), "gain_2": pl.Float64(),
     "gain_error": pl.Float64(), "gain_oracle_error": pl.Float64(), "direction_error_deg": pl.Float64(),
     "axis_ratio_seen_law": pl.Float64(), "error_look_law_deg": pl.Float64(), "laws": pl.String(),
+    "target": pl.String(), "error_fine_deg": pl.Float64(), "error_base_deg": pl.Float64(),
+    "error_base_law_deg": pl.Float64(), "kd_min_base": pl.Float64(), "kd_max_base": pl.Float64(),
+    "visible_id": pl.Int64(), "visible_snr": pl.Float64(), "frame_visible": pl.Int64(),
+    "cloud": pl.Int64(), "pool": pl.Boolean(), "radius_px": pl.Float64(),
+    "radius_law_px": pl.Float64(), "cloud_glints": pl.Int64(), "cloud_glints_law": pl.Float64(),
+    "cloud_visible": pl.Int64(), "cloud_error_deg": pl.Float64(), "cloud_error_law_deg": pl.Float64(),
+    "cloud_kd_min": pl.Float64(), "cloud_kd_max": pl.Float64(), "cloud_cov_11": pl.Float64(),
+    "cloud_cov_12": pl.Float64(), "cloud_cov_22": pl.Float64(),
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
 
@@ -43,6 +54,7 @@ class ResultRow:
     setting: str | None = None
     seed: int | None = None
     laws: str | None = None
+    target: str | None = None
     swept: Mapping[str, Value] = field(default_factory=dict)
     # Scene.
     surface: str | None = None
@@ -54,6 +66,27 @@ class ResultRow:
     distance_mm: float | None = None
     kd_min: float | None = None
     kd_max: float | None = None
+    kd_min_base: float | None = None
+    kd_max_base: float | None = None
+    visible_id: int | None = None
+    visible_snr: float | None = None
+    frame_visible: int | None = None
+    cloud: int | None = None
+    pool: bool | None = None
+    radius_px: float | None = None
+    radius_law_px: float | None = None
+    # Its cloud.
+    cloud_glints: int | None = None
+    cloud_glints_law: float | None = None
+    cloud_visible: int | None = None
+    cloud_error_deg: float | None = None
+    cloud_error_law_deg: float | None = None
+    cloud_kd_min: float | None = None
+    cloud_kd_max: float | None = None
+    cloud_cov_11: float | None = None
+    cloud_cov_12: float | None = None
+    cloud_cov_22: float | None = None
+    # Light and noise at the true highlight.
     eps_over_d: float | None = None
     peak_snr: float | None = None
     axis_ratio_law: float | None = None
@@ -94,6 +127,9 @@ class ResultRow:
     error_look_deg: float | None = None
     error_law_deg: float | None = None
     error_look_law_deg: float | None = None
+    error_fine_deg: float | None = None
+    error_base_deg: float | None = None
+    error_base_law_deg: float | None = None
     rank_correct: int | None = None
     mahalanobis2: float | None = None
     gain_error: float | None = None

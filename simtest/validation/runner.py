@@ -122,6 +122,11 @@ def run_experiment(
     return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
 
 
+def _is_coloured(experiment: Experiment) -> bool:
+    """Return whether a scene of an experiment has the colour of tissue."""
+    return any("albedo" in case.data.get("reflectance", {}) for case in expand(experiment))
+
+
 def run_experiments(
     wanted: Sequence[tuple[Experiment, Path]],
     command: str = "",
@@ -135,7 +140,7 @@ def run_experiments(
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # The variant is chosen here: a worker on another machine may have another environment.
-    variant = backend.requested_variant(variant)
+    variant = backend.requested_variant(variant, coloured=any(_is_coloured(one) for one, _ in wanted))
     # Check: everything that may be refused is refused before a folder is touched.
     jobs = [_job(experiment, folder, variant) for experiment, folder in wanted]
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}

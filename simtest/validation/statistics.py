@@ -37,6 +37,8 @@ class Figures:
         Of the errors of the answers.
     mean_penalised_deg : float or None
         Mean with `PENALTY_DEG` for each failed or missed highlight.
+    mean_base_deg : float or None
+        Mean error against the base's normal; `mean_deg` itself without a relief.
     ci95_deg : tuple of float or None
         Confidence interval of the mean (`mean_interval`).
     coverage95 : float or None
@@ -49,6 +51,7 @@ class Figures:
     n_missed: int
     n_false: int
     mean_deg: float | None
+    mean_base_deg: float | None
     mean_oracle_deg: float | None
     rms_deg: float | None
     std_deg: float | None
@@ -87,8 +90,11 @@ def figures(rows: pl.DataFrame) -> Figures:
         n_ok=len(errors),
         n_failed_by_reason=dict(sorted(failed.iter_rows())),
         n_missed=true.filter(pl.col("status") == "missed").height,
-        n_false=rows.filter(pl.col("true_id").is_null()).height,
+        n_false=rows.filter(pl.col("true_id").is_null() & _sees_nothing(rows)).height,
         mean_deg=_or_none(np.mean, errors),
+        mean_base_deg=_or_none(np.mean, answered["error_base_deg"].drop_nulls().to_numpy())
+        if "error_base_deg" in rows.columns
+        else None,
         mean_oracle_deg=_or_none(np.mean, answered["error_oracle_deg"].to_numpy()),
         rms_deg=_or_none(lambda e: np.sqrt(np.mean(e**2)), errors),
         std_deg=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
@@ -99,6 +105,11 @@ def figures(rows: pl.DataFrame) -> Figures:
         ci95_deg=mean_interval(errors),
         coverage95=float(np.mean(distances <= stats.chi2.ppf(CONFIDENCE, 2))) if len(distances) else None,
     )
+
+
+def _sees_nothing(rows: pl.DataFrame) -> pl.Expr:
+    """Return where a detection shows nothing visible: on a relief a spot may melt several glints, or hold none."""
+    return pl.col("visible_id").is_null() if "visible_id" in rows.columns else pl.lit(True)
 
 
 def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:

@@ -126,7 +126,7 @@ FAULTS: dict[str, tuple[Mutation, ...]] = {
     "noise seed reused": (Mutation(Case.noise_seed, "realisation, Stage.SENSOR", "0, Stage.SENSOR"),),
     "falloff dropped": (
         Mutation(
-            DirectLight.radiance, "values, -direction) / squared)", "values, -direction))"
+            DirectLight._from, "values, -direction) / squared)", "values, -direction))"
         ),
     ),
     "normals in the world frame": (Mutation(exact.solve, "normal=exact.normal @ rotation", "normal=exact.normal"),),

@@ -111,6 +111,7 @@ def table_of(made):
     return pl.DataFrame([{**blank, **row} for row in kept.values()], schema=SCHEMA)
 
 
+@pytest.mark.slow
 @given(records, records)
 @settings(max_examples=40, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 def test_any_two_nights_have_a_verdict_without_a_nan(first, second):

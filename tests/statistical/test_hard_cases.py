@@ -277,7 +277,7 @@ def test_regions_cover_the_truth_on_a_generated_colon():
         seen = render_view(session, scene)
         truths = [truth for truth in seen.highlights if truth.isolated]
         spots = reconstruct(seen.frame(viewpoint), seen.calibration, HALVES)
-        for i, j in match(spots, truths).items():
+        for i, j in match(spots, [truth.bp_px for truth in truths]).items():
             for key, estimate in spots[i].estimates.items():
                 if not isinstance(estimate, Failure):
                     held[key].append(mahalanobis2(estimate, truths[j].normal) < 5.99)

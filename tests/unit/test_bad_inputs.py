@@ -35,12 +35,17 @@ def refused(call, *fragments):
 PLANE = '[surface]\ntype = "plane"\n'
 SPHERE = '[surface]\ntype = "sphere"\n'
 PHONG = PLANE + '[reflectance]\ntype = "phong"\n'
+TISSUE = PLANE + '[reflectance]\ntype = "tissue"\nfilm = {index = 1.36}\n'
+FILM = PLANE + '[reflectance]\ntype = "tissue"\n[reflectance.film]\n'
+WET = FILM + "index = 1.36\n"
+RELIEF = "\n[[surface.relief.bands]]\nslope_deg = 4\nwavelength_mm = 1"
+COLOURED = PHONG + "[reflectance.albedo]\n"
 LIGHT = PLANE + "[[rig.lights]]\n"
 CAMERA = PLANE + "[camera]\n"
 ANATOMY = '[surface]\ntype = "anatomy"\npath = "colon"\n'
 
 SCENES = {
-    "unknown key": (PLANE + "distance = 3", "surface.distance = 3: unknown key; allowed: distance_mm, tilt_deg"),
+    "unknown key": (PLANE + "distance = 3", "surface.distance = 3: unknown key; allowed: distance_mm, relief, "),
     "unknown table": ("[lamp]\n" + PLANE, "lamp = {}: unknown key; allowed: name, surface, reflectance"),
     "unknown type": ('[surface]\ntype = "cone"', "surface.type = 'cone': unknown; allowed: anatomy, cylinder, plane"),
     "type a number": ("[surface]\ntype = 5", "surface.type = 5: unknown; allowed: anatomy, cylinder, plane"),
@@ -56,6 +61,24 @@ SCENES = {
     "number for true": (PHONG + "normalised = 1", "reflectance.normalised = 1: must be true or false"),
     "more light than arrives": (PHONG + "normalised = true\ndiffuse = 0.3", "a diffuse base of 0.3 reflect more light"),
     "number for text": ("name = 5\n" + PLANE, "name = 5: must be a valid string"),
+    "unknown tissue": (COLOURED + 'preset = "skin"', "albedo.preset = 'skin': must be 'colon_mucosa'"),
+    "tissue a text": (PHONG + 'albedo = "liver"', "reflectance.albedo = 'liver': must be a table"),
+    "tissue a list": (PHONG + "albedo = [1]", "reflectance.albedo = [1]: must be a table"),
+    "tissue and diffuse": (PHONG + "diffuse = 0.3\nalbedo = {}", "diffuse and albedo exclude each other"),
+    "tissue and colour": (PHONG + "colour = [1, 0.5, 0.5]\nalbedo = {}", "colour and albedo exclude each other"),
+    "tissue brighter than arrives": (COLOURED + "base = [1.2, 0.3, 0.2]", "albedo.base.0 = 1.2: must be less"),
+    "tissue without blood": (COLOURED + "blood = 0", "albedo.blood = 0: must be greater than or equal"),
+    "negative mottling": (COLOURED + "mottling = {amplitude = -0.1}", "mottling.amplitude = -0.1: must be greater"),
+    "mottling a number": (COLOURED + "mottling = 0.1", "reflectance.albedo.mottling = 0.1: must be a table"),
+    "unknown key of vessels": (COLOURED + "vessels = {radius = 1}", "vessels.radius = 1: unknown key; allowed: l"),
+    "calibres turned round": (COLOURED + "vessels = {smallest_mm = 0.6}", "largest_mm = 0.5 and smallest_mm = 0.6"),
+    "too many calibres": (COLOURED + "vessels = {smallest_mm = 0.01}", "more than the smallest and at most 30 times"),
+    "vessels too near": (COLOURED + "vessels = {spacing_mm = 0.3}", "vessels must not be wider than their spacing"),
+    "vessels too deep": (COLOURED + "vessels = {depth_mm = 9}", "vessels.depth_mm = 9: must be less than or"),
+    "NaN for a calibre": (COLOURED + "vessels = {largest_mm = nan}", "largest_mm = nan: must be a finite number"),
+    "text for a saturation": (COLOURED + 'vessels = {venous_saturation = "0.7"}', "= '0.7': must be a number"),
+    "endless capillaries": (COLOURED + "capillaries = {spacing_mm = 0}", "capillaries.spacing_mm = 0: must be greater"),
+    "negative seed of tissue": (COLOURED + "seed = -1", "reflectance.albedo.seed = -1: must be greater than or equal"),
     "empty name": ('name = ""\n' + PLANE, "name = '': must have at least 1 character"),
     "NaN": (PLANE + "distance_mm = nan", "surface.distance_mm = nan: must be a finite number"),
     "infinity": (PLANE + "distance_mm = -inf", "surface.distance_mm = -inf: must be a finite number"),
@@ -85,6 +108,22 @@ SCENES = {
     "exponent 0": (PHONG + "exponent = 0", "reflectance.exponent = 0: must be greater than 0"),
     "exponent negative": (PHONG + "exponent = -50.0", "reflectance.exponent = -50.0: must be greater than 0"),
     "another type's key": (PHONG + "alpha = 0.2", "reflectance.alpha = 0.2: unknown key; allowed: diffuse, colour"),
+    "no film": (PLANE + '[reflectance]\ntype = "tissue"', "reflectance.film: missing; it must be given"),
+    "film without index": (FILM + "alpha = 0.03", "reflectance.film.index: missing; it must be given"),
+    "film of glass": (FILM + "index = 1.5", "reflectance.film.index = 1.5: must be less than or equal to 1.4"),
+    "film of air": (FILM + "index = 1.0", "reflectance.film.index = 1.0: must be greater than or equal to 1.33"),
+    "film too rough": (WET + "alpha = 0.5", "reflectance.film.alpha = 0.5: must be less than or equal to 0.1"),
+    "film too smooth": (WET + "alpha = 0.001", "reflectance.film.alpha = 0.001: must be greater than or equal to 0.01"),
+    "film of Phong": (WET + 'distribution = "phong"', "film.distribution = 'phong': must be 'beckmann' or 'ggx'"),
+    "level without relief": (WET + "level = 0.5", "reflectance.film.level = 0.5: there are no valleys to fill"),
+    "level too high": (WET + "level = 4" + RELIEF, "reflectance.film.level = 4: must be less than or equal to 3"),
+    "level NaN": (WET + "level = nan" + RELIEF, "reflectance.film.level = nan: must be a finite number"),
+    "level in quotes": (WET + 'level = "high"' + RELIEF, "reflectance.film.level = 'high': must be a number"),
+    "film a number": (TISSUE.replace("{index = 1.36}", "1.36"), "reflectance.film = 1.36: must be a table"),
+    "film misspelt": (WET + "roughness = 0.1", "reflectance.film.roughness = 0.1: unknown key; allowed: index, alpha"),
+    "film of Phong's": (PHONG + "film = {index = 1.36}", "reflectance.film = {'index': 1.36}: unknown key; allowed:"),
+    "exponent of tissue": (TISSUE + "exponent = 50", "reflectance.exponent = 50: unknown key; allowed: diffuse"),
+    "tissue too bright": (TISSUE + "diffuse = 1.2", "reflectance.diffuse = 1.2: must be less than or equal to 1"),
     "colour over 1": (PHONG + "colour = [0.5, 1.5, 0.5]", "reflectance.colour.1 = 1.5: must be less than or"),
     "colour of two": (PHONG + "colour = [1, 0]", "reflectance.colour.2: missing"),
     "colour in quotes": (PHONG + 'colour = ["1", 0, 0]', "reflectance.colour = ['1', 0, 0]: must be numbers"),
@@ -177,7 +216,7 @@ SETTINGS = {
     "surface.distance_mm=1\nfoo=2": r"surface.distance_mm = '1\nfoo=2': must be a number",
     "camera.width=" + "[" * 100_000: "camera.width = '[[[",
     "camera.width=" + "9" * 5000: "camera.width = '999",
-    "surface.typo=1": "surface.typo = 1: unknown key; allowed: type, distance_mm",
+    "surface.typo=1": "surface.typo = 1: unknown key; allowed: type, relief, distance_mm",
     "surface..x=1": "surface.'' = {'x': 1}: unknown key",
     "surface.distance_mm.x=1": "surface.distance_mm.x: surface.distance_mm is a plain value, not a table",
     "surface.distance_mm.x.y=1": "surface.distance_mm.x.y: x is below a plain value, not a table",

@@ -143,7 +143,7 @@ BAD_USE = {
     "render plane --out x --set tilt": "--set tilt: must be key=value, for example surface.distance_mm=12",
     "render plane --out x --set =3": "--set =3: must be key=value",
     "render plane --out x --set surface.tilt_deg=95": "values: surface.tilt_deg = 95: must be less than 90",
-    "render plane --out x --set surface.typo=1": "surface.typo = 1: unknown key; allowed: type, distance_mm",
+    "render plane --out x --set surface.typo=1": "surface.typo = 1: unknown key; allowed: type, relief, distance_mm",
     "render plane --out x --set surface.tilt_deg=steep": "surface.tilt_deg = 'steep': must be a number",
     "render plane --out x --set rig.lights.3.power=2": "index 3 is not allowed; the first item is 0",
     "render plane --out x --set surface.tilt_deg.x=1": "surface.tilt_deg is a plain value, not a table",
@@ -232,7 +232,7 @@ def test_the_default_schema_is_the_scenes(here):
 TRUTH = {
     "depth_mm": (), "position_mm": (3,), "normal": (3,), "shading_normal": (3,), "geometric_normal": (3,),
     "curvature": (2,), "direction_min": (3,), "direction_max": (3,), "radiance_specular": (), "radiance_diffuse": (),
-    "radiance_indirect": (), "mask": (),
+    "radiance_indirect": (), "mask": (), "normal_base": (3,), "curvature_base": (2,), "pool": (),
 }  # fmt: skip
 
 
@@ -269,7 +269,7 @@ def test_render_writes_its_files_with_the_documented_keys(frames):
         assert set(truth.files) == set(TRUTH)
         for name, tail in TRUTH.items():
             assert truth[name].shape == (96, 96, *tail)
-            assert truth[name].dtype == (bool if name == "mask" else np.float32)
+            assert truth[name].dtype == (bool if name in ("mask", "pool") else np.float32)
         mask, normal = truth["mask"], truth["normal"]
         assert mask.any()
         assert not mask.all()

@@ -61,6 +61,8 @@ REFLECTANCES = {
     "rough plastic": {"type": "rough_plastic", "alpha": 0.1, "colour": [0.8, 0.4, 0.3]},
     "principled": {"type": "principled", "roughness": 0.3},
     "rough conductor": {"type": "rough_conductor", "alpha": 0.2, "diffuse": 0.3},
+    "albedo": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.05}, "colour": [0.8, 0.4, 0.3]},
+    "tissue GGX": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.05, "distribution": "ggx"}},
 }
 CASES = [(name, "phong", AT_CAMERA if i % 2 else ASIDE) for i, name in enumerate(SURFACES) if name != "liver"]
 CASES.append(pytest.param("liver", "phong", ASIDE, marks=pytest.mark.slow))
@@ -88,17 +90,20 @@ def test_shadows_are_exported(session, tmp_path):
 
 
 TUBE = {"type": "cylinder", "radius_mm": 12.0, "side": "inside"}
+WIDE = {**PHONG, "exponent": 5.0, "diffuse": 0.7}
+WET = {"type": "tissue", "film": {"index": 1.36, "alpha": 0.1}, "diffuse": 0.9}
 SPREAD = {
-    "two lights": ({"samples_per_pixel": 64}, (AT_CAMERA, {**ASIDE, "power": 1.0}), SURFACES["plane"]),
-    "bounces": ({"samples_per_pixel": 16, "path_depth": 3}, (ASIDE,), TUBE),
+    "two lights": ({"samples_per_pixel": 64}, (AT_CAMERA, {**ASIDE, "power": 1.0}), SURFACES["plane"], WIDE),
+    "bounces": ({"samples_per_pixel": 16, "path_depth": 3}, (ASIDE,), TUBE, WIDE),
+    "bounces off tissue": ({"samples_per_pixel": 64, "path_depth": 3}, (ASIDE,), TUBE, WET),
 }
 
 
 @pytest.mark.parametrize("name", SPREAD)
 def test_sampled_pictures_have_the_same_mean(session, tmp_path, name):
     """Over all pixels together, within 3 standard errors; 1 % more would be seen."""
-    render, lights, surface = SPREAD[name]
-    described = scene(surface, {**PHONG, "exponent": 5.0, "diffuse": 0.7}, lights, render)
+    render, lights, surface, reflectance = SPREAD[name]
+    described = scene(surface, reflectance, lights, render)
     session.update(described)
     expected = session.radiance().total.astype(float)
     image = loaded(session, described, tmp_path)
@@ -121,14 +126,15 @@ def test_one_sample_where_it_cannot_do_becomes_many(tmp_path):
     assert sampler((ASIDE,), {"samples_per_pixel": 9}) == ("independent", 9)
 
 
-def test_the_line_in_the_file_makes_it_load(session, tmp_path):
-    text = simtest.export(scene(SURFACES["quadric"]), tmp_path)[0].read_text()
+@pytest.mark.parametrize(("name", "shown"), [("phong", "Phong[exponent=40"), ("tissue GGX", "Tissue[alpha=0.05")])
+def test_the_line_in_the_file_makes_it_load(session, tmp_path, name, shown):
+    text = simtest.export(scene(SURFACES["quadric"], REFLECTANCES[name]), tmp_path)[0].read_text()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.xml", "surface.ply"]
     line = next(line.strip() for line in text.splitlines() if "import register" in line)
     code = "import mitsuba as mi; mi.set_variant('scalar_rgb')\n" + line
     code += "\nprint(mi.load_file('scene.xml').shapes()[0].bsdf())"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert "Phong[exponent=40" in done.stdout, done.stderr
+    assert shown in done.stdout, done.stderr
 
 
 def test_mitsuba_alone_loads_what_is_its_own(session, tmp_path):
@@ -179,6 +185,7 @@ def test_what_mitsuba_cannot_express_is_refused(tmp_path):
     rig = described.rig
     cases = {
         "camera.fx = 81.0": scene(SURFACES["plane"], camera={"fx": 81.0}),
+        "reflectance.albedo = 'stomach'": scene(SURFACES["plane"], {"type": "phong", "albedo": {"preset": "stomach"}}),
         "camera.skew = 2.0": scene(SURFACES["plane"], camera={"skew": 2.0}),
         "rig.lights.1.profile = 'cos'": with_parts(
             described,
@@ -190,6 +197,9 @@ def test_what_mitsuba_cannot_express_is_refused(tmp_path):
         ),
         "camera.distortion = KannalaBrandtSpec(": scene(
             SURFACES["plane"], camera={"distortion": {"type": "kannala_brandt"}}
+        ),
+        "surface.relief = {'bands': ": scene(
+            {**SURFACES["plane"], "relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.0}]}}
         ),
         "camera.view_mask = ViewMaskSpec(": scene(SURFACES["plane"], camera={"view_mask": {"radius": 30.0}}),
     }

@@ -367,6 +367,10 @@ SWEPT = {
     "rough plastic": [{"type": "rough_plastic", "alpha": 0.1 + 0.05 * i, "diffuse": 0.2 * i} for i in range(4)],
     "principled": [{"type": "principled", "roughness": 0.2 + 0.1 * i, "diffuse": 0.2 * i} for i in range(4)],
     "rough conductor": [{"type": "rough_conductor", "alpha": 0.1 + 0.1 * i, "diffuse": 0.2 * i} for i in range(4)],
+    "tissue": [
+        {"type": "tissue", "diffuse": 0.2 * i, "film": {"index": 1.33 + 0.02 * i, "alpha": 0.03 + 0.02 * i}}
+        for i in range(4)
+    ],
 }
 
 

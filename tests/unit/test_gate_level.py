@@ -1,6 +1,7 @@
 """The gate's level on nights of fresh seeds, with a rise that it must see as the negative control."""
 
 import polars as pl
+import pytest
 from gate_nights import night, rows
 from scipy import stats
 
@@ -20,6 +21,7 @@ def alarms(nights, factor, seed):
     return found
 
 
+@pytest.mark.slow
 def test_fresh_seeds_alone_are_no_regression():
     """12 nights at a level of 1 %: more than 2 alarms have a chance below 0.001; threefold errors are always seen."""
     assert stats.binom.sf(2, 12, 0.01) < 0.001

@@ -115,7 +115,9 @@ def test_realisations_reach_every_group():
 def spot(x, lit):
     place = np.array([0, 0, 10.0])
     normal, along = np.array([0, 0, -1.0]), np.array([1.0, 0, 0])
-    return HighlightPoint(0, np.array([x, 30.0]), place, normal, along, 10.0, 0.2, 0.5, lit, 1.0)
+    return HighlightPoint(
+        0, np.array([x, 30.0]), place, normal, along, 10.0, 0.2, 0.5, lit, 1.0, normal, 0.2, 0.5, pool=False
+    )
 
 
 def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
@@ -213,7 +215,9 @@ def test_false_detections_that_failed_are_counted():
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("name", ["plane", "cylinder", "sphere", "saddle", "anatomy"])
+@pytest.mark.parametrize(
+    "name", ["plane", "cylinder", "sphere", "saddle", pytest.param("anatomy", marks=pytest.mark.slow)]
+)
 def test_a_rendered_picture_can_be_reconstructed(name, tmp_path):
     """sRGB encoding lifts the noise of dark pixels: undone before detection."""
     write_frame(simtest.render(name), tmp_path / "frame")

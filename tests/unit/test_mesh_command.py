@@ -43,6 +43,7 @@ def here(monkeypatch, capsys, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_in_two_processes_and_another_for_another(tmp_path):
     size = ("--set", "length_mm=40", "--edge-mm", 1.5, "--curvature")
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):

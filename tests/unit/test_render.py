@@ -266,6 +266,7 @@ MATERIALS = {
     "rough plastic": {"type": "rough_plastic", "alpha": 0.15},
     "principled": {"type": "principled", "roughness": 0.3},
     "rough conductor": {"type": "rough_conductor", "alpha": 0.2, "diffuse": 0.3},
+    "albedo": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.1}},
 }
 
 

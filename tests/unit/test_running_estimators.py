@@ -198,8 +198,8 @@ def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
     assert len(describe(made, CAMERA)) == 2
     # The truth lies at the second estimate's pixel; the detection keeps it all the same.
     true = SimpleNamespace(bp_px=np.array([50.45, 49.6]))
-    assert match([alone, detected], [true]) == {1: 0}
-    assert match([alone], [true]) == {0: 0}
+    assert match([alone, detected], [true.bp_px]) == {1: 0}
+    assert match([alone], [true.bp_px]) == {0: 0}
 
 
 # What counts as an estimator ------------------------------------------------------------------------------------------

@@ -58,6 +58,7 @@ def test_only_anatomies_are_sampled(tmp_path):
         api.sample_views("anatomy", tmp_path, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_a_sequence_leaves_no_place_out_and_is_a_film(tmp_path):
     (tmp_path / "view_0007.png").write_text("of an earlier call")

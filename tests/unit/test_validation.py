@@ -35,7 +35,7 @@ def truth_at(x, y, normal=NORTH, light=0):
     return TrueHighlight(
         light=light, bp_px=np.array([x, y]), position=np.array([0, 0, 10.0]), normal=normal,
         direction_min=np.array([1.0, 0.0, 0.0]), distance=10.0, kd_min=0.2, kd_max=0.5, lit=True, radiance=1.0,
-        peak_snr=50.0, why_not="",
+        peak_snr=50.0, why_not="", normal_base=normal, kd_min_base=0.2, kd_max_base=0.5, pool=False,
     )  # fmt: skip
 
 
@@ -50,6 +50,10 @@ def spots(*centres, sigma=5.0):
     return sum(a * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * sigma**2)) for u, v, a in centres).astype(np.float32)
 
 
+def matched_to(found, truths):
+    return match(found, [truth.bp_px for truth in truths])
+
+
 # Matching ------------------------------------------------------------------------------------------------------------
 
 
@@ -57,26 +61,26 @@ def test_each_detection_takes_the_truth_inside_its_isophote():
     found = reconstruct(spots((40, 40, 1.0), (100, 70, 0.7)), CAMERA, {})
     assert [s.region.peak for s in found] == [(39, 39), (99, 69)]
     truths = [truth_at(100.4, 69.2), truth_at(41, 40)]
-    assert match(found, truths) == {0: 1, 1: 0}
+    assert matched_to(found, truths) == {0: 1, 1: 0}
     # The isophote at t = 0.5 of a spot of 5 px has a radius of 5.9 px; the smoothing of 2 px makes it 6.3.
-    assert match(found, [truth_at(46.0, 40)]) == {0: 0}
-    assert match(found, [truth_at(47.0, 40)]) == {}
+    assert matched_to(found, [truth_at(46.0, 40)]) == {0: 0}
+    assert matched_to(found, [truth_at(47.0, 40)]) == {}
 
 
 def test_the_nearest_truth_wins_and_the_others_stay_unmatched():
     wide = detection(0, 0, 50, 50, (20, 20))
-    assert match([wide], [truth_at(30, 20), truth_at(22, 20), truth_at(10, 20)]) == {0: 1}
-    assert match([wide], [truth_at(60, 20)]) == {}
+    assert matched_to([wide], [truth_at(30, 20), truth_at(22, 20), truth_at(10, 20)]) == {0: 1}
+    assert matched_to([wide], [truth_at(60, 20)]) == {}
     # The peak's pixel (20, 20) has its centre at 20.5: 20.9 is nearer than 20.0.
-    assert match([wide], [truth_at(20.0, 20.5), truth_at(20.9, 20.5)]) == {0: 1}
+    assert matched_to([wide], [truth_at(20.0, 20.5), truth_at(20.9, 20.5)]) == {0: 1}
 
 
 def test_a_truth_is_given_to_one_detection_only():
     far, near = detection(0, 0, 50, 50, (5, 5)), detection(10, 10, 50, 50, (24, 24))
-    assert match([far, near], [truth_at(25, 25)]) == {1: 0}
+    assert matched_to([far, near], [truth_at(25, 25)]) == {1: 0}
     # The second best pair is kept where it does not collide.
-    assert match([far, near], [truth_at(25, 25), truth_at(12, 12)]) == {1: 0, 0: 1}
-    assert match([], [truth_at(1, 1)]) == {}
+    assert matched_to([far, near], [truth_at(25, 25), truth_at(12, 12)]) == {1: 0, 0: 1}
+    assert matched_to([], [truth_at(1, 1)]) == {}
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -107,7 +111,7 @@ def test_rows_count_matched_false_and_missed():
         detection(100, 80, 20, 20, (110, 90), {"a": estimate(NORTH), "b": estimate(NORTH)}),
     ]
     truths = [truth_at(21, 21), truth_at(75, 100)]
-    made = rows(*context(), found, truths, match(found, truths), ["a", "b"])
+    made = rows(*context(), found, truths, matched_to(found, truths), ["a", "b"])
     frame = table(made, {})
     assert frame.columns == list(SCHEMA)
     assert len(frame) == 6
@@ -160,8 +164,8 @@ def test_angles_are_exact_near_zero_and_near_180_deg():
 def hand_made():
     """Two ok, one failed, one missed, two false (one failed) of estimator a; three ok of b."""
     lines = [
-        ("s1", "a", 0, "ok", 1.0, 0.5, 2.0),
-        ("s1", "a", 1, "ok", 3.0, 3.0, 8.0),
+        ("s1", "a", 0, "ok", 1.0, 0.5, 2.0, 3.0),
+        ("s1", "a", 1, "ok", 3.0, 3.0, 8.0, 5.0),
         ("s1", "a", 2, "not_an_ellipse", None, None, None),
         ("s1", "a", 3, "missed", None, None, None),
         ("s1", "a", None, "ok", None, None, None),
@@ -171,8 +175,17 @@ def hand_made():
         ("s1", "b", 2, "ok", 5.0, 5.0, None),
         ("s0", "a", 0, "missed", None, None, None),
     ]
-    names = ("setting", "estimator", "true_id", "status", "error_deg", "error_oracle_deg", "mahalanobis2")
-    return table([ResultRow(**dict(zip(names, line, strict=True))) for line in lines], {})
+    names = (
+        "setting",
+        "estimator",
+        "true_id",
+        "status",
+        "error_deg",
+        "error_oracle_deg",
+        "mahalanobis2",
+        "error_base_deg",
+    )
+    return table([ResultRow(**dict(zip(names, line, strict=False))) for line in lines], {})
 
 
 def test_summary_of_a_hand_made_table():
@@ -183,6 +196,7 @@ def test_summary_of_a_hand_made_table():
     assert a.n_failed_by_reason == {"not_an_ellipse": 1}
     assert a.mean_deg == pytest.approx(2.0)
     assert a.mean_oracle_deg == pytest.approx(1.75)
+    assert a.mean_base_deg == pytest.approx(4.0)
     assert a.rms_deg == pytest.approx(np.sqrt(5))
     assert a.std_deg == pytest.approx(np.sqrt(2))
     assert a.median_deg == pytest.approx(2.0)
@@ -246,7 +260,7 @@ def test_every_branch_of_the_seed_tree_is_another():
     ]
     states = {sequence(*branch).generate_state(4).tobytes() for branch in branches}
     assert len(states) == len(branches)
-    assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4]
+    assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4, 5]
 
 
 # Cases ---------------------------------------------------------------------------------------------------------------

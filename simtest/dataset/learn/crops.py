@@ -43,7 +43,7 @@ class Crops:
     rotation : ndarray of float32, shape (N, 2)
         True normal as a vector of the tangent basis of `towards`, rad.
     normal : ndarray, shape (N, 3)
-        True unit normal, camera frame.
+        True unit normal of the fine surface, camera frame.
     axis_ratio : ndarray of float32, shape (N,)
         abs(1 + d k) of the smaller over that of the larger, at the true BP.
     index : ndarray of int64, shape (N,)

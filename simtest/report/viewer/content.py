@@ -14,6 +14,8 @@ from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Scene
 
 GRID = 240  # samples of the visible surface along the longer side of the frame
+FINE_GRID = 1000  # the same where relief or vessels are to be seen: they are as fine as a pixel
+BRIGHTEST = 0.9  # share of full scale that the brightest colours of tissue are shown with
 OCCLUSION = 1.15  # factor between the distances of neighbouring samples beyond which there is an edge
 CAMERA, TRUE = "camera", "true normal"
 
@@ -24,7 +26,9 @@ class Content:
 
     vertices: Array  # samples of the visible surface, shape (V, 3)
     faces: IntArray  # triangles between them, shape (F, 3)
-    curvature: Array  # principal curvature of larger size, 1/mm, convex towards the camera positive, shape (V,)
+    curvature: Array  # of the base: principal one of larger size, 1/mm, convex to the camera positive, shape (V,)
+    normal: Array  # unit normals of the fine surface, shape (V, 3), or (0, 3) without a relief
+    colour: Array  # of the tissue, sRGB from 0 to 1, shape (V, 3), or (0, 3) without one
     lights: Array  # shape (L, 3)
     names: AnyArray  # `CAMERA`, `TRUE` or an estimator, shape (S,)
     starts: Array  # shape (S, 3)
@@ -48,7 +52,7 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     """
     session = Session(scene, variant)
     seen = render_view(session, scene)
-    vertices, faces, curvature = _visible(session)
+    vertices, faces, curvature, normal, colour = _visible(session)
     distance = np.linalg.norm(vertices, axis=1)
     near, reach = 0.5 * float(np.quantile(distance, 0.05)), 0.35 * float(np.median(distance))
 
@@ -67,17 +71,37 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     segments += [(name, look, look + reach * normal) for name, look, normal in estimates]
     names, starts, ends = zip(*segments, strict=True)
     lights = np.asarray(scene.rig.true_mm())
-    return Content(vertices, faces, curvature, lights, np.array(names), np.array(starts), np.array(ends))
+    shown = (vertices, faces, curvature, normal, colour)
+    return Content(*shown, lights, np.array(names), np.array(starts), np.array(ends))
 
 
-def _visible(session: Session) -> tuple[Array, IntArray, Array]:
-    stride = max(1, -(-max(session.camera.width, session.camera.height) // GRID))
+def _visible(session: Session) -> tuple[Array, IntArray, Array, Array, Array]:
+    """Sample the visible surface; return vertices, faces, curvature, fine normals and colours (see `Content`)."""
+    relief, tissue = session.surface.relief is not None, session.scene.albedo
+    grid = FINE_GRID if relief or tissue else GRID
+    stride = max(1, -(-max(session.camera.width, session.camera.height) // grid))
     truth = session.truth(stride)
-    position, curvature = (np.asarray(part, dtype=float) for part in (truth.position, truth.larger_curvature))
+    position = np.asarray(truth.position, dtype=float)
+    # Curvature is the base's: that of the relief would be noise.
+    k_min, k_max = truth.k_min_base, truth.k_max_base
+    curvature = np.asarray(np.where(np.abs(k_max) >= np.abs(k_min), k_max, k_min), dtype=float)
     faces, valid = grid_triangles(position, OCCLUSION), np.isfinite(position).all(axis=-1)
     if not len(faces):
         raise InputError("the camera sees no surface; move it or choose another viewpoint")
-    return position[valid], faces, curvature[valid]
+    normal = np.asarray(truth.normal, dtype=float)[valid] if relief else np.empty((0, 3))
+    colour = np.empty((0, 3))
+    if tissue is not None:
+        from simtest.surfaces.tissue_pattern import make_pattern
+
+        albedo = make_pattern(session.surface, tissue).albedo(session.to_model(position[valid]))
+        colour = _srgb(BRIGHTEST * albedo / np.quantile(albedo.max(axis=1), 0.99))
+    return position[valid], faces, curvature[valid], normal, colour
+
+
+def _srgb(linear: Array) -> Array:
+    """Return linear values as sRGB's, from 0 to 1."""
+    value = np.clip(linear, 0, 1)
+    return np.asarray(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
 
 
 def _estimates(session: Session, seen: RenderedView) -> list[tuple[str, Array, Array]]:

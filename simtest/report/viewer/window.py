@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from simtest.errors import InputError
 from simtest.report.viewer.content import CAMERA, TRUE, Content
@@ -23,6 +24,11 @@ SIZE = (1280, 800)
 LINES = {CAMERA: ("black", 2), TRUE: ("black", 3),
          "circle_pose": ("#d95f02", 6), "brightest_point": ("#7570b3", 6), "cone_axis": ("#1b9e77", 6)}  # fmt: skip
 """Colour and width of lines."""
+
+PLAIN = {"ambient": 0.8, "diffuse": 0.2}
+MATT = {"ambient": 0.5, "diffuse": 0.5}
+ROUGH = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.5, "specular_power": 40.0}
+"""Shading: of curvature, of colour, and of a relief, which shows by its glints."""
 
 OTHER, LIGHT = "#666666", "#f2c500"
 DONE = "simtest view: drawn"
@@ -102,17 +108,50 @@ def _plot(content: Content, screenshot: str | None) -> None:
     plotter.set_background("white")
     faces = np.column_stack([np.full(len(content.faces), 3), content.faces]).ravel()
     surface = pyvista.PolyData(content.vertices, faces)
+    # The normals of the relief shade the surface; without one, VTK's own.
+    rough, coloured = len(content.normal) > 0, len(content.colour) > 0
+    if rough:
+        surface.point_data.active_normals = content.normal
+    light = ROUGH if rough else PLAIN
+    if coloured:
+        surface["colour"] = np.round(255 * content.colour).astype(np.uint8)
+        light = light if rough else MATT
+        actor = plotter.add_mesh(surface, scalars="colour", rgb=True, smooth_shading=not rough, **light)
+    else:
+        actor = _add_curvature(plotter, surface, content, light, rough)
+    if rough:
+        actor.prop.interpolation = "Phong"
+    _add_lines(plotter, content)
+    _move_viewer(plotter, content)
+    if screenshot is None:
+        plotter.show(title="simtest view")
+    else:
+        plotter.screenshot(screenshot)
+    plotter.close()
+
+
+def _add_curvature(plotter: Any, surface: Any, content: Content, light: dict[str, float], rough: bool) -> Any:
+    """Add the surface coloured by curvature; return its actor."""
+    import numpy as np
+
     surface["curvature"] = content.curvature
     # A few sharp edges must not take all the colours.
     limit = max(float(np.quantile(np.abs(content.curvature[np.isfinite(content.curvature)]), 0.97)), 1e-4)
-    plotter.add_mesh(
-        surface, scalars="curvature", cmap="RdBu_r", clim=(-limit, limit), nan_color="grey", smooth_shading=True,
-        ambient=0.8, diffuse=0.2,
+    return plotter.add_mesh(
+        surface, scalars="curvature", cmap="RdBu_r", clim=(-limit, limit), nan_color="grey", smooth_shading=not rough,
+        **light,
         scalar_bar_args={"title": "curvature of larger size (1/mm), convex positive", "color": "black",
                          "vertical": False, "fmt": "%.3g", "n_labels": 5, "title_font_size": 18, "label_font_size": 15,
                          "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25,
                          "position_y": 0.02},
     )  # fmt: skip
+
+
+def _add_lines(plotter: Any, content: Content) -> None:
+    """Add camera, lights and normals, with a legend."""
+    import numpy as np
+    import pyvista
+
     legend: list[tuple[str, str]] = []
     for name in dict.fromkeys(content.names.tolist()):
         own = content.names == name
@@ -123,12 +162,6 @@ def _plot(content: Content, screenshot: str | None) -> None:
     plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
     legend.insert(1, ("light", LIGHT))
     plotter.add_legend([list(entry) for entry in legend], bcolor="white", border=True, size=(0.16, 0.032 * len(legend)))
-    _move_viewer(plotter, content)
-    if screenshot is None:
-        plotter.show(title="simtest view")
-    else:
-        plotter.screenshot(screenshot)
-    plotter.close()
 
 
 def _move_viewer(plotter: object, content: Content) -> None:

@@ -1,0 +1,260 @@
+"""Glints: all zeros of the misfit between the fine normal and the bisector on a surface with relief (theory.md 7.1).
+
+They are hundreds a frame, and small. The misfit of the rendered frame, a value a pixel, shows where a zero is near;
+exact Newton steps with the closed derivative of the fine normal finish.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from simtest.geometry.vectors import tangent_basis
+from simtest.rendering.frames import HighlightPoint, Radiance
+from simtest.rendering.highlights import brightest_first, describe
+from simtest.runtime.arrays import Array, Image, IntArray, Mask
+from simtest.surfaces.model import SurfacePoints
+from simtest.surfaces.relief_field import normal_derivative
+
+if TYPE_CHECKING:
+    from simtest.rendering.session import Session
+
+NEAR_PX = 1.5
+"""A pixel whose own Newton step is shorter than this is a seed."""
+
+GRID_WAVE = 6.0
+"""Steps of the seeds' grid per wave of the finest band; pixels that are wider are divided."""
+
+MAX_DIVISION = 4
+LEAST_WAVE_PX = 1.5
+"""Pixels are divided by at most this. Relief whose waves are shorter than this many px is not resolved there, and acts
+as roughness."""
+
+NEWTON_STEPS = 40
+PATIENT_STEPS, LEAST_FALL = 5, 0.7
+"""After so many steps each one must lower the misfit to this share."""
+
+MAX_STEP_PX = 2.0
+ZERO = 1e-9
+"""A glint's fine normal is the bisector to within this, rad."""
+
+SAME_PX = 0.02
+"""Glints closer than this are the same zero, found twice."""
+
+SAME_SEED_PX = 0.5
+DIFFERENCE_PX = 1e-2
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Misfit between fine normal and bisector at pixel positions.
+
+    Parameters
+    ----------
+    w : ndarray, shape (N, 2)
+        Its components across the sightline.
+    jacobian : ndarray, shape (N, 2, 2)
+        Their derivatives along the image's axes, 1/px.
+    length : ndarray, shape (N,)
+        Of the whole misfit, rad: abs(tau) of theory.md section 7.
+    """
+
+    w: Array
+    jacobian: Array
+    length: Array
+
+
+def is_resolved(session: "Session") -> bool:
+    """Return whether any part of the frame resolves the relief."""
+    return bool((wave_px(session) >= LEAST_WAVE_PX).any())
+
+
+def find(session: "Session", radiance: Radiance) -> list[HighlightPoint]:
+    """Find the glints of all lights in view, the brightest first, with the frame's radiance.
+
+    Those of parts of the frame that do not resolve the relief are left out.
+    """
+    found = []
+    for index in range(len(session.scene.rig.lights)):
+        pixels = search(session, index)
+        if len(pixels):
+            found += describe(session, radiance, pixels, index)
+    return brightest_first(found)
+
+
+def search(session: "Session", index: int) -> Array:
+    """Find the glints of the light of an index; return their pixels, shape (N, 2)."""
+    # Seeds: pixels whose own Newton step is short.
+    seeds, light = _seeds(session, index), session.scene.rig.true_mm()[index]
+    # Refine on the exact surface; seeds of one zero meet.
+    found = _newton(session, seeds, light)
+    return distinct(found[session.camera.contains(found)], SAME_PX)
+
+
+def wave_px(session: "Session") -> Image:
+    """Return how many pixels the relief's finest wave spans at each pixel, shape (H, W); NaN without a surface."""
+    assert session.surface.relief is not None
+    maps = session.misfits()
+    distance = maps.distance[maps.margin : -maps.margin, maps.margin : -maps.margin]
+    return session.surface.relief.finest_wave * max(session.camera.fx, session.camera.fy) / distance
+
+
+def _seeds(session: "Session", index: int) -> Array:
+    """Return where short Newton steps of the grid lead, shape (N, 2), px, where the frame resolves the relief."""
+    waves = wave_px(session)
+    resolved = waves >= LEAST_WAVE_PX
+    if not resolved.any():
+        return np.empty((0, 2))
+    # As fine as most of the resolved part of the frame needs.
+    parts = int(np.clip(np.ceil(GRID_WAVE / np.percentile(waves[resolved][::8], 10)), 1, MAX_DIVISION))
+    if parts == 1:
+        maps, light = session.misfits(), index
+    else:
+        maps, light = session.fine_misfits(parts, index), 0
+    seeds = _grid_seeds(maps.fine[light], maps.margin, parts)
+    height, width = waves.shape
+    rows, columns = (np.clip(seeds[:, axis].astype(int), 0, size - 1) for axis, size in ((1, height), (0, width)))
+    return seeds[resolved[rows, columns]]
+
+
+def _grid_seeds(w: Image, margin: int, parts: int) -> Array:
+    """Return the seeds, shape (N, 2), px, of a misfit's map, shape (2, h, w), of pixels divided into `parts`."""
+    # Newton steps from central differences.
+    along_x, along_y = (w[:, 1:-1, 2:] - w[:, 1:-1, :-2]) / 2, (w[:, 2:, 1:-1] - w[:, :-2, 1:-1]) / 2
+    inner = w[:, 1:-1, 1:-1]
+    determinant = along_x[0] * along_y[1] - along_x[1] * along_y[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step_x = (along_y[0] * inner[1] - along_y[1] * inner[0]) / determinant
+        step_y = (along_x[1] * inner[0] - along_x[0] * inner[1]) / determinant
+        short = (np.abs(step_x) < NEAR_PX) & (np.abs(step_y) < NEAR_PX)
+    rows, columns = np.nonzero(short)
+    stepped = np.stack([columns + 1.5 + step_x[short], rows + 1.5 + step_y[short]], axis=1)
+    # Cells in which the interpolated misfit has its zero, where differences over two pixels are too coarse.
+    rows, columns = _crossed(w)
+    seeds = (np.concatenate([np.stack([columns + 1.0, rows + 1.0], axis=1), stepped]) - margin) / parts
+    return distinct(seeds, SAME_SEED_PX / parts)
+
+
+def _crossed(w: Image) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the cells of a grid in which the linear misfit of a triangle half has its zero."""
+    corners = [w[:, :-1, :-1], w[:, :-1, 1:], w[:, 1:, :-1], w[:, 1:, 1:]]
+    with np.errstate(invalid="ignore"):
+        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
+        rows, columns = np.nonzero(((low <= 0) & (high >= 0)).all(axis=0))
+    a, b, c, d = (corner[:, rows, columns] for corner in corners)
+
+    def inside(*triangle: Image) -> Mask:
+        p, q, r = triangle
+        signs = np.stack([u[0] * v[1] - u[1] * v[0] for u, v in ((p, q), (q, r), (r, p))])
+        return np.asarray((signs >= 0).all(axis=0) | (signs <= 0).all(axis=0))
+
+    held = inside(a, b, c) | inside(b, d, c)
+    return rows[held], columns[held]
+
+
+def _newton(session: "Session", seeds: Array, light: Array) -> Array:
+    """Refine seeds to zeros of the misfit; return those that converged, shape (M, 2), px."""
+    position, finished = seeds, []
+    before = np.full(len(seeds), np.inf)
+    for number in range(NEWTON_STEPS):
+        if not len(position):
+            break
+        state = exact_misfit(session, position, light)
+        done = state.length < ZERO
+        finished.append(position[done])
+        # Near a zero the misfit falls with the square; a seed that still strays has none.
+        falling = (state.length < LEAST_FALL * before) if number >= PATIENT_STEPS else np.isfinite(state.length)
+        with np.errstate(invalid="ignore"):
+            determinant = np.abs(np.linalg.det(state.jacobian))
+            going = ~done & falling & np.isfinite(state.length) & (determinant > 1e-18)
+        step = -np.linalg.solve(state.jacobian[going], state.w[going, :, None])[..., 0]
+        step *= np.minimum(1.0, MAX_STEP_PX / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
+        position, before = position[going] + step, state.length[going]
+        # Seeds of one zero have met after a few steps.
+        if number in (2, 4):
+            kept = _first_of_each(position, SAME_PX / 4)
+            position, before = position[kept], before[kept]
+    return np.concatenate(finished) if finished else np.empty((0, 2))
+
+
+def exact_misfit(session: "Session", points_px: Array, light: Array) -> Misfit:
+    """Compute the exact misfit at pixel positions and its derivative, in the model frame."""
+    origins, r = session.sightlines.in_model(points_px)
+    base = session.base_points(origins, r)
+    N, position, relief = base.normal, base.position, session.surface.relief
+    normal, derivative = N, shape_operator(base)
+    if relief is not None:
+        jets = relief.jets(np.where(base.valid[:, None], position, 0.0))
+        normal, derivative = normal_derivative(N, derivative, jets)
+    # Bisector of the directions to camera and light.
+    towards = session.to_model(light[None]) - position
+    reach = np.linalg.norm(towards, axis=1, keepdims=True)
+    towards /= reach
+    both = towards - r
+    size = np.linalg.norm(both, axis=1, keepdims=True)
+    bisector = both / size
+    gap = normal - bisector
+    # Derivatives along the image's axes: of the point on the tangent plane, of the normal, of the bisector.
+    first, second = tangent_basis(-r)
+    columns = []
+    for axis in np.eye(2):
+        turn = session.sightlines.in_model(points_px + DIFFERENCE_PX * axis)[1]
+        turn = (turn - session.sightlines.in_model(points_px - DIFFERENCE_PX * axis)[1]) / (2 * DIFFERENCE_PX)
+        slant = np.sum(N * turn, axis=1, keepdims=True) / np.sum(N * r, axis=1, keepdims=True)
+        moved = base.distance[:, None] * (turn - r * slant)
+        bent = np.einsum("nij,nj->ni", derivative, moved)
+        swing = -(moved - towards * np.sum(towards * moved, axis=1, keepdims=True)) / reach - turn
+        swing = (swing - bisector * np.sum(bisector * swing, axis=1, keepdims=True)) / size
+        columns.append(np.stack([np.sum(e * (bent - swing), axis=1) for e in (first, second)], axis=1))
+    w = np.stack([np.sum(e * gap, axis=1) for e in (first, second)], axis=1)
+    return Misfit(w, np.stack(columns, axis=-1), np.linalg.norm(gap, axis=1))
+
+
+def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_width: float) -> Array:
+    """Compute the radii, shape (N,), px, at which highlights fall to half height, from their shape alone (theory 7.3).
+
+    The half-angle grows from the BP by the misfit's derivative J: a lobe of half-width `half_width`, rad, at half
+    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area.
+    """
+    radii = np.full(len(highlights), np.nan)
+    lights = session.scene.rig.true_mm()
+    for index, light in enumerate(lights):
+        own = [i for i, highlight in enumerate(highlights) if highlight.light == index]
+        if own:
+            state = exact_misfit(session, np.array([highlights[i].bp_px for i in own]), light)
+            with np.errstate(divide="ignore"):
+                radii[own] = half_width / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
+    return radii
+
+
+def shape_operator(points: SurfacePoints) -> Array:
+    """Return S, shape (N, 3, 3), of the principal curvatures and directions of points."""
+    return np.asarray(
+        points.k_min[:, None, None] * points.direction_min[:, :, None] * points.direction_min[:, None, :]
+        + points.k_max[:, None, None] * points.direction_max[:, :, None] * points.direction_max[:, None, :]
+    )
+
+
+def distinct(points: Array, apart: float) -> Array:
+    """Keep one of the finite points, shape (N, 2), that lie within `apart` of each other."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return points[_first_of_each(points, apart)]
+
+
+def _first_of_each(points: Array, apart: float) -> Mask:
+    """Return which points are no nearer to an earlier one that stays than `apart`."""
+    kept = np.ones(len(points), dtype=bool)
+    if len(points) < 2:
+        return kept
+    from scipy.spatial import cKDTree
+
+    for i, j in _ordered(cKDTree(points).query_pairs(apart, output_type="ndarray")):
+        if kept[i]:
+            kept[j] = False
+    return kept
+
+
+def _ordered(pairs: IntArray) -> IntArray:
+    pairs = np.sort(pairs, axis=1)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]

@@ -1,0 +1,212 @@
+"""The wet tissue as a Mitsuba plugin, usable by any Mitsuba integrator: a rough liquid film over a diffuse base."""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+PLUGIN = "simtest_tissue"
+
+MARGIN = 1 / 40
+"""Share of the light through the film that is given up per unit of alpha.
+
+The film's rough surface reflects a little more than the smooth one, of which the light through it is taken: less than
+this in any direction for alpha up to 0.1 and an index from 1.33 to 1.40, so that no more is reflected than arrives.
+"""
+
+STEEPEST = 10.0
+"""Where the Smith function is 1 to the last digit: cot(theta) / alpha."""
+
+Albedo = Callable[[Any, Any], Any]
+"""Albedo of the base, mitsuba.Spectrum, at a surface point, mitsuba.SurfaceInteraction3f, in the lanes of a mask."""
+
+
+@cache
+def register(mi: Any, variant: str) -> str:
+    """Register the plugin for a variant, once (see `simtest.rendering.phong.register`)."""
+    mi.register_bsdf(PLUGIN, lambda props: _make_class(mi, variant)(props))
+    return PLUGIN
+
+
+def external_reflectance(index: Any) -> Any:
+    """Compute the share of diffuse light that a smooth surface of an index above 1 reflects, from outside.
+
+    The integral of 2 F(mu) mu over the cosine mu, in closed form [Duntley 1942].
+    """
+    import drjit as dr
+
+    n, n2 = index, index * index
+    n4 = n2 * n2
+    return (
+        0.5
+        + (n - 1) * (3 * n + 1) / (6 * (n + 1) * (n + 1))
+        + n2 * (n2 - 1) * (n2 - 1) / ((n2 + 1) * (n2 + 1) * (n2 + 1)) * dr.log((n - 1) / (n + 1))
+        - 2 * n2 * n * (n2 + 2 * n - 1) / ((n2 + 1) * (n4 - 1))
+        + 8 * n4 * (n4 + 1) / ((n2 + 1) * (n4 - 1) * (n4 - 1)) * dr.log(n)
+    )
+
+
+def facet_density(squared: Any, alpha: Any, ggx: bool) -> Any:
+    """Compute the density D of the facets' normals per solid angle, from the squared tangent of their angle.
+
+    Beckmann: exp(-t^2/alpha^2) / (pi alpha^2 cos^4); GGX: 1 / (pi alpha^2 cos^4 (1 + t^2/alpha^2)^2).
+    """
+    import drjit as dr
+
+    scaled = squared / (alpha * alpha)
+    shape = dr.rcp(dr.square(1 + scaled)) if ggx else dr.exp(-scaled)
+    return dr.inv_pi * dr.square(1 + squared) / (alpha * alpha) * shape
+
+
+def visible_over_cosine(direction: Any, alpha: Any, ggx: bool) -> Any:
+    """Compute Smith's share of facets that are seen from a direction above the surface, over its cosine.
+
+    G1 = 1/(1 + Lambda) [Walter 2007, exact]; G1/cos stays finite at grazing directions.
+    """
+    import drjit as dr
+
+    cosine = direction.z
+    sine = dr.sqrt(dr.maximum(dr.square(direction.x) + dr.square(direction.y), 1e-20))
+    if ggx:
+        return 2 / (cosine + dr.sqrt(dr.square(cosine) + dr.square(alpha * sine)))
+    a = dr.minimum(cosine / (alpha * sine), STEEPEST)
+    # Lambda cos: a in its denominator would be 0 at the horizon.
+    hidden = cosine * (dr.erf(a) - 1) / 2 + dr.exp(-a * a) * alpha * sine * (0.5 / math.sqrt(math.pi))
+    return dr.rcp(cosine + hidden)
+
+
+@cache
+def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
+    import drjit as dr
+
+    class Tissue(mi.BSDF):
+        """A film's rough dielectric reflection D G F / (4 cos_i cos_o) over a diffuse base below the film.
+
+        D is Beckmann's or GGX's, G = G1(i) G1(o) Smith's, F Fresnel's for unpolarised light at the facet. What is not
+        reflected passes the film, is reflected diffusely, and passes it again or is reflected back from within:
+        T(i) T(o) / eta^2 albedo/pi / (1 - albedo r), with T = 1 - F of the smooth film, less a margin (see `MARGIN`),
+        and r the share of diffuse light that the film reflects from within. Both parts are reciprocal, and together
+        they reflect at most what arrives.
+
+        Parameters: `alpha`, `index` (of the film, above 1), `distribution` ("beckmann" or "ggx") and
+        `diffuse_reflectance`, the base's albedo. Components: 0 the film's reflection, 1 the base.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.alpha = mi.Float(props.get("alpha", 0.03))
+            self.index = mi.Float(props.get("index", 1.33))
+            distribution = props.get("distribution", "beckmann")
+            if distribution not in ("beckmann", "ggx"):
+                raise ValueError(f"distribution = {distribution!r}: unknown; allowed: beckmann, ggx")
+            self.ggx = distribution == "ggx"
+            self.base = props.get_texture("diffuse_reflectance", 0.5)
+            # Called with surface points and a mask in place of the texture, where it is set.
+            self.albedo_at: Albedo | None = None
+            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [glossy, diffuse]
+            self.m_flags = glossy | diffuse
+            self.parameters_changed()
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
+            callback.put("index", self.index, mi.ParamFlags.Differentiable)
+            callback.put("diffuse_reflectance", self.base, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            # Literal parameters would be baked into the kernel, and each change would recompile it.
+            dr.make_opaque(self.alpha, self.index)
+            passed = (1 - external_reflectance(self.index)) / dr.square(self.index)
+            # Reflected back from within, and the factor of both passages.
+            self.returned, self.passage = 1 - passed, (1 - MARGIN * self.alpha) / dr.square(self.index)
+            dr.make_opaque(self.returned, self.passage)
+
+        def _albedo(self, si: Any, active: Any) -> Any:
+            return self.base.eval(si, active) if self.albedo_at is None else self.albedo_at(si, active)
+
+        def _lift(self, albedo: Any) -> Any:
+            """Compute the base's share of the light within the film that leaves it upwards, times eta^2."""
+            return albedo / (1 - albedo * self.returned)
+
+        def _enabled(self, ctx: Any) -> tuple[bool, bool]:
+            """Return whether the film's reflection and the base are asked for."""
+            return (
+                ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
+                ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
+            )
+
+        def _film(self, wi: Any, wo: Any) -> tuple[Any, Any]:
+            """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
+            # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
+            # digits that matter next to 1.
+            both = wi + wo
+            squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
+            facing = dr.minimum(dr.norm(both) / 2, 1)
+            seen, lit = visible_over_cosine(wi, self.alpha, self.ggx), visible_over_cosine(wo, self.alpha, self.ggx)
+            density = facet_density(squared, self.alpha, self.ggx) * seen / 4
+            # Gradients must not flow through the choice of samples.
+            return density * lit * wo.z * mi.fresnel(facing, self.index)[0], dr.detach(density)
+
+        def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+            """Compute f cos(theta) and the sampling density of the enabled parts."""
+            active &= (si.wi.z > 0) & (wo.z > 0)
+            # Other lanes compute with a direction of their own, so that no derivative is NaN.
+            wi, wo = dr.select(active, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
+            value, density = mi.Spectrum(0), mi.Float(0)
+            share = self._share(ctx, si, wi, active)
+            glossy, diffuse = self._enabled(ctx)
+            if glossy:
+                film, drawn = self._film(wi, wo)
+                value += film
+                density += share * drawn
+            if diffuse:
+                through = (1 - mi.fresnel(wi.z, self.index)[0]) * (1 - mi.fresnel(wo.z, self.index)[0])
+                value += self._lift(self._albedo(si, active)) * (through * self.passage * wo.z * dr.inv_pi)
+                density += (1 - share) * dr.inv_pi * wo.z
+            return dr.select(active, value, 0), dr.select(active, density, 0)
+
+        def _share(self, ctx: Any, si: Any, wi: Any, active: Any) -> Any:
+            """Return the share of samples for the film's reflection: its part of what is reflected, about."""
+            glossy, diffuse = self._enabled(ctx)
+            if not (glossy and diffuse):
+                return mi.Float(float(glossy))
+            film = mi.fresnel(wi.z, self.index)[0]
+            base = (1 - film) * (1 - self.returned) * dr.mean(self._lift(self._albedo(si, active)))
+            return dr.detach(film / (film + base))
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            active = mi.Bool(active) & (si.wi.z > 0)
+            wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+            # Film: the normals of the facets that are seen from the direction of incidence.
+            kind = mi.MicrofacetType.GGX if self.ggx else mi.MicrofacetType.Beckmann
+            facet, _ = mi.MicrofacetDistribution(kind, dr.detach(self.alpha)).sample(wi, sample2)
+            chosen = sample1 < self._share(ctx, si, wi, active)
+            bs = mi.BSDFSample3f()
+            # Base: cosine-weighted about the normal.
+            bs.wo = dr.select(chosen, mi.reflect(wi, facet), mi.warp.square_to_cosine_hemisphere(sample2))
+            value, bs.pdf = self._values(ctx, si, bs.wo, active)
+            bs.eta = 1.0
+            bs.sampled_type = dr.select(
+                chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            )
+            bs.sampled_component = dr.select(chosen, mi.UInt32(0), mi.UInt32(1))
+            drawn = bs.pdf > 0
+            return bs, dr.select(drawn, value / dr.select(drawn, bs.pdf, 1), 0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self._values(ctx, si, wo, mi.Bool(active))[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self._values(ctx, si, wo, mi.Bool(active))[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            return self._values(ctx, si, wo, mi.Bool(active))
+
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            return self._albedo(si, mi.Bool(active))
+
+        def to_string(self) -> str:
+            return f"Tissue[alpha={self.alpha}, index={self.index}, ggx={self.ggx}]"
+
+    return Tissue

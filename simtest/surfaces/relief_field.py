@@ -1,0 +1,374 @@
+"""The relief of a surface: a random height field in space, with exact gradient and Hessian (theory.md section 7).
+
+Each band is a periodic cubic B-spline on a turned lattice. A cubic B-spline has continuous second derivatives, so the
+normal and the curvature of the relief are closed forms everywhere, and a renderer can gather the same coefficients.
+The lattice fills space, so the field has no seams on any surface, and is stationary on all of them.
+
+The relief turns the normal and leaves the position: the fine normal at the base point P is N - grad h, normalised, with
+the gradient along the surface. A film may fill the valleys up to a level: pools are smooth, crests keep their relief.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, reduce
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.arrays import Array, Mask
+from simtest.spec.relief import Relief, ReliefBand
+from simtest.surfaces.model import SurfacePoints
+
+NODES = 96
+"""Nodes of the lattice along each side; the field repeats after as many."""
+
+NODES_PER_WAVE = 6.0
+"""Nodes per mean wave: the spline then follows the field to about 1 %, and its own moments are measured."""
+
+PROBES = 100_000
+"""Random points at which slope, wavelength and height of a field are measured."""
+
+POINTS = 2**15
+"""Points whose jets are computed together: they bound the memory."""
+
+RIDGE_ROUNDING = 0.35
+"""Half-width of a rounded crest, in standard deviations of the field: -sqrt(g^2 + rounding^2)."""
+
+PIT_THRESHOLD = 0.6
+"""Height above which the field becomes a pit, in its standard deviations: -max(g - threshold, 0)^2."""
+
+KIND_SMOOTHING = 0.08
+"""Smoothing of ridged and pitted fields, waves: their crests must be wider than a cell of the lattice."""
+
+UNSEEN = 0.01
+"""A diffused field below this share of the whole field's deviation is left out: less than 0.1 deg of 6."""
+
+FELT = 0.1
+"""A band of less than this share of the whole slope hardly moves a glint: the search need not resolve its waves."""
+
+MENISCUS = 0.1
+"""Width of a pool's rim, where the film's surface bends from the pool to the crest, in deviations of the height."""
+
+
+@dataclass(frozen=True)
+class HeightJets:
+    """Height of the relief with its first two derivatives in space.
+
+    Parameters
+    ----------
+    height : ndarray, shape (N,)
+        mm, towards the camera.
+    gradient : ndarray, shape (N, 3)
+        Model frame.
+    hessian : ndarray, shape (N, 3, 3)
+        1/mm.
+    """
+
+    height: Array
+    gradient: Array
+    hessian: Array
+
+
+@dataclass(frozen=True)
+class BandField:
+    """One band: a periodic cubic B-spline.
+
+    Parameters
+    ----------
+    lattice_from_model : ndarray, shape (3, 3)
+        Lattice cells over mm.
+    coefficients : ndarray, shape (NODES, NODES, NODES)
+        Of the B-splines, mm.
+    diffused : ndarray, shape (NODES, NODES, NODES)
+        Those of the field that diffuse light sees.
+    """
+
+    lattice_from_model: Array
+    coefficients: Array
+    diffused: Array
+
+    @cached_property
+    def is_seen_diffusely(self) -> bool:
+        """Whether diffuse light sees anything of the band."""
+        return bool(self.diffused.any())
+
+    def jets(self, points: Array, diffused: bool = False) -> HeightJets:
+        """Compute the field's jets at points, shape (N, 3), model frame, mm."""
+        A = self.lattice_from_model
+        cells = points @ A.T
+        first = np.floor(cells)
+        weights = _spline_weights(cells - first)  # (3 orders, N, 3 axes, 4)
+        index = (first.astype(np.int64)[:, :, None] + np.arange(-1, 3)) % NODES
+        nodes = (index[:, 0, :, None, None] * NODES + index[:, 1, None, :, None]) * NODES + index[:, 2, None, None, :]
+        values = (self.diffused if diffused else self.coefficients).ravel()[nodes]
+        # Contract along z, y, x, for all orders of derivatives that are needed.
+        along_z = [np.einsum("nxyz,nz->nxy", values, weights[k][:, 2]) for k in range(3)]
+        pairs = {(j, k): np.einsum("nxy,ny->nx", along_z[k], weights[j][:, 1]) for j in range(3) for k in range(3 - j)}
+
+        def derivative(i: int, j: int, k: int) -> Array:
+            return np.asarray(np.einsum("nx,nx->n", pairs[j, k], weights[i][:, 0]))
+
+        gradient = np.stack([derivative(1, 0, 0), derivative(0, 1, 0), derivative(0, 0, 1)], axis=1)
+        xy, xz, yz = derivative(1, 1, 0), derivative(1, 0, 1), derivative(0, 1, 1)
+        xx, yy, zz = derivative(2, 0, 0), derivative(0, 2, 0), derivative(0, 0, 2)
+        hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        # Chain rule to the model frame.
+        return HeightJets(derivative(0, 0, 0), gradient @ A, A.T @ hessian @ A)
+
+
+def _spline_weights(t: Array) -> Array:
+    """Return value, first and second derivative of the four cubic B-splines at shares t of a cell, (3, *t.shape, 4)."""
+    one = 1 - t
+    value = [one**3 / 6, 2 / 3 - t**2 + t**3 / 2, 2 / 3 - one**2 + one**3 / 2, t**3 / 6]
+    first = [-(one**2) / 2, -2 * t + 1.5 * t**2, 2 * one - 1.5 * one**2, t**2 / 2]
+    second = [one, 3 * t - 2, 3 * one - 2, t]
+    return np.stack([np.stack(order, axis=-1) for order in (value, first, second)])
+
+
+@dataclass(frozen=True)
+class ReliefField:
+    """The relief of one surface.
+
+    Parameters
+    ----------
+    bands : tuple of BandField
+        Their heights add up.
+    deviation : float
+        Standard deviation of the height, mm.
+    finest_wave : float
+        Least wavelength of the bands that hold a share of the slope above `FELT`, mm.
+    level : float or None
+        Height up to which a film fills the valleys, mm; None: it follows the relief.
+    """
+
+    bands: tuple[BandField, ...]
+    deviation: float
+    finest_wave: float
+    level: float | None = None
+
+    @property
+    def meniscus(self) -> float:
+        """Width of a pool's rim in height, mm."""
+        return MENISCUS * self.deviation
+
+    def tissue_jets(self, points: Array, diffused: bool = False) -> HeightJets:
+        """Compute the jets of the tissue below the film at points, shape (N, 3), model frame, mm."""
+        parts = [_add([band.jets(some, diffused) for band in self.bands]) for some in _split(points)]
+        return HeightJets(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("height", "gradient", "hessian"))
+        )
+
+    def jets(self, points: Array) -> HeightJets:
+        """Compute the jets of the surface that the film's reflection sees, at points, shape (N, 3), model frame, mm."""
+        return self.fill(self.tissue_jets(points))
+
+    def fill(self, jets: HeightJets) -> HeightJets:
+        """Fill valleys: phi(h) = level + w log(1 + exp((h - level)/w)), with w the meniscus; and its derivatives."""
+        if self.level is None:
+            return jets
+        x = (jets.height - self.level) / self.meniscus
+        share = 1 / (1 + np.exp(-np.clip(x, -60.0, 60.0)))
+        height = self.level + self.meniscus * np.logaddexp(0.0, x)
+        bend = share * (1 - share) / self.meniscus
+        outer = jets.gradient[:, :, None] * jets.gradient[:, None, :]
+        hessian = share[:, None, None] * jets.hessian + bend[:, None, None] * outer
+        return HeightJets(height, share[:, None] * jets.gradient, hessian)
+
+    def pool(self, points: Array) -> Mask:
+        """Return which points, shape (N, 3), model frame, mm, lie in a pool of the film, shape (N,)."""
+        if self.level is None:
+            return np.zeros(len(points), dtype=bool)
+        return np.asarray(self.tissue_jets(points).height < self.level)
+
+    def apply(self, points: SurfacePoints) -> SurfacePoints:
+        """Turn the normals and curvatures of base points, model frame, to those of the fine surface.
+
+        The fine normal is n = m/|m| with m = N - (I - N N^T) G, G the gradient of the height; its derivative along a
+        base tangent t is ((1 + N.G) S + N (G^T S + N^T H) - H) t / |m|, across n, with the base's S and the height's
+        Hessian H. Curvatures are eigenvalues of its symmetric part on the surface that the relief makes.
+        """
+        found = np.flatnonzero(points.valid)
+        if not len(found):
+            return points
+        N = points.normal[found]
+        first, second = points.direction_max[found], points.direction_min[found]
+        S = _outer(points.k_max[found], first) + _outer(points.k_min[found], second)
+        tissue = self.tissue_jets(points.position[found])
+        jets = self.fill(tissue)
+        normal, k, directions = fine_curvatures(N, S, jets)
+        fields = {
+            "normal": normal, "k_min": k[:, 0], "k_max": k[:, 1],
+            "direction_min": directions[0], "direction_max": directions[1],
+        }  # fmt: skip
+        changed = {}
+        for name, values in fields.items():
+            whole = getattr(points, name).copy()
+            whole[found] = values
+            changed[name] = whole
+        pool = np.zeros(len(points.valid), dtype=bool)
+        pool[found] = False if self.level is None else tissue.height < self.level
+        return replace(points, **changed, pool=pool)
+
+
+def fine_normals(normal: Array, gradient: Array) -> Array:
+    """Return the unit normals of the relief, shape (N, 3), over base normals, for gradients of the height."""
+    m = normal - gradient + normal * np.sum(normal * gradient, axis=1, keepdims=True)
+    return np.asarray(m / np.linalg.norm(m, axis=1, keepdims=True))
+
+
+def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array]:
+    """Return fine normals, shape (N, 3), and their derivative along the base's tangents, shape (N, 3, 3).
+
+    `N` and `S` are the base's normals and shape operators; see `ReliefField.apply`.
+    """
+    G, H = jets.gradient, jets.hessian
+    along = np.sum(N * G, axis=1)
+    m = N - G + N * along[:, None]
+    length = np.linalg.norm(m, axis=1)
+    normal = m / length[:, None]
+    rest = np.einsum("ni,nij->nj", G, S) + np.einsum("ni,nij->nj", N, H)
+    derivative = (1 + along)[:, None, None] * S + N[:, :, None] * rest[:, None, :] - H
+    across = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    return normal, across @ derivative / length[:, None, None]
+
+
+def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Return fine normals, principal curvatures k_min and k_max, shape (N, 2), and unit principal directions."""
+    normal, derivative = normal_derivative(N, S, jets)
+    # A tangent f of the fine surface stands over the base's tangent f - N (N.f).
+    tangents = tangent_basis(normal)
+    below = [f - N * np.sum(N * f, axis=1, keepdims=True) for f in tangents]
+    form = [[np.einsum("ni,nij,nj->n", f, derivative, t) for t in below] for f in tangents]
+    a, b, c = form[0][0], (form[0][1] + form[1][0]) / 2, form[1][1]
+    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
+    angle = 0.5 * np.arctan2(b, (a - c) / 2)
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    direction_max = cosine * tangents[0] + sine * tangents[1]
+    direction_min = cosine * tangents[1] - sine * tangents[0]
+    return normal, np.stack([mean - half, mean + half], axis=1), (direction_min, direction_max)
+
+
+def _outer(weight: Array, vector: Array) -> Array:
+    return np.asarray(weight[:, None, None] * vector[:, :, None] * vector[:, None, :])
+
+
+def _split(points: Array) -> Iterator[Array]:
+    for start in range(0, max(len(points), 1), POINTS):
+        yield points[start : start + POINTS]
+
+
+def _add(parts: list[HeightJets]) -> HeightJets:
+    return reduce(lambda a, b: HeightJets(a.height + b.height, a.gradient + b.gradient, a.hessian + b.hessian), parts)
+
+
+# Making the field ------------------------------------------------------------------------------------------------
+
+
+def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
+    """Make the relief of a description.
+
+    Parameters
+    ----------
+    spec : Relief
+        Its bands and seed.
+    level : float, optional
+        Height up to which a film fills the valleys, in standard deviations of the height about its mean.
+    """
+    field = _make_field(spec)
+    return field if level is None else replace(field, level=level * field.deviation)
+
+
+@lru_cache(maxsize=4)
+def _make_field(spec: Relief) -> ReliefField:
+    """Make the relief without a film."""
+    branches = np.random.SeedSequence(spec.seed).spawn(len(spec.bands))
+    bands = tuple(_make_band(band, branch, spec.diffusion_mm)
+                  for band, branch in zip(spec.bands, branches, strict=True))  # fmt: skip
+    # Bands are independent, and each has mean 0.
+    deviation = float(np.sqrt(sum(np.var(_node_values(band.coefficients)) for band in bands)))
+    whole = sum(band.slope_deg**2 for band in spec.bands)
+    felt = [band.wavelength_mm for band in spec.bands if band.slope_deg**2 >= FELT**2 * whole]
+    return ReliefField(bands, deviation, min(felt))
+
+
+def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
+    rng = np.random.Generator(np.random.SFC64(branch))
+    # A uniformly random rotation; by itself, as scipy changed the name of its generator's argument.
+    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    nodes = _shell_noise(rng, spec.width)
+    if spec.kind != "gaussian":
+        nodes = _shaped(nodes, spec.kind)
+    coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
+    # The spline's own slope and wavelength on a plane, in lattice cells; then scaled to those that are asked for.
+    slope, wave = _plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng)
+    # Stretch along the direction, so that the wavelength there is longer and the slope lower.
+    axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
+    stretch = np.eye(3) + (1 / spec.anisotropy - 1) * np.outer(axis, axis)
+    lattice_from_model = (wave / spec.wavelength_mm) * turn @ stretch
+    coefficients *= np.radians(spec.slope_deg) / slope * (spec.wavelength_mm / wave)
+    return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
+
+
+def _wave_numbers() -> list[Array]:
+    """Return the lattice's wave numbers, rad per cell, along its three axes, for `numpy.fft.rfftn`."""
+    full: Array = np.asarray(2 * np.pi * np.fft.fftfreq(NODES), dtype=float)
+    half: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(NODES), dtype=float)
+    return [full[:, None, None], full[None, :, None], half[None, None, :]]
+
+
+def _shell_noise(rng: np.random.Generator, width: float) -> Array:
+    """Draw a gaussian field whose power lies on a shell of wave numbers, unit deviation, at the nodes."""
+    kx, ky, kz = _wave_numbers()
+    k = np.sqrt(kx**2 + ky**2 + kz**2)
+    # The shell's radius, for which sections have about NODES_PER_WAVE nodes a wave.
+    w = width
+    k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
+    with np.errstate(divide="ignore"):
+        amplitude = np.where(k > 0, np.exp(-(((k - k0) / (w * k0)) ** 2) / 4) / k, 0.0)
+    noise = np.fft.rfftn(rng.standard_normal((NODES, NODES, NODES)))
+    field = np.fft.irfftn(noise * amplitude, s=(NODES, NODES, NODES), axes=(0, 1, 2))
+    return np.asarray(field / field.std())
+
+
+def _shaped(g: Array, kind: str) -> Array:
+    """Turn a gaussian field into crests and grooves, or into pits."""
+    shaped = -np.sqrt(g**2 + RIDGE_ROUNDING**2) if kind == "ridged" else -(np.maximum(g - PIT_THRESHOLD, 0) ** 2)
+    shaped = ndimage.gaussian_filter(shaped, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
+    return np.asarray(shaped - shaped.mean())
+
+
+def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float, float]:
+    """Measure the slope along one direction and the wavelength 2 pi sqrt(m2/m4) of a field's plane sections, cells.
+
+    On sections of an isotropic field m2 = 2/3 E|grad h|^2 and m4 = 8/15 E(laplace h)^2; the slope is sqrt(m2/2).
+    """
+    relief = ReliefField((field,), 1.0, 1.0)
+    jets = relief.tissue_jets(rng.uniform(0, NODES, (PROBES, 3)))
+    normal = rng.standard_normal((PROBES, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # Not of the whole space: a shaped field is isotropic, but its sections' moments follow no closed form.
+    along = np.einsum("ni,nij,nj->n", normal, jets.hessian, normal)
+    laplace = np.trace(jets.hessian, axis1=1, axis2=2) - along
+    gradient = jets.gradient - normal * np.sum(normal * jets.gradient, axis=1, keepdims=True)
+    m2, m4 = np.mean(np.sum(gradient**2, axis=1)), np.mean(laplace**2)
+    return float(np.sqrt(m2 / 2)), float(2 * np.pi * np.sqrt(m2 / m4))
+
+
+def _diffused(coefficients: Array, lattice_from_model: Array, length: float) -> Array:
+    """Smooth a field by a Gaussian of standard deviation `length`, mm, in the model frame."""
+    kx, ky, kz = _wave_numbers()
+    A = lattice_from_model
+    # Wave numbers in the model frame are A^T k.
+    squared = sum((A[0, i] * kx + A[1, i] * ky + A[2, i] * kz) ** 2 for i in range(3))
+    damping = np.exp(-squared * length**2 / 2)
+    smooth = np.fft.irfftn(np.fft.rfftn(coefficients) * damping, s=coefficients.shape, axes=(0, 1, 2))
+    return np.asarray(smooth if smooth.std() > UNSEEN * coefficients.std() else np.zeros_like(smooth))
+
+
+def _node_values(coefficients: Array) -> Array:
+    """Return a spline's values at its nodes."""
+    for axis in range(3):
+        coefficients = ndimage.convolve1d(coefficients, [1 / 6, 4 / 6, 1 / 6], axis=axis, mode="wrap")
+    return coefficients

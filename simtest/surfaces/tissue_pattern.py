@@ -1,0 +1,187 @@
+"""The albedo of tissue at points of a surface: ground, mottling, capillaries and vessels.
+
+    albedo_c = base_c exp(-a_c g - b_c n) V_c(artery) V_c(vein),    V_c = 1 - s_c (1 - exp(-mu_c L))
+
+for each channel c. g is the mottling, a periodic random field of space of unit deviation; n the capillaries' net, from
+0 to 1; a_c and b_c follow the root of blood's absorption, as the reflectance of a scattering medium does. L is the
+chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and s_c = exp(-depth / reach_c) the share
+of the light that comes back from below the vessel's depth.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from simtest.runtime.arrays import Array
+from simtest.spec.tissue_colour import TissueColour
+from simtest.surfaces.haemoglobin import TISSUE_SATURATION, blood_absorption, reach
+from simtest.surfaces.model import SurfaceModel
+from simtest.surfaces.segment_table import SegmentTable, make_table
+from simtest.surfaces.surface_samples import Patch, surface_patch
+from simtest.surfaces.vessels import grow_vessels, segments
+
+NODES = 64
+"""Nodes of a lattice along each side, a power of two; its field repeats after as many."""
+
+MOTTLING_NODES = 10.0
+"""Nodes per mean wave of the mottling."""
+
+MOTTLING_WIDTH = 0.6
+"""Its relative width of the band of wave numbers: blotches of several sizes."""
+
+MOTTLING_LIMIT = 3.0
+"""Deviations beyond which the mottling is cut off."""
+
+MESH_NODES = 8.0
+"""Nodes across a mesh of the capillaries' net."""
+
+WALL = 0.1
+"""Half-width of a capillary over the width of a mesh."""
+
+BLUR_PER_DEPTH = 0.4
+"""Standard deviation of the blur of a vessel's edge over its depth."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A periodic field in space, linear between the nodes of a turned lattice.
+
+    Parameters
+    ----------
+    lattice_from_model : ndarray, shape (3, 3)
+        Nodes over mm.
+    values : ndarray, shape (NODES, NODES, NODES)
+        At the nodes.
+    """
+
+    lattice_from_model: Array
+    values: Array
+
+    def at(self, points: Array) -> Array:
+        """Return the field at points, shape (N, 3), model frame, mm."""
+        cells = points @ self.lattice_from_model.T
+        first = np.floor(cells)
+        share = cells - first
+        low = first.astype(np.int64) % NODES
+        high = (low + 1) % NODES
+        total = np.zeros(len(points))
+        for corner in np.ndindex(2, 2, 2):
+            x, y, z = ((high if up else low)[:, axis] for axis, up in enumerate(corner))
+            weight = np.prod([share[:, axis] if up else 1 - share[:, axis] for axis, up in enumerate(corner)], axis=0)
+            total += weight * self.values[x, y, z]
+        return total
+
+
+@dataclass(frozen=True)
+class TissuePattern:
+    """The albedo of one surface's tissue.
+
+    Parameters
+    ----------
+    base : ndarray, shape (3,)
+        Albedo of the ground, linear RGB.
+    mottling, capillaries : Lattice
+    mottled, netted : ndarray, shape (3,)
+        Absorbances a_c and b_c for a unit of them.
+    absorption : ndarray, shape (2, 3)
+        Of the blood of arteries and veins, 1/mm.
+    share : ndarray, shape (3,)
+        s_c.
+    vessels : SegmentTable
+    """
+
+    base: Array
+    mottling: Lattice
+    capillaries: Lattice
+    mottled: Array
+    netted: Array
+    absorption: Array
+    share: Array
+    vessels: SegmentTable
+
+    def albedo(self, points: Array) -> Array:
+        """Return the albedo at points of the surface, shape (N, 3), model frame, mm; linear RGB, shape (N, 3).
+
+        The slow reference of `simtest.rendering.albedo`.
+        """
+        field, net = self.mottling.at(points), self.capillaries.at(points)
+        value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
+        chords = self.vessels.chords(points)
+        for kind in range(2):
+            value = value * (1 - self.share * -np.expm1(-chords[:, kind, None] * self.absorption[kind]))
+        return np.asarray(np.clip(value, 0, 1))
+
+
+def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
+    """Make the pattern of a surface; the last few are cached."""
+    return _make(surface_patch(surface), spec)
+
+
+@lru_cache(maxsize=4)
+def _make(patch: Patch, spec: TissueColour) -> TissuePattern:
+    net, mottle, grow = np.random.SeedSequence(spec.seed).spawn(3)
+    blood = blood_absorption(TISSUE_SATURATION)
+    # Relative to green
+    root = np.sqrt(blood / blood[1])
+    vessels = spec.vessels
+    saturation = (vessels.arterial_saturation, vessels.venous_saturation)
+    forest = grow_vessels(patch, vessels, int(grow.generate_state(1)[0]))
+    return TissuePattern(
+        base=np.array(spec.base),
+        mottling=_mottling(spec.mottling.wavelength_mm, np.random.Generator(np.random.SFC64(mottle))),
+        capillaries=_net(spec.capillaries.spacing_mm, np.random.Generator(np.random.SFC64(net))),
+        mottled=spec.mottling.amplitude * root,
+        netted=spec.capillaries.strength * root,
+        absorption=vessels.strength * np.stack([blood_absorption(s) for s in saturation]),
+        share=np.exp(-vessels.depth_mm / reach(spec.blood)),
+        vessels=make_table(segments(forest), BLUR_PER_DEPTH * vessels.depth_mm),
+    )
+
+
+def _mottling(wavelength: float, rng: np.random.Generator) -> Lattice:
+    """Draw a gaussian field of unit deviation, with power on a shell of wave numbers."""
+    full, half = 2 * np.pi * np.fft.fftfreq(NODES), 2 * np.pi * np.fft.rfftfreq(NODES)
+    k = np.sqrt(full[:, None, None] ** 2 + full[None, :, None] ** 2 + half[None, None, :] ** 2)
+    k0 = 2 * np.pi / MOTTLING_NODES
+    with np.errstate(divide="ignore"):
+        amplitude = np.where(k > 0, np.exp(-(((k / k0 - 1) / MOTTLING_WIDTH) ** 2) / 4) / k, 0.0)
+    field = np.fft.irfftn(np.fft.rfftn(rng.standard_normal((NODES,) * 3)) * amplitude, s=(NODES,) * 3, axes=(0, 1, 2))
+    field = np.clip(field / field.std(), -MOTTLING_LIMIT, MOTTLING_LIMIT)
+    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    return Lattice(turn * (MOTTLING_NODES / wavelength), _float32(field))
+
+
+def _net(spacing: float, rng: np.random.Generator) -> Lattice:
+    """Make walls between the cells about random points of space; a surface cuts them in a net of polygons."""
+    side = NODES / MESH_NODES
+    centres = _apart(rng, side)
+    grid = np.stack(np.meshgrid(*[np.arange(NODES) / MESH_NODES] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    distance, nearest = cKDTree(centres, boxsize=side).query(grid, k=2)
+    apart = centres[nearest[:, 0]] - centres[nearest[:, 1]]
+    apart -= side * np.round(apart / side)
+    # Distance to the plane halfway between the two nearest centres
+    to_wall = (distance[:, 1] ** 2 - distance[:, 0] ** 2) / (2 * np.linalg.norm(apart, axis=1))
+    wall = np.exp(-((to_wall / WALL) ** 2)).reshape((NODES,) * 3)
+    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    return Lattice(turn * (MESH_NODES / spacing), _float32(wall))
+
+
+def _apart(rng: np.random.Generator, side: float) -> Array:
+    """Draw points of a periodic box, about one in a unit volume, that keep apart."""
+    centres = rng.uniform(0, side, (round(side**3), 3))
+    for _ in range(8):
+        # Each moves away from its nearest neighbour.
+        distance, other = cKDTree(centres, boxsize=side).query(centres, k=2)
+        gap = centres - centres[other[:, 1]]
+        gap -= side * np.round(gap / side)
+        push = np.clip(0.9 - distance[:, 1], 0, None) / (2 * distance[:, 1])
+        centres = (centres + push[:, None] * gap) % side
+    return centres
+
+
+def _float32(values: Array) -> Array:
+    """Round to single precision, in which the renderer holds them."""
+    return np.asarray(values.astype(np.float32), dtype=np.float64)

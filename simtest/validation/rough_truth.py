@@ -1,0 +1,168 @@
+"""What a row of results holds on a surface with relief: visible highlights, sizes, and clouds of glints."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA
+from simtest.geometry.vectors import angle_deg
+from simtest.rendering import HighlightPoint, Session
+from simtest.runtime.arrays import Array
+from simtest.simulation import clouds as regions
+from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.visible_highlights import VisibleHighlight
+from simtest.validation.predicted import centroid_law_deg, glint_count_law
+from simtest.validation.results_table import ResultRow
+
+MISSED_PX = 3.0
+"""A missed glint belongs to the visible highlight whose peak is so near."""
+
+WHOLE_SLOPES = 3.0
+"""A cloud is wholly in view if the base's misfit at the edge of its region is so many slopes: by Rayleigh's law 1.1 %
+of its glints are outside."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The glints of one light around one highlight point of the base, wholly in view (theory.md 7.1 to 7.5).
+
+    Parameters
+    ----------
+    glints : int
+        Zeros of the misfit, however faint.
+    glints_law : float or None
+        Their expected number (7.2); None where the law does not hold.
+    visible : int
+        Visible highlights that belong to it, above the noise as isolated ones are (theory.md section 6).
+    error_deg : float or None
+        Angle between the mean of the glints' fine normals and the base's normal at its highlight point. With the light
+        at the camera these normals are the reversed sightlines (7.5). None without glints, as `covariance`.
+    error_law_deg : float or None
+        Mean of `error_deg` if the glints were independent (7.5); None where the law does not hold.
+    kd_min, kd_max : float
+        Distance times principal curvatures of the base at its highlight point.
+    covariance : ndarray, shape (2, 2), or None
+        Mean square of the glints' positions about the highlight point, in its tangent plane along the directions of
+        k_min and k_max, mm^2 (7.1).
+    """
+
+    glints: int
+    glints_law: float | None
+    visible: int
+    error_deg: float | None
+    error_law_deg: float | None
+    kd_min: float
+    kd_max: float
+    covariance: Array | None
+
+
+@dataclass(frozen=True)
+class RoughTruth:
+    """What stands beside the true highlights of a frame on a relief; all empty on a smooth surface.
+
+    Parameters
+    ----------
+    visible : sequence of VisibleHighlight
+        On a smooth surface a visible highlight is a true highlight (theory.md 7.1b).
+    seen : mapping
+        Index of the visible highlight by index of the detection.
+    alone_px : mapping
+        Radius of the visible highlight that is whole and holds one glint alone, px, by index of the truth.
+    clouds : mapping
+        By number, those wholly in view.
+    is_rough : bool
+        Whether the surface has a relief.
+    """
+
+    visible: Sequence[VisibleHighlight] = ()
+    seen: Mapping[int, int] = field(default_factory=dict)
+    alone_px: Mapping[int, float] = field(default_factory=dict)
+    clouds: Mapping[int, Cloud] = field(default_factory=dict)
+    is_rough: bool = False
+
+    def filled(self, row: ResultRow, specularity: int | None, truth: TrueHighlight | None) -> ResultRow:
+        """Fill the columns of a detection's row, or of that of a truth which no detection found."""
+        number = None if specularity is None else self.seen.get(specularity)
+        if number is None and specularity is None and truth is not None:
+            # The spot in which the missed glint shines.
+            near = [np.linalg.norm(spot.peak_px - truth.bp_px) for spot in self.visible]
+            number = int(np.argmin(near)) if near and min(near) < MISSED_PX else None
+        snr = None if number is None else self.visible[number].peak_snr
+        row = replace(row, visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
+        if self.is_rough:
+            row = replace(row, frame_visible=len(shown(self.visible)))
+        if truth is not None:
+            row = replace(row, cloud=truth.cloud)
+        elif number is not None:
+            row = replace(row, cloud=self.visible[number].cloud)
+        if truth is not None and self.is_rough:
+            law = truth.radius_px if np.isfinite(truth.radius_px) else None
+            alone = None if row.true_id is None else self.alone_px.get(row.true_id)
+            row = replace(row, pool=truth.pool, radius_px=alone, radius_law_px=law)
+        cloud = None if row.cloud is None else self.clouds.get(row.cloud)
+        return row if cloud is None else _cloud_row(row, cloud)
+
+
+def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
+    """Return the visible highlights that stand above the noise as isolated ones do (theory.md section 6)."""
+    return [spot for spot in visible if spot.peak_snr >= HIGHLIGHT_CONTRAST_SIGMA]
+
+
+def _cloud_row(row: ResultRow, cloud: Cloud) -> ResultRow:
+    covariance = cloud.covariance
+    return replace(
+        row,
+        cloud_glints=cloud.glints,
+        cloud_glints_law=cloud.glints_law,
+        cloud_visible=cloud.visible,
+        cloud_error_deg=cloud.error_deg,
+        cloud_error_law_deg=cloud.error_law_deg,
+        cloud_kd_min=cloud.kd_min,
+        cloud_kd_max=cloud.kd_max,
+        cloud_cov_11=None if covariance is None else float(covariance[0, 0]),
+        cloud_cov_12=None if covariance is None else float(covariance[0, 1]),
+        cloud_cov_22=None if covariance is None else float(covariance[1, 1]),
+    )
+
+
+def rough_truth(session: Session, view: RenderedView, counted: Sequence[int], seen: Mapping[int, int]) -> RoughTruth:
+    """Gather what stands beside the true highlights of a view on a relief, at whose scene the session is.
+
+    `counted` are the indices in `view.highlights` of the truths; for `seen` see `RoughTruth`.
+    """
+    visible = view.visible_highlights
+    alone = {spot.glints[0]: spot.radius_px for spot in visible if spot.whole and len(spot.glints) == 1}
+    alone_px = {truth: alone[i] for truth, i in enumerate(counted) if i in alone}
+    return RoughTruth(visible, seen, alone_px, whole_clouds(session, view), is_rough=True)
+
+
+def whole_clouds(session: Session, view: RenderedView) -> dict[int, Cloud]:
+    """Describe the clouds of a view that are wholly in view, by number (`WHOLE_SLOPES`)."""
+    relief = view.scene.surface.relief
+    assert relief is not None
+    least = WHOLE_SLOPES * np.radians(relief.slope_deg)
+    edges = regions.edges(session, view.clouds)
+    return {n: _cloud(view, n, centre) for n, centre in enumerate(view.clouds) if edges[n] >= least}
+
+
+def _cloud(view: RenderedView, number: int, centre: HighlightPoint) -> Cloud:
+    own = [glint for glint in view.highlights if glint.cloud == number]
+    error_deg = covariance = None
+    if own:
+        mean = np.mean([glint.normal for glint in own], axis=0)
+        error_deg = float(angle_deg(mean / np.linalg.norm(mean), centre.normal))
+        axes = np.stack([centre.direction_min, np.cross(centre.normal, centre.direction_min)])
+        at = (np.array([glint.position for glint in own]) - centre.position) @ axes.T
+        covariance = at.T @ at / len(own)
+    return Cloud(
+        glints=len(own),
+        glints_law=glint_count_law(view.scene, centre),
+        visible=sum(spot.cloud == number for spot in shown(view.visible_highlights)),
+        error_deg=error_deg,
+        error_law_deg=centroid_law_deg(view.scene, centre, len(own)) if own else None,
+        kd_min=centre.kd_min,
+        kd_max=centre.kd_max,
+        covariance=covariance,
+    )

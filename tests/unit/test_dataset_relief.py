@@ -1,0 +1,189 @@
+"""Datasets of surfaces with a relief: both truths stored, drawn, read, and checked."""
+
+import hashlib
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.dataset import fields, read
+from simtest.dataset.card import make_card
+from simtest.dataset.index import HIGHLIGHTS
+from simtest.dataset.manifest import read_manifest
+from simtest.dataset.plan import Plan
+from simtest.dataset.preview import write_preview
+from simtest.dataset.shard import read_member, samples
+from simtest.dataset.shard_writer import write_dataset
+from simtest.dataset.verify import check_sample, verify
+from simtest.errors import InputError
+from simtest.runtime.engines import make_engine
+from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.spec_model import validate
+
+pytestmark = pytest.mark.render
+
+CAMERA = {"camera.width": 64, "camera.height": 48, "camera.fx": 48.0, "camera.fy": 48.0}
+RELIEF = {"surface.relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 2.0}]}}
+ROUGH = {
+    "scene": "sphere",
+    "set": CAMERA | RELIEF,
+    "per_sample": {
+        "surface.relief.bands.0.slope_deg": {"low": 2.0, "high": 8.0},
+        "surface.relief.seed": {"low": 0, "high": 2**32 - 1, "integer": True},
+    },
+}
+SMOOTH = {"scene": "sphere", "set": CAMERA}
+
+
+def recipe(**values):
+    described = {"name": "two", "samples": 4, "samples_per_anatomy": 1, "highlights": 0, "families": [ROUGH, SMOOTH]}
+    described |= {"splits": {"train": 1, "validation": 0, "test": 0}, "estimators": ["cone_axis"]}
+    return validate(Dataset, described | values, "two")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("relief") / "two"
+    write_dataset(recipe(), folder, make_engine())
+    return folder
+
+
+def angle_deg(a, b):
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+
+
+def is_rough(record):
+    return record["meta"]["scene"]["surface"]["relief"] is not None
+
+
+def test_samples_hold_both_truths_and_smooth_ones_hold_one(made):
+    assert verify(made) == []
+    records = list(read(made))
+    rough = [record for record in records if is_rough(record)]
+    assert len(rough) == 2
+    assert len(records) == 4
+    # Each sample has a relief of its own.
+    assert len({record["meta"]["drawn"]["surface.relief.seed"] for record in rough}) == 2
+    for record in records:
+        fine, base = record["normal"], record["normal_base"]
+        seen = np.isfinite(record["depth"])
+        assert record["pool"].shape == seen.shape
+        assert record["pool"].dtype == bool
+        assert not record["pool"].any()
+        if not is_rough(record):
+            assert base is fine
+            assert record["curvature_base"] is record["curvature"]
+            continue
+        # The drawn slope shows, and the base is a sphere.
+        slope = record["meta"]["drawn"]["surface.relief.bands.0.slope_deg"]
+        assert np.mean(angle_deg(fine, base)[seen]) == pytest.approx(np.sqrt(np.pi / 2) * slope, rel=0.35)
+        radius = record["meta"]["scene"]["surface"]["radius_mm"]
+        np.testing.assert_allclose(record["curvature_base"][seen], 1 / radius, atol=1e-4)
+        assert np.abs(record["curvature"][seen] - 1 / radius).max() > 0.1
+
+
+def test_smooth_samples_store_no_base(made):
+    """Their members are those of a dataset without a relief."""
+    names = {}
+    for shard in made.glob("*.tar"):
+        with shard.open("rb") as file:
+            for stored in samples(file):
+                names[stored.meta["index"]] = (stored.meta["scene"]["surface"]["relief"] is None, set(stored.members))
+    base = {"normal_base.png", "curvature_base.png", "pool.png"}
+    for smooth, members in names.values():
+        assert members & base == (set() if smooth else base)
+
+
+@pytest.mark.parametrize("name", ["normal_base", "curvature_base", "pool"])
+def test_one_field_alone_is_read_as_well(made, name):
+    for whole, alone in zip(read(made), read(made, fields=[name]), strict=True):
+        assert set(alone) == {"meta", name}
+        np.testing.assert_array_equal(alone[name], whole[name])
+
+
+def test_tables_and_highlights_hold_both_truths(made):
+    highlights = pl.read_parquet(made / HIGHLIGHTS)
+    for record in read(made, fields=["image"]):
+        meta = record["meta"]
+        rows = highlights.filter(pl.col("index") == meta["index"])
+        assert rows["normal_base_z"].to_list() == [own["normal_base"][2] for own in meta["highlights"]]
+        assert rows["pool"].to_list() == [False] * rows.height
+        off = [angle_deg(np.array(own["normal"]), np.array(own["normal_base"])) for own in meta["highlights"]]
+        assert max(off) > 0.1 if is_rough(record) else max(off) == 0.0
+        for estimate in meta["estimates"]:
+            if "error_deg" in estimate:
+                assert estimate["target"] == "fine"
+                assert estimate["error_fine_deg"] == estimate["error_deg"]
+                assert is_rough(record) or estimate["error_base_deg"] == estimate["error_deg"]
+
+
+@pytest.mark.slow
+def test_the_same_seeds_give_the_same_reliefs(made, tmp_path):
+    write_dataset(recipe(), tmp_path / "again", make_engine())
+    one, other = (
+        {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*.tar")}
+        for folder in (made, tmp_path / "again")
+    )
+    assert one == other
+
+
+def stored_rough(made):
+    for shard in made.glob("*.tar"):
+        with shard.open("rb") as file:
+            for stored in samples(file):
+                if stored.meta["scene"]["surface"]["relief"]:
+                    return {s: read_member(file, stored, s) for s in stored.members if s != "json"}, stored.meta
+    raise AssertionError
+
+
+def recoded(members, name, change):
+    field = fields.BY_NAME[name]
+    return members | {field.suffix: field.encode(change(field.decode(members[field.suffix], {})))}
+
+
+DAMAGE = {
+    "base missing": (lambda m: {s: d for s, d in m.items() if s != "normal_base.png"}, "has no normal_base"),
+    "pool missing": (lambda m: {s: d for s, d in m.items() if s != "pool.png"}, "has no pool"),
+    "fine turned": (lambda m: recoded(m, "normal", lambda n: n[..., [1, 2, 0]]), "fine normals are"),
+    "fine not there": (lambda m: recoded(m, "normal", lambda n: n * np.nan), "not there at the same pixels"),
+    "base away": (lambda m: recoded(m, "normal_base", lambda n: -n), "do not face the camera"),
+    "curvatures swapped": (lambda m: recoded(m, "curvature", lambda k: k[..., ::-1]), "k_min of the fine surface"),
+}
+
+
+@pytest.mark.parametrize(("damage", "said"), DAMAGE.values(), ids=DAMAGE)
+def test_a_wrong_truth_is_found(made, damage, said):
+    members, meta = stored_rough(made)
+    assert list(check_sample(members, meta)) == []
+    assert any(said in fault for fault in check_sample(damage(members), meta))
+
+
+def test_card_and_preview_tell_both_truths(made, tmp_path):
+    plan, manifest = Plan(recipe()), read_manifest(made)
+    card = make_card(plan, manifest)
+    assert "KEY.normal_base.png" in card
+    assert "There are two truths" in card
+    smooth = make_card(Plan(recipe(families=[SMOOTH], samples=1)), manifest)
+    assert "KEY.normal_base.png" not in smooth
+    assert "have no relief" in smooth
+    page = write_preview(made, tmp_path / "preview.html")
+    assert page.read_text().count("<figcaption>normal of the base, without the relief") == 2
+
+
+def test_ranges_that_make_too_high_a_relief_are_refused():
+    wide = ROUGH | {"per_sample": {"surface.relief.bands.0.wavelength_mm": {"low": 1.0, "high": 15.0}}}
+    with pytest.raises(InputError, match=r"families\.0.*must stay below 0\.3 mm"):
+        Plan(recipe(families=[wide]))
+
+
+def test_loader_passes_the_base_on(made):
+    torch = pytest.importorskip("torch")
+    from simtest.dataset.learn.samples import Samples
+
+    wanted = ("normal", "normal_base", "curvature_base", "pool")
+    for item in Samples(made, fields=wanted):
+        assert item["normal_base"].shape == (3, 48, 64)
+        assert item["curvature_base"].shape == (2, 48, 64)
+        assert item["pool"].dtype == torch.bool
+        same = torch.equal(torch.nan_to_num(item["normal"]), torch.nan_to_num(item["normal_base"]))
+        assert same == (item["meta"]["scene"]["surface"]["relief"] is None)

@@ -1,0 +1,213 @@
+"""Glints, clouds and visible highlights of a surface with relief."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session, glints
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.visible_highlights import find_spots, glints_of, shape_of
+from simtest.spec.scene import scene_from_dict
+
+CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}
+SURFACES = {
+    "plane": {"type": "plane", "distance_mm": 20, "tilt_deg": 10},
+    "inside": {"type": "cylinder", "distance_mm": 20, "radius_mm": 40, "side": "inside"},
+    "sphere": {"type": "sphere", "distance_mm": 20, "radius_mm": 30},
+}
+RELIEF = {"bands": [{"slope_deg": 5.0, "wavelength_mm": 1.5}], "seed": 3}
+
+
+def scene(surface, relief=RELIEF, **more):
+    rough = {} if relief is None else {"relief": relief}
+    return scene_from_dict({"surface": {**SURFACES[surface], **rough}, "camera": CAMERA, **more})
+
+
+@pytest.fixture(scope="module")
+def sessions():
+    return {name: Session(scene(name)) for name in SURFACES}
+
+
+def off_zero(session, pixels, light):
+    """Angle between fine normal and bisector, rad, from the points alone."""
+    points = session.cast(pixels)[0]
+    to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
+    to_light = light - points.position
+    to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+    bisector = to_camera + to_light
+    bisector /= np.linalg.norm(bisector, axis=1, keepdims=True)
+    return np.linalg.norm(points.normal - bisector, axis=1)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_every_glint_is_a_zero(sessions, surface):
+    session = sessions[surface]
+    pixels = glints.search(session, 0)
+    assert len(pixels) >= 5
+    assert off_zero(session, pixels, np.zeros(3)).max() < 1e-8
+    assert off_zero(session, pixels + 0.5, np.zeros(3)).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "surface", ["plane", pytest.param("inside", marks=pytest.mark.slow), pytest.param("sphere", marks=pytest.mark.slow)]
+)
+def test_search_finds_what_an_exhaustive_one_finds(sessions, surface):
+    """Every sign change of the misfit on a grid of quarter pixels, followed by bisection of boxes, is a found glint."""
+    session = sessions[surface]
+    found = glints.search(session, 0)
+    missing = [zero for zero in boxed_zeros(session) if np.linalg.norm(found - zero, axis=1).min() > 0.3]
+    assert missing == []
+
+
+def boxed_zeros(session, size=0.25):
+    """Find the pixels near which both components of the misfit change sign round the border of a cell: winding 1."""
+    y, x = np.mgrid[1 : CAMERA["height"] - 1 : size, 1 : CAMERA["width"] - 1 : size]
+    corners = np.stack([x, y], axis=-1)
+    points = session.cast(corners.reshape(-1, 2))[0]
+    to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
+    gap = (points.normal - to_camera)[:, :2].reshape(*x.shape, 2)
+    angle = np.arctan2(gap[..., 1], gap[..., 0])
+    ring = [angle[:-1, :-1], angle[:-1, 1:], angle[1:, 1:], angle[1:, :-1]]
+    turns = sum(np.angle(np.exp(1j * (b - a))) for a, b in zip(ring, ring[1:] + ring[:1], strict=True))
+    rows, columns = np.nonzero(np.abs(turns) > np.pi)
+    return corners[rows, columns] + size / 2
+
+
+def test_jacobian_is_the_misfits_derivative(sessions):
+    session = sessions["sphere"]
+    pixels = glints.search(session, 0)[:10] + 0.3
+    state = glints.exact_misfit(session, pixels, np.zeros(3))
+    step = 1e-4
+    for axis in range(2):
+        move = step * np.eye(2)[axis]
+        high = glints.exact_misfit(session, pixels + move, np.zeros(3)).w
+        low = glints.exact_misfit(session, pixels - move, np.zeros(3)).w
+        # The tangent basis turns with the sightline, which moves w by w itself times the turn.
+        assert (
+            np.abs((high - low) / (2 * step) - state.jacobian[:, :, axis]).max() < 0.02 * np.abs(state.jacobian).max()
+        )
+
+
+def test_glints_know_their_base_normal_and_cloud(sessions):
+    session = sessions["plane"]
+    view = render_view(session, session.scene)
+    assert len(view.clouds) == 1
+    tilt = np.radians(10)
+    for glint in view.highlights:
+        assert glint.cloud == 0
+        assert abs(np.arccos(-glint.normal_base[2]) - tilt) < 1e-9
+    # The cloud's centre is the point whose base normal looks at the camera.
+    sightline = session.camera.unproject(view.clouds[0].bp_px[None])[0]
+    assert np.allclose(-sightline, view.clouds[0].normal, atol=1e-7)
+
+
+def test_two_lights_have_two_clouds():
+    rig = {"lights": [{"position_mm": [-6, 0, 0]}, {"position_mm": [6, 0, 0]}]}
+    session = Session(scene("plane", rig=rig))
+    view = render_view(session, session.scene)
+    assert [centre.light for centre in view.clouds] in ([0, 1], [1, 0])
+    for glint in view.highlights:
+        assert view.clouds[glint.cloud].light == glint.light
+
+
+def test_a_smooth_highlight_is_its_own_cloud():
+    session = Session(scene("sphere", None))
+    view = render_view(session, session.scene)
+    (highlight,) = view.highlights
+    assert highlight.cloud == 0
+    assert view.clouds[0] is highlight
+    (spot,) = view.visible_highlights
+    assert spot.glints == (0,)
+    assert spot.radius_px == pytest.approx(highlight.radius_px, rel=0.05)
+
+
+def test_unresolved_relief_has_no_list_of_glints():
+    relief = {"bands": [{"slope_deg": 3.0, "wavelength_mm": 0.05}]}
+    session = Session(scene("plane", relief))
+    assert len(glints.search(session, 0)) == 0
+    # It acts as roughness: the highlight is the base's, and its fine normal is anyone's.
+    (point,) = session.highlights(session.radiance())
+    sightline = session.camera.unproject(point.bp_px[None])[0]
+    assert np.allclose(point.normal, -sightline, atol=1e-6)
+    (centre,) = session.base_highlights(session.radiance())
+    assert np.array_equal(centre.bp_px, point.bp_px)
+
+
+def test_a_fine_band_without_slope_hides_no_glints():
+    bands = [{"slope_deg": 4.0, "wavelength_mm": 2.0}, {"slope_deg": 0.1, "wavelength_mm": 0.1}]
+    both, alone = (
+        len(glints.search(Session(scene("plane", {"bands": bands[:n], "seed": 3})), 0)) for n in (2, 1)
+    )  # fmt: skip
+    assert both >= alone > 5
+
+
+@pytest.mark.slow
+def test_glints_on_a_users_mesh():
+    """Hits on triangles are single precision; the search must not depend on it."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "meshes" / "colon_edingca_00090.ply"
+    if not path.exists():
+        pytest.skip(f"no {path.name}: reference data is not part of the repository")
+    surface = {"type": "anatomy", "path": str(path), "relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.5}]}}
+    session = Session(scene_from_dict({"surface": surface, "camera": CAMERA}))
+    found = glints.search(session, 0)
+    assert len(found) >= 10
+    assert off_zero(session, found, np.zeros(3)).max() < 1e-8
+    zeros = boxed_zeros(session)
+    missing = [zero for zero in zeros if np.linalg.norm(found - zero, axis=1).min() > 0.5]
+    # Creases of the mesh hold some.
+    assert len(missing) <= 0.05 * len(zeros)
+
+
+def bump(shape, row, column, width, height=1.0):
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return height * np.exp(-((y - row) ** 2 + (x - column) ** 2) / (2 * width**2))
+
+
+def test_spots_need_a_saddle_below_four_fifths():
+    shape = (60, 120)
+    # Two equal bumps 2 a apart, of deviation w, have the saddle 2 exp(-a^2/(2 w^2)) at the middle.
+    apart = bump(shape, 30, 40, 5) + bump(shape, 30, 60, 5, 0.9)
+    melted = bump(shape, 30, 44, 5) + bump(shape, 30, 55, 5, 0.95)
+    assert len(find_spots(apart, apart).rows) == 2
+    assert len(find_spots(melted, melted).rows) == 1
+
+
+def test_spots_shine():
+    shape = (60, 80)
+    lobe = bump(shape, 30, 20, 3)
+    matt = bump(shape, 30, 60, 8)
+    spots = find_spots(0.2 + lobe + matt, lobe)
+    assert [(int(r), int(c)) for r, c in zip(spots.rows, spots.columns, strict=True)] == [(30, 20)]
+    assert spots.regions.max() == 1
+    assert abs(np.sum(spots.regions == 1) - 2 * np.pi * np.log(2) * 9) < 6
+
+
+def test_a_dark_frame_has_no_spots():
+    assert len(find_spots(np.zeros((20, 20)), np.zeros((20, 20))).rows) == 0
+
+
+def test_spot_shape():
+    y, x = np.mgrid[:80, :100]
+    lobe = np.exp(-((x - 50.25) ** 2 / (2 * 8.0**2) + (y - 40.0) ** 2 / (2 * 4.0**2)))
+    spots = find_spots(lobe, lobe)
+    shape = shape_of(spots, 0, lobe)
+    assert shape.area_px == pytest.approx(2 * np.pi * np.log(2) * 32, rel=0.03)
+    assert shape.centroid_px == pytest.approx([50.75, 40.5], abs=0.05)
+    assert shape.axis_ratio == pytest.approx(0.5, rel=0.02)
+    assert shape.whole
+    cut = find_spots(lobe[:, 50:], lobe[:, 50:])
+    assert not shape_of(cut, 0, lobe[:, 50:]).whole
+
+
+def test_spots_hold_the_glints_in_them(sessions):
+    session = sessions["inside"]
+    view = render_view(session, session.scene)
+    held = [number for spot in view.visible_highlights for number in spot.glints]
+    assert len(held) == len(set(held))
+    assert all(view.highlights[number].lit for number in held)
+    # Glints are brighter where they are listed first.
+    for spot in view.visible_highlights:
+        values = [view.highlights[number].radiance for number in spot.glints]
+        assert values == sorted(values, reverse=True)
+    assert glints_of(find_spots(np.zeros((9, 9)), np.zeros((9, 9))), view.highlights) == []

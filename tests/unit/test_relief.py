@@ -1,0 +1,460 @@
+"""The relief against 4th-order differences of its height, its told statistics, and the same inside a kernel."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+from simtest.spec.relief import MAX_HEIGHT_MM, Relief
+from simtest.surfaces import forget_meshes
+from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
+
+STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
+"""Central differences of 4th order."""
+
+SECOND_STENCIL = ((-2, -1 / 12), (-1, 16 / 12), (0, -30 / 12), (1, 16 / 12), (2, -1 / 12))
+
+RELIEF = {
+    "bands": [
+        {"slope_deg": 4, "wavelength_mm": 1.5},
+        {"slope_deg": 2, "wavelength_mm": 0.9, "kind": "ridged", "anisotropy": 2, "direction": [1, 2, 0]},
+        {"slope_deg": 1.5, "wavelength_mm": 2.2, "kind": "pits"},
+    ],
+    "seed": 3,
+}
+
+MESH = Path(__file__).resolve().parents[2] / "meshes" / "colon_40mm.ply"
+
+SURFACES = {
+    "plane": {"type": "plane", "distance_mm": 20, "tilt_deg": 25},
+    "sphere": {"type": "sphere", "distance_mm": 20, "radius_mm": 15},
+    "inside of a cylinder": {"type": "cylinder", "distance_mm": 12, "radius_mm": 20, "side": "inside"},
+    "quadric": {"type": "quadric", "distance_mm": 15, "k1_per_mm": 0.05, "k2_per_mm": -0.03},
+    "colon": {"type": "anatomy", "path": "colon"},
+    "liver": {"type": "anatomy", "path": "liver"},
+}
+
+BAND = {"slope_deg": 4.0, "wavelength_mm": 1.5}
+
+
+def scene(surface, relief):
+    camera = {"width": 64, "height": 48, "fx": 50, "fy": 50}
+    return scene_from_dict({"surface": {**surface, "relief": relief}, "camera": camera})
+
+
+def make(level=None, seed=0, **values):
+    """Return the field of one band."""
+    return make_relief(Relief(bands=({**BAND, **values},), seed=seed), level)
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Fine normals and principal curvatures, (N, 2), by differences over the image, and the exact points."""
+
+    points: object
+    base: np.ndarray
+    normal: np.ndarray
+    curvature: np.ndarray
+
+
+def normals(J, dh, away):
+    """Return base and fine normals, against the vectors `away`, of tangents J = dX/dx, (N, 3, 2), and dh/dx, (N, 2)."""
+    base = np.cross(J[:, :, 0], J[:, :, 1])
+    base *= -np.sign(np.sum(base * away, axis=1, keepdims=True)) / np.linalg.norm(base, axis=1, keepdims=True)
+    inverse = np.linalg.inv(np.einsum("nij,nik->njk", J, J))
+    normal = base - np.einsum("nij,njk,nk->ni", J, inverse, dh)
+    return base, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def curvatures(J, normal, dn):
+    """Return the principal curvatures, (N, 2), of fine normals with derivatives dn/dx, (N, 3, 2)."""
+    inverse = np.linalg.inv(np.einsum("nij,nik->njk", J, J))
+    # A tangent f of the fine surface stands over the base's tangent f - N (N.f) = J a.
+    first = np.cross(normal, np.roll(normal, 1, axis=1))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangents = np.stack([first, np.cross(normal, first)], axis=2)
+    a = np.einsum("njk,nij,nit->nkt", inverse, J, tangents)
+    form = np.einsum("nif,nik,nkt->nft", tangents, dn, a)
+    return np.linalg.eigvalsh((form + np.swapaxes(form, 1, 2)) / 2)
+
+
+def by_differences(session, pixels, step):
+    """Difference positions, heights and fine normals along the image: each pixel position is a point of the base.
+
+    With J = dX/dx the base's normal is across J's columns, the surface gradient is J (J^T J)^-1 dh/dx. Nothing here
+    uses gradient or Hessian of the relief, or the base's normal. The model frame is the camera's here.
+    """
+    pose = session.surface.model_from_camera
+
+    def heights(points):
+        return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).height
+
+    points = session.cast(pixels)[0]
+    J, dn, dh = np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 2))
+    for axis in range(2):
+        for k, weight in STENCIL:
+            near = session.cast(pixels + k * step * np.eye(2)[axis])[0]
+            J[:, :, axis] += weight / step * near.position
+            dn[:, :, axis] += weight / step * near.normal
+            dh[:, axis] += weight / step * np.nan_to_num(heights(replace(near, position=np.nan_to_num(near.position))))
+    usable = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & points.valid)
+    some = {name: getattr(points, name)[usable] for name in points.__dataclass_fields__}
+    J, dn, dh = J[usable], dn[usable], dh[usable]
+    base, normal = normals(J, dh, some["position"])
+    return Differences(replace(points, **some), base, normal, curvatures(J, normal, dn))
+
+
+def relative(found, curvature):
+    """Return the error of both curvatures over the larger one's size, at least that of a radius of 1 m.
+
+    In pools on a plane both vanish, and differences know nothing relative to that.
+    """
+    return np.abs(found - curvature).max(axis=1) / np.maximum(np.abs(curvature).max(axis=1), 1e-3)
+
+
+@pytest.mark.parametrize("level", [None, -0.5])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n == "liver" else []) for n in SURFACES])
+def test_fine_normals_and_curvatures_are_those_of_the_height(name, level):
+    session = Session(scene(SURFACES[name], RELIEF))
+    session.surface.relief = make_relief(session.scene.surface.relief, level)
+    pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (300, 2))
+    wide, fine = by_differences(session, pixels, 1e-3), by_differences(session, pixels, 1e-4)
+    assert len(wide.points.normal) >= 200
+    assert np.linalg.norm(wide.normal - wide.points.normal, axis=1).max() < 1e-6
+    assert np.linalg.norm(wide.base - wide.points.normal_base, axis=1).max() < 1e-6
+    # Not smooth by chance
+    assert np.median(np.linalg.norm(wide.points.normal - wide.points.normal_base, axis=1)) > np.radians(1)
+    exact = np.stack([fine.points.k_min, fine.points.k_max], axis=1)
+    assert relative(fine.curvature, exact).max() < 1e-4
+
+
+def test_principal_directions_of_the_fine_surface():
+    session = Session(scene(SURFACES["inside of a cylinder"], RELIEF))
+    pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (200, 2))
+    points = session.cast(pixels)[0]
+    for direction in (points.direction_min, points.direction_max):
+        assert np.abs(np.sum(direction * points.normal, axis=1)).max() < 1e-12
+        assert np.allclose(np.linalg.norm(direction, axis=1), 1)
+    assert np.abs(np.sum(points.direction_min * points.direction_max, axis=1)).max() < 1e-12
+    assert (points.k_min <= points.k_max).all()
+
+
+def test_on_a_plane_the_relief_is_the_graph_of_its_height():
+    """The closed form of a graph's normal and curvature, from differences of the height in the plane alone."""
+    session = Session(scene({"type": "plane", "distance_mm": 20}, RELIEF))
+    points = session.cast(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))[0]
+    height = session.surface.relief.jets
+    pose = session.surface.model_from_camera
+    step = 1e-4
+
+    def h(x, y):
+        # The plane faces the camera: its height points along -z.
+        moved = points.position + np.array([x, y, 0.0])
+        return height(moved @ pose[:3, :3].T + pose[:3, 3]).height
+
+    hx, hy = (sum(w * h(*(k * step * np.eye(2)[i])) for k, w in STENCIL) / step for i in range(2))
+    wide = 1e-3
+    hxx, hyy = (sum(w * h(*(k * wide * np.eye(2)[i])) for k, w in SECOND_STENCIL) / wide**2 for i in range(2))
+    hxy = sum(v * w * h(j * wide, k * wide) for j, v in STENCIL for k, w in STENCIL) / wide**2
+    root = np.sqrt(1 + hx**2 + hy**2)
+    normal = np.stack([-hx, -hy, -np.ones_like(hx)], axis=1) / root[:, None]
+    assert np.linalg.norm(normal - points.normal, axis=1).max() < 1e-6
+    gauss = (hxx * hyy - hxy**2) / root**4
+    mean = -((1 + hy**2) * hxx - 2 * hx * hy * hxy + (1 + hx**2) * hyy) / (2 * root**3)
+    size = np.maximum(np.abs(points.k_min), np.abs(points.k_max))
+    # Here the step is wide, and a spline's third derivative jumps at the knots that it straddles.
+    off = np.maximum(
+        np.abs(points.k_min + points.k_max - 2 * mean) / size, np.abs(points.k_min * points.k_max - gauss) / size**2
+    )
+    assert np.median(off) < 1e-5
+    assert np.quantile(off, 0.95) < 1e-4
+    assert off.max() < 1e-2
+
+
+@pytest.mark.filterwarnings("ignore:.*inside out")
+def test_on_a_users_mesh_the_base_is_its_interpolated_normal_and_operator():
+    """Differences over the quadric of the base's normal and shape operator at each point."""
+    session = Session(scene({"type": "anatomy", "path": str(MESH)}, RELIEF))
+    pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (900, 2))
+    origins, directions = session.sightlines.in_model(pixels)
+    hits = session._hits(origins, directions)[0]
+    base = session.surface.points(origins, directions, hits)
+    fine = session.surface.fine_points(origins, directions, hits)
+    keep = np.flatnonzero(base.valid)
+    assert len(keep) >= 200
+    P, N = base.position[keep], base.normal[keep]
+    u, v = base.direction_max[keep], base.direction_min[keep]
+    ku, kv, relief = base.k_max[keep, None], base.k_min[keep, None], session.surface.relief
+
+    def at(a, b):
+        return P + a * u + b * v - (ku * a**2 + kv * b**2) / 2 * N
+
+    def fine_normal(a, b, step=1e-4):
+        J = np.stack([u - ku * a * N, v - kv * b * N], axis=2)
+        steps = [[at(a + k * step * i, b + k * step * (1 - i)) for k, _ in STENCIL] for i in (1, 0)]
+        weights = [w / step for _, w in STENCIL]
+        dh = np.stack([np.dot(weights, [relief.jets(x).height for x in points]) for points in steps], axis=1)
+        return J, normals(J, dh, -N)[1]
+
+    J, normal = fine_normal(0.0, 0.0)
+    assert np.linalg.norm(normal - fine.normal[keep], axis=1).max() < 1e-6
+    step = 2e-4
+    dn = np.stack(
+        [sum(w / step * fine_normal(k * step * i, k * step * (1 - i))[1] for k, w in STENCIL) for i in (1, 0)], axis=2
+    )
+    found = np.stack([fine.k_min, fine.k_max], axis=1)[keep]
+    assert relative(curvatures(J, normal, dn), found).max() < 1e-4
+
+
+# What is told ----------------------------------------------------------------------------------------------------
+
+
+def plane_heights(field, normal, along, count=40_000, seed=1):
+    """Return first and second differences along `along` and across it, at random points of a wide plane."""
+    rng = np.random.default_rng(seed)
+    normal = np.array(normal, float) / np.linalg.norm(normal)
+    x = np.array(along, float) / np.linalg.norm(along)
+    y = np.cross(normal, x)
+    u, v = rng.uniform(-400, 400, (2, count))
+    P = 3.1 * normal + u[:, None] * x + v[:, None] * y
+    e, h0 = 1e-3, field.jets(P).height
+    first, second = [], []
+    for axis in (x, y):
+        plus, minus = field.jets(P + e * axis).height, field.jets(P - e * axis).height
+        first.append((plus - minus) / (2 * e))
+        second.append((plus - 2 * h0 + minus) / e**2)
+    return h0, first, second
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "ridged", "pits"])
+@pytest.mark.parametrize("width", [0.05, 0.25, 0.5])
+def test_slope_wavelength_and_height(kind, width):
+    field = make(kind=kind, width=width)
+    h, (hx, hy), (hxx, hyy) = plane_heights(field, [1, 2, 3], [3, 0, -1])
+    for slope in (hx, hy):
+        # One realisation holds some 4,000 independent waves, fewer pits.
+        assert np.degrees(slope.std()) == pytest.approx(4.0, rel=0.05)
+    wavelength = 2 * np.pi * np.sqrt(np.mean(hx**2 + hy**2) / np.mean((hxx + hyy) ** 2))
+    assert wavelength == pytest.approx(1.5, rel=0.03)
+    assert field.deviation == pytest.approx(h.std(), rel=0.03)
+    assert abs(h.mean()) < 0.05 * h.std()
+
+
+@pytest.mark.slow
+def test_theory_table_of_heights():
+    """theory.md section 7: 6 deg at 1.5 mm is 35 micrometres high, 6 deg at 3 mm 70, of a narrow band."""
+    for slope, wavelength, micrometres in ((2, 1.5, 12), (4, 1.5, 23), (6, 1.5, 35), (6, 3.0, 70)):
+        field = make(slope_deg=slope, wavelength_mm=wavelength, width=0.05)
+        assert 1e3 * field.deviation == pytest.approx(micrometres, rel=0.2)
+
+
+@pytest.mark.parametrize("anisotropy", [2.0, 5.0])
+def test_anisotropy_draws_waves_out_along_the_direction(anisotropy):
+    field = make(anisotropy=anisotropy, direction=(0.0, 2.0, 1.0))
+    _, (along, across), (along_2, across_2) = plane_heights(field, [1, 0, 0], [0, 2, 1])
+    assert np.degrees(across.std()) == pytest.approx(4.0, rel=0.04)
+    assert across.std() / along.std() == pytest.approx(anisotropy, rel=0.05)
+    waves = [first.std() / second.std() for first, second in ((along, along_2), (across, across_2))]
+    assert waves[0] / waves[1] == pytest.approx(anisotropy, rel=0.05)
+
+
+@pytest.mark.slow
+def test_gaussian_relief_is_gaussian_and_the_other_kinds_are_not():
+    for kind, low, high in (("gaussian", -0.1, 0.1), ("ridged", -3, -0.5), ("pits", -8, -1)):
+        h = plane_heights(make(kind=kind), [0, 0, 1], [1, 0, 0])[0]
+        skewness = np.mean(((h - h.mean()) / h.std()) ** 3)
+        assert low < skewness < high, kind
+
+
+def test_stationary_on_a_sphere():
+    field, rng = make(), np.random.default_rng(4)
+    points = rng.standard_normal((60_000, 3))
+    normal = points / np.linalg.norm(points, axis=1, keepdims=True)
+    g = field.jets(60 * normal).gradient
+    g -= normal * np.sum(g * normal, axis=1, keepdims=True)
+    square = np.sum(g**2, axis=1) / 2
+    # Octants of the sphere
+    octant = (normal > 0) @ [1, 2, 4]
+    slopes = [np.degrees(np.sqrt(square[octant == i].mean())) for i in range(8)]
+    assert np.allclose(slopes, 4.0, rtol=0.06)
+
+
+def test_seamless_around_a_tube_and_across_the_lattices_borders():
+    field = make()
+    angle = np.linspace(np.pi - 1e-3, np.pi + 1e-3, 2001)
+    around = 25 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    line = np.linspace(0, 80, 400_001)[:, None] * np.array([1.0, 0.3, 0.2]) / np.linalg.norm([1.0, 0.3, 0.2])
+    for path in (around, line):
+        jets, step = field.jets(path), np.linalg.norm(np.diff(path, axis=0), axis=1)
+        steepest = np.linalg.norm(jets.gradient, axis=1).max()
+        assert (np.abs(np.diff(jets.height)) <= steepest * step * 1.01 + 1e-15).all()
+        bent = np.abs(np.linalg.eigvalsh(jets.hessian)).max()
+        assert (np.linalg.norm(np.diff(jets.gradient, axis=0), axis=1) <= bent * step * 1.01 + 1e-14).all()
+
+
+def test_seeds_and_bands_differ_and_repeat():
+    points = np.random.default_rng(0).uniform(-50, 50, (20_000, 3))
+    height = make(seed=1).jets(points).height
+    forget_meshes()
+    assert np.array_equal(make(seed=1).jets(points).height, height)
+    other = make(seed=2).jets(points).height
+    assert abs(np.corrcoef(height, other)[0, 1]) < 0.05
+    two = make_relief(Relief(bands=(BAND, BAND), seed=1))
+    first, second = (band.jets(points).height for band in two.bands)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
+    # Another level is the same field.
+    assert np.array_equal(make(seed=1, level=0.0).tissue_jets(points).height, height)
+
+
+@pytest.mark.slow
+def test_heights_stay_below_the_limit():
+    """The steepest relief that is allowed: hardly a point exceeds the limit, and some come near."""
+    for kind, width in (("gaussian", 0.5), ("ridged", 0.25), ("pits", 0.25)):
+        for slope in np.arange(12.0, 0.0, -0.1):
+            try:
+                field = make(kind=kind, width=width, slope_deg=slope, wavelength_mm=2.0)
+            except ValueError:
+                continue
+            break
+        h = np.abs(plane_heights(field, [0, 0, 1], [1, 0, 0])[0])
+        assert np.mean(h > MAX_HEIGHT_MM) < 0.005, (kind, width)
+        assert np.mean(h > 0.8 * MAX_HEIGHT_MM) > 0.001, (kind, width)
+
+
+# Film and diffuse light ------------------------------------------------------------------------------------------
+
+
+@given(
+    height=st.floats(-0.2, 0.2),
+    level=st.floats(-1.5, 1.5),
+    gradient=st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
+)
+@settings(max_examples=60, deadline=None)
+def test_film_fills_valleys_smoothly(height, level, gradient):
+    field = make(level=0.0)
+    field = replace(field, level=level * field.deviation)
+    G = np.array([gradient])
+    jets = HeightJets(np.array([height]), G, np.zeros((1, 3, 3)))
+    filled = field.fill(jets)
+    surface = max(height, field.level)
+    assert surface - 1e-15 <= filled.height[0] <= surface + np.log(2) * field.meniscus + 1e-15
+    # phi' from differences of phi
+    e = 1e-6
+    near = [field.fill(replace(jets, height=jets.height + k * e)).height for k, _ in STENCIL]
+    share = sum(w * value for (_, w), value in zip(STENCIL, near, strict=True)) / e
+    assert np.allclose(filled.gradient, share[:, None] * G, atol=1e-8)
+    # and phi'' from those of phi'
+    steps = [field.fill(replace(jets, height=jets.height + k * e)).gradient for k, _ in STENCIL]
+    bend = sum(w * value for (_, w), value in zip(STENCIL, steps, strict=True)) / e
+    assert np.allclose(filled.hessian[0], np.outer(bend[0], G[0]), atol=1e-5 * (1 + np.abs(filled.hessian).max()))
+
+
+def test_pools_are_smooth_and_crests_keep_their_relief():
+    relief = {**RELIEF, "bands": RELIEF["bands"][:1]}
+    session = Session(scene(SURFACES["plane"], relief))
+    pixels = session.camera.pixel_centres().reshape(-1, 2)
+    rough = session.cast(pixels)[0]
+    assert not rough.pool.any()
+    session.surface.relief = make_relief(session.scene.surface.relief, 0.3)
+    wet, field = session.cast(pixels)[0], session.surface.relief
+    pose = session.surface.model_from_camera
+    height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).height
+    assert np.array_equal(wet.pool, height < field.level)
+    # Of a gaussian field 62 % lie below 0.3 deviations.
+    assert wet.pool.mean() == pytest.approx(0.618, abs=0.08)
+    deep, high = height < field.level - 10 * field.meniscus, height > field.level + 10 * field.meniscus
+    assert np.linalg.norm(wet.normal - wet.normal_base, axis=1)[deep].max() < 2e-5
+    assert np.linalg.norm(wet.normal - rough.normal, axis=1)[high].max() < 2e-5
+    assert min(deep.sum(), high.sum()) > 50
+
+
+def test_diffuse_light_sees_the_field_smoothed_in_space():
+    """Against Gauss-Hermite quadrature of the convolution."""
+    field = make_relief(Relief(bands=({"slope_deg": 4, "wavelength_mm": 3.0},), diffusion_mm=0.5))
+    points = np.random.default_rng(3).uniform(-30, 30, (25, 3))
+    x, w = np.polynomial.hermite_e.hermegauss(9)
+    offsets = 0.5 * np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
+    weights = (w[:, None, None] * w[:, None] * w).ravel() / (2 * np.pi) ** 1.5
+    around = field.jets((points[:, None] + offsets).reshape(-1, 3))
+    expected = np.einsum("nqi,q->ni", around.gradient.reshape(25, -1, 3), weights)
+    found = field.tissue_jets(points, diffused=True).gradient
+    assert np.abs(found - expected).max() < 0.02 * np.abs(expected).max()
+    assert np.linalg.norm(found) < 0.8 * np.linalg.norm(field.jets(points).gradient)
+
+
+def test_short_waves_are_not_seen_by_diffuse_light_and_long_ones_are():
+    spec = Relief(bands=({"slope_deg": 4, "wavelength_mm": 0.5}, {"slope_deg": 1, "wavelength_mm": 12.0}))
+    short, long = make_relief(spec).bands
+    assert not short.is_seen_diffusely
+    assert long.is_seen_diffusely
+
+
+# The kernel ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [None, 0.2])
+def test_the_kernel_computes_the_same(level):
+    session = Session(scene(SURFACES["plane"], RELIEF))
+    import drjit as dr
+
+    from simtest.rendering.relief_kernel import ReliefKernel
+
+    mi, field = session.mi, make_relief(session.scene.surface.relief, level)
+    points = np.random.default_rng(9).uniform(-40, 40, (5000, 3)).astype(np.float32)
+    jets = ReliefKernel(mi, field).jets(mi.Point3f(points.T.copy()), True, bent=True)
+    dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
+    exact, diffused = field.jets(points.astype(float)), field.tissue_jets(points.astype(float), diffused=True)
+    assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < 1e-5
+    assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < 1e-5
+    tissue = field.tissue_jets(points.astype(float))
+    assert np.abs(np.array(jets.height) - tissue.height).max() < 1e-5 * field.deviation * 10
+    six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
+    assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
+
+
+def test_the_kernel_finds_the_lattices_nodes():
+    """In single precision, at whole numbers of cells far from the origin too."""
+    session = Session(scene(SURFACES["plane"], RELIEF))
+    import drjit as dr
+
+    from simtest.rendering.relief_kernel import _modulo
+
+    cells = np.arange(-200_000, 200_000)
+    given_cells = session.mi.Float(cells.astype(np.float32))
+    dr.make_opaque(given_cells)
+    assert np.array_equal(np.array(_modulo(given_cells)), np.mod(cells, NODES))
+
+
+def test_rendered_shading_follows_the_fine_normal():
+    """A frame of a rough plane: Phong's lobe at the exact fine normals, light at the camera."""
+    rough = scene({"type": "plane", "distance_mm": 20}, {"bands": [BAND]})
+    session = Session(rough)
+    truth, radiance = session.truth(), session.radiance().specular.reshape(48, 64, -1)[..., 0]
+    view = truth.position / truth.depth[..., None]
+    # Light at the camera: the mirror direction is 2 beta off the view, published Phong cos^n of it over d^2.
+    cosine = -np.sum(view * truth.normal, axis=-1)
+    expected = np.maximum(2 * cosine**2 - 1, 0) ** rough.reflectance.exponent / truth.depth**2
+    assert np.abs(radiance / expected.max() - expected / expected.max()).max() < 1e-3
+
+
+# Formulas --------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3))
+def test_fine_normals_are_unit_and_see_the_tangent_gradient_only(direction, gradient):
+    N = np.array([direction])
+    if np.linalg.norm(N) < 1e-3:
+        N = np.array([[0.0, 0.0, 1.0]])
+    N /= np.linalg.norm(N)
+    G = np.array([gradient])
+    found = fine_normals(N, G)
+    assert np.allclose(np.linalg.norm(found, axis=1), 1)
+    assert np.allclose(found, fine_normals(N, G + 0.7 * N), atol=1e-12)
+    # Its slope against the base is the gradient's length along the surface.
+    along = G - N * np.sum(G * N)
+    assert np.arccos(np.clip(np.sum(found * N), -1, 1)) == pytest.approx(np.arctan(np.linalg.norm(along)), abs=1e-7)

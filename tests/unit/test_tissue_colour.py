@@ -1,0 +1,412 @@
+"""Tissue's colour: trees of vessels, their absorption, the pattern's table, and the same in the kernel."""
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+from simtest.spec.tissue_colour import PRESETS, TissueColour
+from simtest.surfaces import make_surface
+from simtest.surfaces.haemoglobin import blood_absorption, reach
+from simtest.surfaces.segment_table import make_table, seen_profile
+from simtest.surfaces.surface_samples import spread_points, surface_patch
+from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, make_pattern
+from simtest.surfaces.vessels import Segments, grow_vessels, segments
+
+DEPTH_MM = TissueColour().vessels.depth_mm
+SMALL = {"width": 96, "height": 72, "fx": 90.0, "fy": 90.0}
+SURFACES = {
+    "plane": {"type": "plane", "distance_mm": 20.0},
+    "sphere": {"type": "sphere", "radius_mm": 12.0, "distance_mm": 20.0},
+    "inside a cylinder": {"type": "cylinder", "radius_mm": 12.0, "distance_mm": 12.0, "side": "inside"},
+    "quadric": {"type": "quadric", "k1_per_mm": 0.05, "k2_per_mm": -0.04, "distance_mm": 15.0},
+    "colon": {"type": "anatomy", "path": "colon"},
+}
+
+
+def scene(surface="plane", tissue=None, **render):
+    reflectance = {"type": "phong", "exponent": 200.0, "specular": 0.3, "albedo": tissue or {}}
+    return scene_from_dict(
+        {"surface": SURFACES[surface], "reflectance": reflectance, "camera": SMALL, "render": render or {}}
+    )
+
+
+def surface_of(name):
+    return make_surface(scene(name).surface)
+
+
+@pytest.fixture(scope="module", params=["plane", "sphere", "inside a cylinder", "quadric", "colon"])
+def grown(request):
+    surface = surface_of(request.param)
+    return request.param, surface, grow_vessels(surface_patch(surface), TissueColour().vessels, 3)
+
+
+# Trees -----------------------------------------------------------------------------------------------------------
+
+
+def test_murray_holds_at_every_node(grown):
+    _, _, forest = grown
+    cubes = np.zeros(len(forest.parent))
+    child = forest.parent >= 0
+    np.add.at(cubes, forest.parent[child], forest.radius[child] ** 3)
+    branching = cubes > 0
+    assert branching.sum() > 50
+    np.testing.assert_allclose(cubes[branching], forest.radius[branching] ** 3, rtol=1e-9)
+    # What has no child has the smallest calibre.
+    np.testing.assert_allclose(forest.radius[~branching], 0.03, rtol=1e-12)
+
+
+def test_trees_are_connected_and_without_loops(grown):
+    _, _, forest = grown
+    # A forest: every way up ends at a root within as many steps as there are nodes.
+    above = np.where(forest.parent >= 0, forest.parent, np.arange(len(forest.parent)))
+    for _ in range(int(np.ceil(np.log2(len(above)))) + 1):
+        above = above[above]
+    assert (forest.parent[above] == -1).all()
+    # A vessel stays an artery or a vein, and both exist.
+    child = forest.parent >= 0
+    assert (forest.vein[child] == forest.vein[forest.parent[child]]).all()
+    assert 0.3 < forest.vein.mean() < 0.7
+    # Every root has a tree.
+    assert set(np.unique(above)) == set(np.flatnonzero(forest.parent == -1))
+
+
+def test_there_are_several_calibres():
+    surface = make_surface(scene_from_dict({"surface": {"type": "plane", "distance_mm": 30.0}}).surface)
+    forest = grow_vessels(surface_patch(surface), TissueColour().vessels, 0)
+    calibre = 2 * forest.radius
+    assert calibre.min() == pytest.approx(0.06)
+    assert 0.6 < calibre[forest.parent == -1].max() / 0.5 < 1.6
+    # Thin ones are many and thick ones few.
+    counts = np.histogram(calibre, [0.059, 0.09, 0.15, 0.25, 1.0])[0]
+    assert (np.diff(counts) < 0).all()
+    assert counts[-1] > 10
+
+
+def test_vessels_lie_on_the_surface(grown):
+    name, surface, forest = grown
+    pieces = segments(forest)
+    for points in (forest.position[::7], pieces.start[::31], pieces.end[::31]):
+        off = np.abs(surface.clearance(points))
+        assert np.quantile(off, 0.95) < 0.01
+        assert off.max() < 0.1
+    # Normals, where they are a closed form.
+    if name == "sphere":
+        out = forest.position - surface.centre
+        assert np.abs(np.cross(forest.normal, out / np.linalg.norm(out, axis=1, keepdims=True))).max() < 0.02
+
+
+def test_no_vessel_leads_through_a_fold(grown):
+    _, _, forest = grown
+    child = np.flatnonzero(forest.parent >= 0)
+    assert np.einsum("ni,ni->n", forest.normal[child], forest.normal[forest.parent[child]]).min() > 0.2
+
+
+def test_pieces_join(grown):
+    _, _, forest = grown
+    pieces = segments(forest)
+    joined = int((forest.parent >= 0).sum())
+    whole = len(pieces.radius) // joined
+    # From the parent to the node, without gaps.
+    start, end = (part.reshape(whole, joined, 3) for part in (pieces.start, pieces.end))
+    child = forest.parent >= 0
+    np.testing.assert_allclose(start[0], forest.position[forest.parent[child]], atol=1e-12)
+    np.testing.assert_allclose(end[-1], forest.position[child], atol=1e-12)
+    np.testing.assert_array_equal(start[1:], end[:-1])
+
+
+def test_samples_are_spread_evenly_by_area():
+    surface = surface_of("quadric")
+    points, normals = spread_points(surface_patch(surface), 0.8, np.random.default_rng(0))
+    gap = np.linalg.norm(points[:, None, :] - points[None, :400], axis=2)
+    gap[np.arange(400), np.arange(400)] = np.inf
+    assert gap.min() >= 0.8
+    # Over a part of the patch, area by its own quadrature.
+    side = (np.arange(400) + 0.5) / 400 * 15.0
+    x, y = np.meshgrid(side, side)
+    secant = np.sqrt(1 + (0.05 * x) ** 2 + (0.04 * y) ** 2)
+    expected = secant.mean() * 225.0 / surface_patch(surface).area
+    assert ((points[:, 0] > 0) & (points[:, 1] > 0)).mean() == pytest.approx(expected, abs=0.02)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+
+
+def test_a_seed_is_a_pattern():
+    patch, spec = surface_patch(surface_of("plane")), TissueColour().vessels
+    first = grow_vessels(patch, spec, 5)
+    grow_vessels.cache_clear()
+    again, other = grow_vessels(patch, spec, 5), grow_vessels(patch, spec, 6)
+    assert first is not again
+    np.testing.assert_array_equal(first.position, again.position)
+    np.testing.assert_array_equal(first.parent, again.parent)
+    assert len(other.position) != len(first.position) or not np.array_equal(other.position, first.position)
+
+
+# Absorption ------------------------------------------------------------------------------------------------------
+
+
+def test_blood_absorbs_red_least():
+    for saturation in (0.0, 0.5, 0.75, 1.0):
+        red, green, blue = blood_absorption(saturation)
+        assert red < 0.3 * min(green, blue)
+    # Blood of 150 g/l: oxygenated 2.303 * 53236 * 150 / 64500 = 285 / cm at 540 nm, and less beside the peak.
+    assert 10 < blood_absorption(1.0)[1] < 28.5
+    # Without oxygen red is absorbed more.
+    assert blood_absorption(0.0)[0] > 4 * blood_absorption(1.0)[0]
+    # More blood, less depth; red reaches deepest.
+    assert (reach(0.1) < reach(0.02)).all()
+    assert reach(0.03)[0] > 2 * reach(0.03)[1]
+
+
+def test_a_profile_keeps_area_and_spread():
+    radius, blur = np.array([0.02, 0.1, 0.4]), 0.06
+    width, peak = seen_profile(radius, blur)
+    for r, w, top in zip(radius, width, peak, strict=True):
+        x = np.linspace(-w, w, 20001)
+        seen = top * np.maximum(1 - (x / w) ** 2, 0) ** 1.5
+        area = seen.sum() * (x[1] - x[0])
+        assert area == pytest.approx(np.pi * r**2, rel=1e-4)
+        assert (seen * x**2).sum() / seen.sum() == pytest.approx(r**2 / 4 + blur**2, rel=1e-4)
+
+
+def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
+    pattern = make_pattern(surface_of("plane"), TissueColour())
+    radius = np.array([0.03, 0.06, 0.12, 0.25])
+    start = np.stack([np.zeros(4), 10.0 * np.arange(4), np.zeros(4)], axis=1)
+    normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
+    for vein in (False, True):
+        lines = Segments(start, start + 2 * half, normal, radius, np.full(4, vein))
+        table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM)
+        chord = table.chords(start + half)[:, int(vein)]
+        assert (table.chords(start + half)[:, int(not vein)] == 0).all()
+        left = 1 - pattern.share * (1 - np.exp(-chord[:, None] * pattern.absorption[int(vein)]))
+        assert (np.diff(left, axis=0) < 0).all()
+        assert (left[:, 0] > left[:, 1]).all()
+        assert (left[:, 0] > left[:, 2]).all()
+        # Twigs are faint, trunks plain.
+        assert left[0, 1] > 0.75
+        assert left[-1, 1] < 0.6
+
+
+def test_the_pattern_darkens_over_vessels_alone():
+    tissue = {"mottling": {"amplitude": 0.0}, "capillaries": {"strength": 0.0}}
+    surface = surface_of("plane")
+    spec = scene(tissue=tissue).albedo
+    pattern = make_pattern(surface, spec)
+    pieces = segments(grow_vessels(surface_patch(surface), spec.vessels, _grow_seed(spec)))
+    on = pattern.albedo((pieces.start + pieces.end) / 2)
+    assert (on < pattern.base).all()
+    # Far from all vessels there is the ground.
+    points = np.zeros((800, 3))
+    points[:, :2] = np.random.default_rng(0).uniform(-25, 25, (800, 2))
+    far = _brute(points, pieces, pattern).max(axis=1) == 0
+    assert far.sum() > 50
+    np.testing.assert_array_equal(pattern.albedo(points[far]), np.tile(pattern.base, (far.sum(), 1)))
+
+
+def _grow_seed(spec):
+    return int(np.random.SeedSequence(spec.seed).spawn(3)[2].generate_state(1)[0])
+
+
+def _brute(points, pieces, pattern):
+    """Chords through every segment, and the longest of arteries and veins."""
+    blur = BLUR_PER_DEPTH * DEPTH_MM
+    variance = pieces.radius**2 / 4 + blur**2
+    found = np.zeros((len(points), 2))
+    along = pieces.end - pieces.start
+    for i, p in enumerate(points):
+        t = np.clip(np.sum((p - pieces.start) * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
+        x2 = np.sum((p - pieces.start - t[:, None] * along) ** 2, axis=1)
+        chord = 8 * pieces.radius**2 / (3 * np.sqrt(6 * variance)) * np.maximum(1 - x2 / (6 * variance), 0) ** 1.5
+        found[i] = [chord[~pieces.vein].max(), chord[pieces.vein].max()]
+    return found
+
+
+@pytest.mark.parametrize("name", ["plane", "inside a cylinder", "colon"])
+def test_the_table_finds_every_vessel(name):
+    surface, spec = surface_of(name), TissueColour()
+    pattern = make_pattern(surface, spec)
+    patch = surface_patch(surface)
+    pieces = segments(grow_vessels(patch, spec.vessels, _grow_seed(spec)))
+    points, _ = patch.draw(np.random.default_rng(1), 300)
+    expected = _brute(points, pieces, pattern)
+    assert (expected > 0).any(axis=1).mean() > 0.2
+    # The table is in single precision, which rounds positions of 100 mm to 4e-6 mm; a profile is no steeper than 1.5.
+    np.testing.assert_allclose(pattern.vessels.chords(points), expected, atol=2e-5)
+
+
+# Pattern ---------------------------------------------------------------------------------------------------------
+
+
+def test_mottling_has_the_told_deviation():
+    tissue = {"mottling": {"amplitude": 0.2, "wavelength_mm": 2.0}, "capillaries": {"strength": 0.0},
+              "vessels": {"strength": 0.0}}  # fmt: skip
+    pattern = make_pattern(surface_of("plane"), scene(tissue=tissue).albedo)
+    points = np.zeros((20000, 3))
+    points[:, :2] = np.random.default_rng(0).uniform(-30, 30, (20000, 2))
+    absorbance = -np.log(pattern.albedo(points) / pattern.base)
+    assert absorbance[:, 1].std() == pytest.approx(0.2, rel=0.1)
+    assert abs(absorbance[:, 1].mean()) < 0.03
+    # Its waves: green's autocorrelation is high within a tenth of one, and gone half of one away.
+    near, far = (
+        -np.log(pattern.albedo(points + np.array([step, 0, 0]))[:, 1] / pattern.base[1]) for step in (0.2, 1.0)
+    )
+    assert np.corrcoef(absorbance[:, 1], near)[0, 1] > 0.8
+    assert np.corrcoef(absorbance[:, 1], far)[0, 1] < 0.3
+    # Red varies least.
+    assert absorbance[:, 0].std() < 0.5 * absorbance[:, 1].std()
+
+
+def test_the_net_has_meshes_of_the_told_width():
+    tissue = {"mottling": {"amplitude": 0.0}, "capillaries": {"strength": 0.5, "spacing_mm": 1.0},
+              "vessels": {"strength": 0.0}}  # fmt: skip
+    pattern = make_pattern(surface_of("plane"), scene(tissue=tissue).albedo)
+    x = np.linspace(-30, 30, 60001)
+    line = np.stack([x, 0.3 * x, np.zeros_like(x)], axis=1)
+    dark = pattern.capillaries.at(line) > 0.6
+    walls = np.count_nonzero(np.diff(dark.astype(int)) == 1)
+    mean_chord = 60 * np.hypot(1, 0.3) / walls
+    # A line's mean chord in the cells of random points is about 0.7 of the cube root of their volume; walls that meet
+    # melt, so some are missed.
+    assert 0.6 < mean_chord < 1.2
+    assert 0.05 < dark.mean() < 0.5
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_albedo_is_a_share(preset):
+    tissue = {"preset": preset, "base": [1.0, 1.0, 0.9], "mottling": {"amplitude": 1.0}}
+    pattern = make_pattern(surface_of("plane"), scene(tissue=tissue).albedo)
+    points = np.zeros((20000, 3))
+    points[:, :2] = np.random.default_rng(0).uniform(-25, 25, (20000, 2))
+    albedo = pattern.albedo(points)
+    assert albedo.min() >= 0
+    assert albedo.max() <= 1
+
+
+def test_presets_can_be_overridden_number_by_number():
+    tissue = TissueColour.model_validate({"preset": "stomach", "vessels": {"depth_mm": 0.1}})
+    assert tissue.vessels.depth_mm == 0.1
+    assert tissue.vessels.largest_mm == PRESETS["stomach"]["vessels"]["largest_mm"]
+    assert tissue.base == PRESETS["stomach"]["base"]
+    assert TissueColour() == TissueColour.model_validate({}) == TissueColour(preset="colon_mucosa")
+
+
+def test_there_is_no_seam_around_a_tube():
+    surface = surface_of("inside a cylinder")
+    pattern = make_pattern(surface, TissueColour())
+    # The anchor lies at angle 0: the seam of the sampling is on the far side.
+    y = np.linspace(-15, 15, 1500)
+
+    def wall(angle):
+        out = np.array([np.sin(angle), 0.0, -np.cos(angle)])
+        return surface.centre + 12.0 * out + y[:, None] * [0.0, 1.0, 0.0]
+
+    step = 1e-4
+    for angle in (np.pi, 1.0):
+        jump = np.abs(pattern.albedo(wall(angle - step)) - pattern.albedo(wall(angle + step)))
+        assert jump.max() < 0.02
+        assert pattern.vessels.chords(wall(angle)).max() > 0.02
+    # Vessels cross the seam as they cross another line.
+    forest = grow_vessels(surface_patch(surface), TissueColour().vessels, 3)
+    child = np.flatnonzero(forest.parent >= 0)
+    x, _, z = (forest.position - surface.centre).T
+    angle = np.arctan2(x, -z)
+
+    def crossings(line):
+        turned = np.angle(np.exp(1j * (angle - line)))
+        a, b = turned[child], turned[forest.parent[child]]
+        return np.count_nonzero((a * b < 0) & (np.abs(a - b) < 1))
+
+    others = np.mean([crossings(line) for line in (-2.0, -1.0, 0.5, 1.0, 2.0)])
+    assert 0.6 * others < crossings(np.pi) < 1.6 * others
+
+
+# Kernel ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"])
+@pytest.mark.parametrize("name", ["plane", "sphere", "colon"])
+def test_the_kernel_is_the_reference(name, variant):
+    session = Session(scene(name), variant)
+    mi = session.mi
+    points, _ = surface_patch(session.surface).draw(np.random.default_rng(2), 3000)
+    rounded = points.astype(np.float32)
+    found = np.array(session._albedo.at(mi.Point3f(rounded.T), mi.Bool(True))).T
+    expected = make_pattern(session.surface, TissueColour()).albedo(rounded.astype(float))
+    if variant.endswith("mono"):
+        # Rec. 709 luminance
+        expected = expected @ [[0.212671], [0.715160], [0.072169]]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("lights", [1, 2])
+def test_a_frame_shows_the_albedo(lights):
+    data = {
+        "surface": SURFACES["sphere"],
+        "camera": SMALL,
+        "rig": {"lights": [{"power": 1.0}, {"offset_mm": 4.0, "power": 0.5}][:lights]},
+    }
+    white = {"type": "phong", "specular": 0.0, "diffuse": 1.0}
+    plain = Session(scene_from_dict({**data, "reflectance": white}), "llvm_ad_rgb").radiance()
+    tissue = {"type": "phong", "specular": 0.0, "albedo": {}}
+    session = Session(scene_from_dict({**data, "reflectance": tissue}), "llvm_ad_rgb")
+    seen = session.radiance()
+    truth = session.truth()
+    valid = np.isfinite(truth.position).all(axis=-1) & (plain.diffuse.min(axis=-1) > 1e-6)
+    assert valid.sum() > 1000
+    pose = session.surface.model_from_camera
+    points = truth.position[valid] @ pose[:3, :3].T + pose[:3, 3]
+    expected = make_pattern(session.surface, TissueColour()).albedo(points)
+    np.testing.assert_allclose(seen.diffuse[valid] / plain.diffuse[valid], expected, atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_no_pattern_has_a_kernel_of_its_own():
+    session = Session(scene(samples_per_pixel=4), "llvm_ad_rgb")
+    frames = [session.radiance().diffuse]
+    import drjit as dr  # after the backend has chosen its libLLVM
+
+    patterns = [{"seed": 1}, {"seed": 2}, {"preset": "gallbladder"}, {"preset": "stomach", "seed": 3},
+                {"base": [0.5, 0.4, 0.3]}, {"vessels": {"spacing_mm": 3.0}}]  # fmt: skip
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for tissue in patterns:
+            session.update(scene(tissue=tissue, samples_per_pixel=4))
+            frames.append(session.radiance().diffuse)
+        launched = [kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,))]
+    assert session.rebuilds == 1
+    # Dr.Jit orders a kernel's arguments at random, so that there are a few; with literals there would be six.
+    assert len(launched) == len(patterns)
+    assert len(set(launched)) <= 4
+    assert np.abs(frames[0] - frames[1]).max() > 0.01 * frames[0].max()
+    fresh = Session(scene(tissue=patterns[-1], samples_per_pixel=4), "llvm_ad_rgb").radiance().diffuse
+    np.testing.assert_array_equal(fresh, frames[-1])
+
+
+@pytest.mark.render
+def test_light_bounces_off_the_same_colour():
+    surface = {"type": "sphere", "radius_mm": 12.0, "distance_mm": 12.0, "side": "inside"}
+
+    def bounced(reflectance):
+        camera = {"width": 48, "height": 36, "fx": 45.0, "fy": 45.0}
+        data = {"surface": surface, "camera": camera, "render": {"path_depth": 3, "samples_per_pixel": 4}}
+        made = scene_from_dict({**data, "reflectance": {"type": "phong", "specular": 0.0, **reflectance}})
+        return Session(made, "llvm_ad_rgb").radiance().indirect.mean(axis=(0, 1))
+
+    even = {"mottling": {"amplitude": 0.0}, "capillaries": {"strength": 0.0}, "vessels": {"strength": 0.0}}
+    tissue = bounced({"albedo": {"base": [0.6, 0.3, 0.2], **even}})
+    plain = bounced({"diffuse": 1.0, "colour": [0.6, 0.3, 0.2]})
+    np.testing.assert_allclose(tissue, plain, rtol=0.02)
+    # Vessels take light away.
+    assert (bounced({"albedo": {"base": [0.6, 0.3, 0.2]}}) < tissue).all()
+
+
+def test_the_cache_is_freed():
+    from simtest.surfaces.factory import forget_meshes
+
+    make_pattern(surface_of("plane"), TissueColour())
+    assert _make.cache_info().currsize > 0
+    forget_meshes()
+    assert _make.cache_info().currsize == 0

@@ -1,0 +1,222 @@
+"""Tissue in a scene: the plane's highlight by closed form, the lobe that is told, pools and crests of the film."""
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+
+pytestmark = pytest.mark.render
+
+DISTANCE, FOCAL, SIZE = 12.0, 400.0, 61
+
+
+def scene(film, relief=None, diffuse=0.4, lights=({},), focal=FOCAL, **surface):
+    described = {"type": "plane", "distance_mm": DISTANCE, **surface}
+    if relief is not None:
+        described["relief"] = relief
+    return scene_from_dict(
+        {
+            "surface": described,
+            "reflectance": {"type": "tissue", "film": film, "diffuse": diffuse},
+            "rig": {"lights": list(lights)},
+            "camera": {"width": SIZE, "height": SIZE, "fx": focal, "fy": focal},
+        }
+    )
+
+
+def fresnel(cosine, index):
+    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+    s = (cosine - index * inside) / (cosine + index * inside)
+    p = (index * cosine - inside) / (index * cosine + inside)
+    return (s**2 + p**2) / 2
+
+
+def smith(cosine, alpha):
+    a = 1 / np.maximum(alpha * np.sqrt(1 - cosine**2) / cosine, 1e-9)
+    return 2 / (1 + erf(a) + np.exp(-(a**2)) / (a * np.sqrt(np.pi)))
+
+
+def plane_film(alpha, index, tilt_deg, light):
+    """Radiance of a tilted plane's Beckmann film at all pixels, by theory: I/r^2 F D G / (4 cos) towards the camera."""
+    tilt = np.radians(tilt_deg)
+    N = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    x, y = np.meshgrid(*2 * [(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL])
+    s = np.stack([x, y, np.ones_like(x)], axis=-1)
+    P = s * (DISTANCE * N[2] / (s @ N))[..., None]
+    towards = np.array(light) - P
+    squared = np.sum(towards**2, axis=-1)
+    wi, wo = -P / np.linalg.norm(P, axis=-1, keepdims=True), towards / np.sqrt(squared)[..., None]
+    h = wi + wo
+    h /= np.linalg.norm(h, axis=-1, keepdims=True)
+    cosine = h @ N
+    D = np.exp((1 - 1 / cosine**2) / alpha**2) / (np.pi * alpha**2 * cosine**4)
+    G = smith(wi @ N, alpha) * smith(wo @ N, alpha)
+    return fresnel(np.sum(wi * h, axis=-1), index) * D * G / (4 * (wi @ N)) / squared
+
+
+@pytest.mark.parametrize(("alpha", "index"), [(0.01, 1.33), (0.03, 1.36), (0.1, 1.4)])
+@pytest.mark.parametrize(("tilt_deg", "light"), [(0.0, (0.0, 0.0, 0.0)), (20.0, (8.0, 1.0, 1.0))])
+def test_a_planes_highlight_is_the_closed_forms(alpha, index, tilt_deg, light):
+    """The peak and all of the lobe down to a thousandth of it, within 1e-3."""
+    film = {"index": index, "alpha": alpha}
+    rendered = Session(scene(film, tilt_deg=tilt_deg, lights=({"position_mm": list(light)},))).radiance().specular
+    expected = plane_film(alpha, index, tilt_deg, light)
+    seen = expected > 1e-3 * expected.max()
+    assert seen.sum() > 100
+    assert rendered.max() == pytest.approx(expected.max(), rel=1e-3)
+    assert np.unravel_index(rendered.argmax(), rendered.shape) == np.unravel_index(expected.argmax(), expected.shape)
+    np.testing.assert_allclose(rendered[seen], expected[seen], rtol=1e-3)
+    if tilt_deg == 0:
+        # Straight on: F(0) / (4 pi alpha^2) over the squared distance.
+        straight = ((index - 1) / (index + 1)) ** 2 / (4 * np.pi * alpha**2) / DISTANCE**2
+        assert rendered.max() == pytest.approx(straight, rel=1e-3)
+
+
+# What estimators are told ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("alpha", [0.01, 0.03, 0.1])
+def test_the_curvature_that_is_told_is_the_rendered_lobes(alpha):
+    """-(log f)''(0) by differences of the rendered radiance along the row through the highlight, falloff taken out."""
+    film = {"index": 1.36, "alpha": alpha}
+    described = scene(film, diffuse=0.0)
+    row = Session(described).radiance().specular[SIZE // 2].astype(float)
+    angle = np.arctan((np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL)
+    near = np.abs(angle) < 1.2 * alpha
+    lobe = np.log(row[near] / np.cos(angle[near]) ** 2)
+    # log f is even: its terms in angle^2, of which the first is -c/2.
+    found = -2 * np.polynomial.polynomial.polyfit(angle[near] ** 2, lobe, 3)[1]
+    told = described.calibration().priors.lobe_curvature
+    assert told.mean == pytest.approx(2 / alpha**2 - 5)
+    assert found == pytest.approx(told.mean, rel=5e-3)
+
+
+def test_no_width_is_told_of_ggx_nor_where_the_lobe_is_unknown():
+    ggx = scene({"index": 1.36, "distribution": "ggx"})
+    assert ggx.calibration().priors.lobe_curvature is None
+    assert ggx.reflectance.lobe_curvature is None
+    untold = scene_from_dict({**scene({"index": 1.36}).model_dump(), "known": {"lobe": False}})
+    assert untold.calibration().priors.lobe_curvature is None
+
+
+# Film over relief -----------------------------------------------------------------------------------------------------
+
+RELIEF = {"bands": [{"slope_deg": 5.0, "wavelength_mm": 0.5}], "seed": 3}
+FILM = {"index": 1.36, "alpha": 0.04}
+WIDE = 60.0
+
+
+def kernel_hits(session):
+    """Height of the tissue, mm, and fine and base normals at the pixels' centres, as the kernel has them."""
+    tracer = session._tracer()
+    lanes = session.sightlines.lanes(0, SIZE * SIZE, False, 0)
+    _, _, hit = tracer._hit(*session.sightlines.centre(lanes))
+    fine, base = (np.array(si.sh_frame.n, dtype=float).T for si in (hit.fine, hit.base))
+    return np.array(hit.jets.height, dtype=float), fine, base
+
+
+def test_pools_are_smooth_and_crests_are_rough():
+    """A film up to the mean height: below it the rendered normals are the base's, above it the relief's."""
+    session = Session(scene({**FILM, "level": 0.0}, RELIEF, focal=WIDE))
+    height, fine, base = kernel_hits(session)
+    bare = kernel_hits(Session(scene(FILM, RELIEF, focal=WIDE)))[1]
+    deviation, meniscus = session.surface.relief.deviation, session.surface.relief.meniscus
+    # Here the meniscus, a tenth of a deviation wide, has ended.
+    deep, high = height < -1.2 * deviation, height > 1.2 * deviation
+    assert min(deep.sum(), high.sum()) > 300
+    turned = np.linalg.norm(fine - base, axis=1)
+    assert turned[deep].max() < 1e-5
+    assert np.linalg.norm(bare - base, axis=1)[deep].mean() > np.radians(3)
+    assert np.linalg.norm(fine - bare, axis=1)[high].max() < 1e-5
+    assert turned[high].mean() > np.radians(3)
+    # Between them the film's surface bends by the softplus's slope.
+    share = 1 / (1 + np.exp(-height / meniscus))
+    # On a plane the fine normal's tangent part over its normal part is the gradient.
+    slope, bare_slope = (np.linalg.norm(n[:, :2], axis=1) / np.abs(n[:, 2]) for n in (fine, bare))
+    np.testing.assert_allclose(slope, share * bare_slope, atol=2e-5)
+
+
+def test_the_truth_tells_pools_from_crests():
+    session = Session(scene({**FILM, "level": 0.5}, RELIEF, focal=WIDE))
+    height, _, _ = kernel_hits(session)
+    level = session.surface.relief.level
+    truth = session.truth()
+    clear = np.abs(height - level) > 1e-4 * session.surface.relief.deviation
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(truth.pool.ravel()[clear], (height < level)[clear])
+    # About as many as a Gaussian has below half a deviation.
+    assert 0.6 < truth.pool.mean() < 0.78
+    deep = truth.pool & (height.reshape(truth.pool.shape) < level - session.surface.relief.deviation)
+    np.testing.assert_allclose(truth.normal[deep], truth.normal_base[deep], atol=1e-5)
+    assert not Session(scene(FILM, RELIEF, focal=WIDE)).truth().pool.any()
+
+
+def test_pools_shine_as_a_smooth_film_does():
+    """The specular radiance of a pool is that of the scene without relief; the base's light stays as it was."""
+    session = Session(scene({**FILM, "level": 1.0}, RELIEF, focal=WIDE))
+    filled, height = session.radiance(), kernel_hits(session)[0].reshape(SIZE, SIZE)
+    deep = height < 0
+    smooth, bare = (Session(scene(FILM, relief, focal=WIDE)).radiance() for relief in (None, RELIEF))
+    bright = deep & (smooth.specular > 1e-3 * smooth.specular.max())
+    assert bright.sum() > 20
+    np.testing.assert_allclose(filled.specular[bright], smooth.specular[bright], rtol=2e-3)
+    assert np.abs(bare.specular[bright] / smooth.specular[bright] - 1).mean() > 0.3
+    np.testing.assert_array_equal(filled.diffuse, bare.diffuse)
+
+
+def test_normals_that_face_away_give_no_light_and_no_nan():
+    """At grazing views of a steep relief."""
+    relief = {"bands": [{"slope_deg": 20.0, "wavelength_mm": 0.5}]}
+    lights = ({"position_mm": [11.0, 0.0, 0.0]}, {})
+    session = Session(scene(FILM, relief, tilt_deg=85.0, lights=lights))
+    tracer = session._tracer()
+    lanes = session.sightlines.lanes(0, SIZE * SIZE, False, 0)
+    _, _, hit = tracer._hit(*session.sightlines.centre(lanes))
+    away = (np.array(hit.fine.wi.z) <= 0).reshape(SIZE, SIZE) & (np.array(hit.base.t) < 1e6).reshape(SIZE, SIZE)
+    assert away.sum() > 50
+    radiance = session.radiance()
+    for part in (radiance.specular, radiance.diffuse):
+        assert np.isfinite(part).all()
+        assert (part >= 0).all()
+    assert (radiance.specular[away] == 0).all()
+
+
+# Painted base ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("samples", "depth"), [(1, 2), (4, 2), (4, 3)])
+def test_a_painted_albedo_reaches_direct_light_and_bounces(samples, depth):
+    """An albedo gathered from a table, by place: 0 on one side of a tube, that of the texture on the other."""
+    tube = {"type": "cylinder", "radius_mm": 20.0, "side": "inside"}
+    described = scene_from_dict(
+        {
+            "surface": tube,
+            "reflectance": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.1}, "diffuse": 0.6},
+            "camera": {"width": SIZE, "height": SIZE, "fx": WIDE, "fy": WIDE},
+            "render": {"samples_per_pixel": samples, "path_depth": depth},
+        }
+    )
+    session = Session(described)
+    plain = session.radiance()
+    mi = session.mi
+    import drjit as dr  # after the backend has chosen its libLLVM
+
+    table = mi.Float(0.0, 0.6)
+    # The camera's x axis in the model frame: pixels on the left have a negative share of it.
+    axis = session.to_model(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    right, origin = mi.Vector3f(*(axis[0] - axis[1]).tolist()), mi.Point3f(*axis[1].tolist())
+
+    def albedo(si, active):
+        side = dr.select(dr.dot(right, si.p - origin) > 0, mi.UInt32(1), mi.UInt32(0))
+        return mi.Spectrum(dr.gather(mi.Float, table, side, active))
+
+    session._built.scene.shapes()[0].bsdf().albedo_at = albedo
+    painted = session.radiance()
+    left, middle = np.s_[:, : SIZE // 2], SIZE // 2 + 1
+    assert (painted.diffuse[left] == 0).all()
+    np.testing.assert_allclose(painted.diffuse[:, middle:], plain.diffuse[:, middle:], rtol=1e-5)
+    np.testing.assert_array_equal(painted.specular, plain.specular)
+    if depth > 2:
+        assert 0 < painted.indirect.sum() < 0.8 * plain.indirect.sum()
