@@ -4,13 +4,14 @@ VENV ?= .venv
 WORKERS ?= auto
 BIN := $(VENV)/bin
 
-.PHONY: help demo test test-all bench lint format clean
+.PHONY: help demo test test-all bench bench-cycles lint format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make bench     speeds, as ratios within one run"
+	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
 
 $(BIN)/python:
@@ -24,6 +25,15 @@ $(VENV)/.tests: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
 	@touch $@
 
+$(VENV)/.benchmarks: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench]"
+	@touch $@
+
+$(VENV)-cycles/.installed: benchmarks/cycles-requirements.txt
+	$(PYTHON) -m venv $(VENV)-cycles
+	$(VENV)-cycles/bin/python -m pip install --quiet --disable-pip-version-check -r benchmarks/cycles-requirements.txt
+	@touch $@
+
 demo: $(VENV)/.installed
 	$(BIN)/simtest validate overview
 
@@ -33,8 +43,12 @@ test: $(VENV)/.tests
 test-all: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-bench: $(VENV)/.installed
+bench: $(VENV)/.benchmarks
 	$(BIN)/python -m benchmarks
+
+# Blender's Cycles lives in an environment of its own: its package needs a NumPy older than ours, and Python 3.11.
+bench-cycles: $(VENV)/.installed $(VENV)-cycles/.installed
+	SIMTEST_CYCLES_PYTHON=$(VENV)-cycles/bin/python $(BIN)/python -m benchmarks blender
 
 lint: $(VENV)/.tests
 	$(BIN)/ruff check
@@ -47,4 +61,4 @@ format: $(VENV)/.tests
 	$(BIN)/ruff format
 
 clean:
-	rm -rf $(VENV) reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(VENV)-cycles reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -9,6 +9,8 @@ NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (
+    "blender",
+    "transfers",
     "history",
     "dataset_memory",
     "nightly_page",
