@@ -11,6 +11,10 @@ NAMES = ("estimators", "published", "rendering", "colour", "dataset")
 ON_REQUEST = (
     "blender",
     "transfers",
+    "growth",
+    "cost",
+    "cores",
+    "ray_nodes",
     "history",
     "dataset_memory",
     "nightly_page",

@@ -19,13 +19,29 @@ LIMIT_S = 0.5
 
 def frame() -> npt.NDArray[np.float32]:
     """Return a shaded, mottled tissue in a round view with 30 highlights of 2 to 9 px, 8 bits."""
+    return _picture([(220 + 160 * (i % 6), 120 + 115 * (i // 6)) for i in range(HIGHLIGHTS)], (30, 25), 9)
+
+
+def spotted(highlights: int) -> npt.NDArray[np.float32]:
+    """Return the same tissue with another number of highlights, of 2 to 4 px, spread evenly over the view."""
+    columns = int(np.ceil(np.sqrt(highlights * 1.6)))
+    rows = -(-highlights // columns)
+    across, down = 860 / columns, 540 / rows
+    grid = [(210 + across * (i % columns + 0.5), 90 + down * (i // columns + 0.5)) for i in range(highlights)]
+    return _picture(grid, (0.1 * across, 0.1 * down), 4)
+
+
+def _picture(
+    grid: list[tuple[float, float]], shift: tuple[float, float], widest: float
+) -> npt.NDArray[np.float32]:
+    """Return tissue with a highlight near each position of a grid, px, shifted by up to `shift` along both axes."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     shading = 0.35 + 0.2 * np.sin(x / 170) * np.cos(y / 130)
     linear = shading[..., None] * np.array([0.55, 0.28, 0.22])
-    for i in range(HIGHLIGHTS):
-        column, row = 220 + 160 * (i % 6) + rng.uniform(-30, 30), 120 + 115 * (i // 6) + rng.uniform(-25, 25)
-        across, along = rng.uniform(2, 9, 2)
+    for at_x, at_y in grid:
+        column, row = at_x + rng.uniform(-shift[0], shift[0]), at_y + rng.uniform(-shift[1], shift[1])
+        across, along = rng.uniform(2, widest, 2)
         spot = np.exp(-0.5 * (((x - column) / across) ** 2 + ((y - row) / max(along, across / 2)) ** 2))
         linear += rng.uniform(0.4, 1.2) * spot[..., None]
     linear += rng.normal(0, 0.004, linear.shape)

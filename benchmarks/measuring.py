@@ -51,3 +51,11 @@ def print_figures(figures: Sequence[Figure]) -> int:
         table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}", limit, verdict, figure.about)
     Console(width=150).print(table)
     return 0 if all(figure.met for figure in figures) else 1
+
+
+def print_markdown(rows: Sequence[Sequence[str]]) -> None:
+    """Print a table as the manual holds it; the first row is its head."""
+    head, *body = rows
+    for row in (head, ["---"] * len(head), *body):
+        print("| " + " | ".join(row) + " |")
+    print()

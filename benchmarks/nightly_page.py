@@ -75,14 +75,14 @@ def _judged(folder: Path) -> JudgedRun:
 
 
 def _opened(page: Path) -> list[Figure]:
-    """Open the page in the system's Chromium; nothing where there is none."""
+    """Open the page in the system's Chromium; without one the benchmark fails, for its figures would be missing."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        raise SystemExit(f"benchmark nightly_page: no browser; install one of {', '.join(BROWSERS)}")
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
-        browser = None
-    if browser is None:
-        return []
+        raise SystemExit("benchmark nightly_page: needs playwright; install simtest[bench]") from None
     times, processor, used = [], [], []
     with sync_playwright() as driver:
         # The sandbox does not start under root.

@@ -1,0 +1,243 @@
+"""What ten million frames cost: processor time, disk, and the run on a cluster; one command, some minutes.
+
+`python -m benchmarks cost` prints the table of docs/performance.md. Samples of anatomies that were never made before are
+timed one by one, encoded and written as a dataset's run does it. An anatomy's own cost is what its first sample takes
+beyond its others. The rest is arithmetic, and a simulation of the scheduler with these times.
+"""
+
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measuring import Figure, print_markdown
+from benchmarks.scheduler import shard_times, simulate
+from simtest.dataset.index import write_tables
+from simtest.dataset.maker import Maker
+from simtest.dataset.manifest import FileEntry, Manifest, new_manifest
+from simtest.dataset.plan import Plan
+from simtest.dataset.shard import finish, write_sample
+from simtest.runtime.arrays import Array
+from simtest.spec import load_dataset
+from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.spec_model import validate
+
+FRAMES = 10**7
+ANATOMIES, SAMPLES = 4, 5
+"""Anatomies that are timed, and samples of each; the shares of the families are those of the recipe."""
+
+WORKERS = (1, 2, 10, 100, 250, 1000)
+CORE_HOUR, TB_MONTH = 0.04, 20.0
+"""Prices that the table assumes, in any currency: of a core for an hour, and of a TB for a month."""
+
+START_S = 10.0
+"""What a worker takes before its first sample, s: imports, and kernels from disk; measured on one loaded core."""
+
+LINEAR = 0.9
+
+TISSUE = {
+    "name": "tissue",
+    "title": "Colon and liver with relief, film, vessels and sources of their true size",
+    "samples_per_anatomy": 20,
+    "families": [
+        {
+            "scene": scene,
+            "weight": weight,
+            "seeds": {"high": 99999},
+            "per_sample": {
+                "surface.viewpoint": {"low": 0, "high": 1000000, "integer": True},
+                "surface.relief.seed": {"low": 0, "high": 2**32 - 1, "integer": True},
+            },
+        }
+        for scene, weight in (("tissue_colon", 2.0), ("tissue_liver", 1.0))
+    ],
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What samples of a recipe took.
+
+    Parameters
+    ----------
+    samples_s, anatomies_s : ndarray
+        Processor time of each sample, encoding and writing included, and of each anatomy beyond that of its samples, s.
+    sample_bytes : float
+        Mean size of a sample in its shard.
+    tables_s : float
+        Time of one sample in the tables that one process makes at the end, s.
+    booking_s : tuple of float
+        Time to book a shard, s: with no others, and for each that is booked already.
+    plan : Plan
+        The plan of ten million frames.
+    """
+
+    samples_s: Array
+    anatomies_s: Array
+    sample_bytes: float
+    tables_s: float
+    booking_s: tuple[float, float]
+    plan: Plan
+
+    @property
+    def per_anatomy(self) -> int:
+        """Samples of an anatomy."""
+        return self.plan.dataset.samples_per_anatomy
+
+    @property
+    def sample_s(self) -> float:
+        """Processor time of a sample with its share of its anatomy, s."""
+        return float(self.samples_s.mean() + self.anatomies_s.mean() / self.per_anatomy)
+
+    @property
+    def shards(self) -> int:
+        """Shards of ten million frames."""
+        return -(-FRAMES // self.plan.samples_per_shard)
+
+
+def recipes() -> dict[str, Dataset]:
+    """Return the recipes that are costed, with seeds that no run had before: nothing of them is kept in any folder."""
+    seed = int.from_bytes(os.urandom(4), "little")
+    smooth = load_dataset("endoscopy", {"seed": seed})
+    return {"smooth: endoscopy": smooth, "tissue": validate(Dataset, {**TISSUE, "samples": 1000, "seed": seed}, "tissue")}
+
+
+def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES) -> Measured:
+    """Make some samples of new anatomies one by one, and write them."""
+    plan = Plan(dataset)
+    maker = Maker(plan)
+    size = dataset.samples_per_anatomy
+    blocks = _blocks(plan, anatomies)
+    # The first sample of the process compiles kernels, those of each family once.
+    for family in range(len(dataset.families)):
+        spare = next((b for b in _all_blocks(plan) if plan.anatomy(b * size).family == family and b not in blocks), None)
+        if spare is not None:
+            maker.make(spare * size).encode()
+    first, later, sizes = [], [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        made = []
+        with (folder / "train-000000.tar").open("wb") as file:
+            for block in blocks:
+                times = []
+                for index in range(block * size, block * size + samples):
+                    start = time.process_time()
+                    sample = maker.make(index)
+                    write_sample(file, sample.key, sample.encode())
+                    times.append(time.process_time() - start)
+                    made.append(index)
+                first.append(times[0] - statistics.median(times[1:]))
+                later += times[1:]
+            finish(file)
+        sizes.append((folder / "train-000000.tar").stat().st_size / len(made))
+        tables_s = _tables(plan, folder, made)
+        booking = _booking(plan, folder)
+    return Measured(np.array(later), np.array(first), float(np.mean(sizes)), tables_s, booking, plan)
+
+
+def _all_blocks(plan: Plan) -> range:
+    return range(plan.dataset.samples // plan.dataset.samples_per_anatomy)
+
+
+def _blocks(plan: Plan, count: int) -> list[int]:
+    """Return blocks of samples whose families have about the shares that they have in the dataset."""
+    size, blocks = plan.dataset.samples_per_anatomy, list(_all_blocks(plan))
+    weights = np.array([family.weight for family in plan.dataset.families])
+    wanted = np.maximum(1, np.rint(count * weights / weights.sum())).astype(int)
+    return [
+        block
+        for family, number in enumerate(wanted.tolist())
+        for block in [b for b in blocks if plan.anatomy(b * size).family == family][:number]
+    ]
+
+
+def _tables(plan: Plan, folder: Path, made: list[int]) -> float:
+    """Return the processor time of one sample in the tables, s, from tables of the shard that was written."""
+    from simtest.dataset.plan import Shard
+
+    class Written(Plan):
+        shards = (Shard("train", 0, tuple(made)),)  # type: ignore[assignment]
+
+    written = Written(plan.dataset)
+    write_tables(written, folder)
+    start = time.process_time()
+    write_tables(written, folder)
+    return (time.process_time() - start) / len(made)
+
+
+def _booking(plan: Plan, folder: Path) -> tuple[float, float]:
+    """Return the processor time to book a shard, s, without others and for each one that is booked before."""
+    manifest = new_manifest(plan, "any")
+    counts, times = (1, 20_000), []
+    for count in counts:
+        manifest.shards = {f"train-{number:06d}.tar": FileEntry(2**28, "0" * 64) for number in range(count)}
+        times.append(_booked(manifest, folder))
+    each = (times[1] - times[0]) / (counts[1] - counts[0])
+    return times[0], each
+
+
+def _booked(manifest: Manifest, folder: Path) -> float:
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        manifest.save(folder)
+        times.append(time.process_time() - start)
+    return statistics.median(times)
+
+
+def table(measured: Mapping[str, Measured]) -> list[list[str]]:
+    """Return the cost model as rows of text, a column a recipe."""
+    rows: list[tuple[str, Any]] = [
+        ("a sample, without its anatomy, s of processor", lambda m: f"{m.samples_s.mean():.2f}"),
+        ("an anatomy, s of processor", lambda m: f"{m.anatomies_s.mean():.1f}"),
+        ("samples of an anatomy", lambda m: f"{m.per_anatomy}"),
+        ("a sample with its share of the anatomy, s", lambda m: f"{m.sample_s:.2f}"),
+        ("the same at 100 samples an anatomy, s", lambda m: f"{m.samples_s.mean() + m.anatomies_s.mean() / 100:.2f}"),
+        ("a sample on disk, MB", lambda m: f"{m.sample_bytes / 1e6:.2f}"),
+        ("10^7 samples: core hours", lambda m: f"{hours(m):,.0f}"),
+        ("10^7 samples: TB", lambda m: f"{FRAMES * m.sample_bytes / 1e12:.1f}"),
+        ("10^7 samples: shards", lambda m: f"{m.shards:,}"),
+        ("tables at the end, by one process, h", lambda m: f"{FRAMES * m.tables_s / 3600:.1f}"),
+        (f"price at {CORE_HOUR:g} a core hour and {TB_MONTH:g} a TB and month, one month", lambda m: f"{price(m):,.0f}"),
+    ]
+    return [["what", *measured], *([name, *(value(own) for own in measured.values())] for name, value in rows)]
+
+
+def hours(measured: Measured) -> float:
+    """Return the core hours of ten million frames."""
+    return FRAMES * measured.sample_s / 3600
+
+
+def price(measured: Measured) -> float:
+    """Return what ten million frames cost at the assumed prices, kept for a month."""
+    return hours(measured) * CORE_HOUR + FRAMES * measured.sample_bytes / 1e12 * TB_MONTH
+
+
+def figures() -> list[Figure]:
+    """Measure all recipes, print their table, and simulate their runs."""
+    measured = {name: measure(dataset) for name, dataset in recipes().items()}
+    print_markdown(table(measured))
+    return [figure for name, own in measured.items() for figure in scheduled(name, own)]
+
+
+def scheduled(name: str, measured: Measured) -> list[Figure]:
+    """Simulate ten million frames on more and more workers of one core each."""
+    tasks = shard_times(
+        measured.samples_s, measured.anatomies_s, measured.shards, measured.plan.samples_per_shard, measured.per_anatomy
+    )
+    alone, each = measured.booking_s
+    shown = []
+    for workers in WORKERS:
+        run = simulate(tasks, workers, lambda booked: alone + each * booked, START_S)
+        whole = replace(run, makespan_s=run.makespan_s + FRAMES * measured.tables_s)
+        about = f"{run.makespan_s / 3600:,.1f} h, and {FRAMES * measured.tables_s / 3600:.1f} h for the tables: "
+        about += f"{100 * whole.efficiency:.0f} % with these"
+        label = f"{name}, {workers} worker{'s' * (workers > 1)}: share of their time that is work (simulated)"
+        shown.append(Figure(label, run.efficiency, LINEAR, True, "", about))
+    return shown

@@ -1,0 +1,302 @@
+"""The pieces of work whose growth is measured, each at several sizes."""
+
+import dataclasses
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import polars as pl
+
+from benchmarks.colour import spotted
+from benchmarks.nights import history_of, run_of, verdict_of
+from benchmarks.transfers import smooth_scene
+from simtest.calibration import Calibration
+from simtest.geometry import Camera
+from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
+from simtest.nightly.page import write_nightly_page
+from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
+from simtest.nightly.verdict import verdict_on
+from simtest.reconstruction import detect_in_picture, reconstruct_colour
+from simtest.reconstruction.picture import default_estimators
+from simtest.rendering import Session, backend
+from simtest.report import write_report
+from simtest.runtime.resources import find
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.rendered_view import render_view
+from simtest.spec import Scene, load_experiment
+from simtest.surfaces import forget_meshes, make_surface
+from simtest.surfaces.factory import make_mesh
+from simtest.surfaces.recipe import load_recipe
+from simtest.validation.runner import run_experiment
+from simtest.validation.statistics import summarise
+
+Works = dict[float, Callable[[], object]]
+
+EDGES_MM = (2.4, 1.7, 1.2, 0.85, 0.6, 0.42)
+WIDTHS = (160, 240, 320, 480, 640, 960, 1280)
+SPOTS = (4, 8, 16, 32, 64, 128)
+WAVELENGTHS_MM = (9.6, 6.8, 4.8, 3.4, 2.4, 1.7)
+COPIES = (1, 2, 4, 8, 16, 32)
+NIGHTS = (16, 64, 256, 512, 1024)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Work that is done at several sizes.
+
+    Parameters
+    ----------
+    name : str
+        What is done.
+    axis : str
+        What the sizes count.
+    opened : callable
+        Returns a context manager that gives the work by its size, sizes rising.
+    """
+
+    name: str
+    axis: str
+    opened: Callable[[], AbstractContextManager[Mapping[float, Callable[[], object]]]]
+
+
+def pieces() -> Iterator[Piece]:
+    """Return all pieces, the axes in the order of the table."""
+    yield Piece("mesh and curvatures of a colon", "triangles", _meshes)
+    yield Piece("scene built, labelled frame and highlights of a colon", "triangles", _scenes)
+    for name, work in _OF_A_VIEW.items():
+        yield Piece(name, "pixels", _views(work))
+    yield Piece("detection in a colour picture", "highlights", _pictures(False))
+    yield Piece("detection and all normals in a colour picture", "highlights", _pictures(True))
+    yield Piece("true highlights of a surface with relief", "highlights", _glints)
+    for name, of_rows in _OF_ROWS.items():
+        yield Piece(name, "rows", _results(of_rows))
+    yield Piece("page of a run", "rows", _pages)
+    yield Piece("history read", "nights", _histories(False))
+    yield Piece("history read and page of the night", "nights", _histories(True))
+
+
+# Triangles ----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _meshes() -> Iterator[Works]:
+    """Build meshes whose seeds are always new: a mesh that is kept from before would cost nothing."""
+    seeds = count(10**6)
+
+    def build(edge_mm: float) -> int:
+        return len(make_mesh(load_recipe(find("colon", "meshes"), {"seed": next(seeds)}), edge_mm)[0].faces)
+
+    yield {float(build(edge)): lambda edge=edge: build(edge) for edge in EDGES_MM}  # type: ignore[misc]
+
+
+@contextmanager
+def _scenes() -> Iterator[Works]:
+    """Build the renderer's scene anew, and render; the mesh is given as a file of triangles and is kept."""
+    import trimesh
+
+    with tempfile.TemporaryDirectory() as folder:
+        works: Works = {}
+        for edge in EDGES_MM:
+            mesh, _, _ = make_mesh(load_recipe(find("colon", "meshes")), edge)
+            path = Path(folder) / f"{edge}.ply"
+            trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+            surface = {"type": "anatomy", "path": str(path), "kind": "lumen", "subdivisions": 0}
+            data = smooth_scene().model_dump(mode="json", exclude_defaults=True) | {"surface": surface}
+            works[float(len(mesh.faces))] = lambda scene=Scene.model_validate(data): _rendered(scene)  # type: ignore[misc]
+        yield works
+    forget_meshes()
+
+
+def _rendered(scene: Scene) -> None:
+    session = Session(scene, labelled=True)
+    session.highlights(session.frame().radiance)
+    backend.release_memory()
+
+
+# Pixels -------------------------------------------------------------------------------------------------------------
+
+
+def _labelled(session: Session) -> Callable[[], object]:
+    return session.frame
+
+
+def _searched(session: Session) -> Callable[[], object]:
+    radiance = session.radiance()
+    return lambda: session.highlights(radiance)
+
+
+def _truth(session: Session) -> Callable[[], object]:
+    def work() -> object:
+        session._truth = None
+        return session.truth()
+
+    return work
+
+
+def _seen(session: Session) -> Callable[[], object]:
+    view = render_view(session, session.scene)
+    return lambda: view.frame(1)
+
+
+_OF_A_VIEW = {
+    "labelled frame of 16 samples": _labelled,
+    "true highlights": _searched,
+    "exact truth": _truth,
+    "camera chain": _seen,
+}
+
+
+def _views(work: Callable[[Session], Callable[[], object]]) -> Callable[[], AbstractContextManager[Works]]:
+    @contextmanager
+    def opened() -> Iterator[Works]:
+        works: Works = {}
+        for width in WIDTHS:
+            size = {"width": width, "height": width * 3 // 4, "fx": width * 0.625, "fy": width * 0.625}
+            works[float(size["width"] * size["height"])] = work(Session(smooth_scene(**size), labelled=True))
+        yield works
+
+    return opened
+
+
+# Highlights ---------------------------------------------------------------------------------------------------------
+
+
+def _pictures(normals: bool) -> Callable[[], AbstractContextManager[Works]]:
+    @contextmanager
+    def opened() -> Iterator[Works]:
+        works: Works = {}
+        calibration = Calibration(Camera.from_fov(70.0, 1280, 720))
+        names = default_estimators(calibration)
+        for spots in SPOTS:
+            picture = spotted(spots)
+            found = len(detect_in_picture(picture).detection.regions)
+            if normals:
+                works[float(found)] = lambda p=picture: reconstruct_colour(p, calibration, names)  # type: ignore[misc]
+            else:
+                works[float(found)] = lambda p=picture: detect_in_picture(p)  # type: ignore[misc]
+        yield works
+
+    return opened
+
+
+@contextmanager
+def _glints() -> Iterator[Works]:
+    """Search for the glints of ever finer reliefs: there are more, the finer it is."""
+    works: Works = {}
+    for wavelength in WAVELENGTHS_MM:
+        relief = {"bands": [{"slope_deg": 4.0, "wavelength_mm": wavelength}]}
+        data = smooth_scene(samples=1).model_dump(mode="json", exclude_defaults=True)
+        data["surface"] |= {"relief": relief}
+        session = Session(Scene.model_validate(data), labelled=True)
+        radiance = session.radiance()
+
+        def search(session: Session = session, radiance: object = radiance) -> int:
+            session._forget_misfits()
+            return len(session.highlights(radiance))  # type: ignore[arg-type]
+
+        works[float(search())] = search
+    yield dict(sorted(works.items()))
+
+
+# Rows ---------------------------------------------------------------------------------------------------------------
+
+
+def _rows(folder: Path, copies: int) -> pl.DataFrame:
+    """Return real rows of the published protocol, and copies of them with other realisations and disturbed errors."""
+    run = run_experiment(load_experiment("paper", {"realisations": 20}), folder)
+    rng = from_integer(1)
+    parts = []
+    for number in range(copies):
+        factor = pl.Series(rng.lognormal(0, 0.1, run.results.height))
+        parts.append(
+            run.results.with_columns(
+                pl.col("realisation") + number * (1 + run.results["realisation"].max()),  # type: ignore[operator]
+                pl.col("error_deg", "error_oracle_deg") * factor,
+            )
+        )
+    return pl.concat(parts)
+
+
+def _gate(rows: pl.DataFrame) -> Callable[[], object]:
+    before = run_of(rows)
+    return lambda: verdict_on(run_of(rows.with_columns(pl.col("error_deg") * 1.01)), before)
+
+
+_OF_ROWS: dict[str, Callable[[pl.DataFrame], Callable[[], object]]] = {
+    "summary of results": lambda rows: lambda: summarise(rows),
+    "a night's figures": lambda rows: lambda: setting_figures(rows),
+    "figures and gate of a night": _gate,
+}
+
+
+def _results(work: Callable[[pl.DataFrame], Callable[[], object]]) -> Callable[[], AbstractContextManager[Works]]:
+    @contextmanager
+    def opened() -> Iterator[Works]:
+        with tempfile.TemporaryDirectory() as folder:
+            rows = (_rows(Path(folder) / "run", copies) for copies in COPIES)
+            yield {float(own.height): work(own) for own in rows}
+
+    return opened
+
+
+@contextmanager
+def _pages() -> Iterator[Works]:
+    """Write the page of a run whose results have more and more rows; always the same figures and gallery."""
+    with tempfile.TemporaryDirectory() as folder:
+        works: Works = {}
+        made = Path(folder) / "run"
+        for copies in COPIES:
+            # A folder each, in which the rows take the place of the run's own.
+            rows, run = _rows(made, copies), Path(folder) / str(copies)
+            shutil.copytree(made, run)
+            rows.write_parquet(run / "results.parquet")
+            works[float(rows.height)] = lambda run=run: _reported(run)  # type: ignore[misc]
+        yield works
+
+
+def _reported(run: Path) -> None:
+    """Write the page of a run as if there were none yet."""
+    (run / "index.html").unlink(missing_ok=True)
+    shutil.rmtree(run / "figures", ignore_errors=True)
+    write_report(run)
+
+
+# Nights -------------------------------------------------------------------------------------------------------------
+
+
+def _histories(page: bool) -> Callable[[], AbstractContextManager[Works]]:
+    @contextmanager
+    def opened() -> Iterator[Works]:
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch)
+            run = run_of(_rows(folder / "run", 1))
+            works: Works = {}
+            for nights in NIGHTS:
+                reports = folder / str(nights)
+                _write_history(reports, run, nights)
+                works[float(nights)] = lambda reports=reports: _night(run, reports, page)  # type: ignore[misc]
+            yield works
+
+    return opened
+
+
+def _write_history(folder: Path, run: NightlyRun, nights: int) -> None:
+    """Write a history of so many nights, a file each, as the nightly does."""
+    verdict = Verdict("fine", False, verdict_of(run).comparisons.clear(), (), None)
+    for own in history_of(run, nights).partition_by("run_id"):
+        values = {"id": own["run_id"][0], "started": own["started"][0].isoformat(), "commit": own["commit"][0]}
+        record = run.record.model_copy(update=values)
+        figures = own.select(run.figures.columns)
+        append(folder, history_rows(dataclasses.replace(run, record=record, figures=figures), verdict))
+
+
+def _night(run: NightlyRun, reports: Path, page: bool) -> None:
+    history, _ = read_history(reports, run.record.profile, TREND_COLUMNS, TRENDS)
+    if page:
+        write_nightly_page(reports.with_suffix(".page"), JudgedRun(run, verdict_on(run, run), history))
+
