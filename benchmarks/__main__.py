@@ -14,6 +14,7 @@ ON_REQUEST = (
     "growth",
     "cost",
     "cores",
+    "memory",
     "ray_nodes",
     "history",
     "dataset_memory",

@@ -61,7 +61,9 @@ def interpreter() -> str:
     if Path(python).is_file():
         tried = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True, check=False)
     if tried is None or tried.returncode:
-        raise SystemExit(f"benchmark blender: no bpy in {python}; `make bench-cycles` installs it, or set {INTERPRETER}")
+        raise SystemExit(
+            f"benchmark blender: no bpy in {python}; `make bench-cycles` installs it, or set {INTERPRETER}"
+        )
     return python
 
 

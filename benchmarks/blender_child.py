@@ -8,6 +8,7 @@ import json
 import resource
 import sys
 import time
+from typing import Any
 
 import bpy
 import numpy as np
@@ -16,7 +17,7 @@ PASSES = ("use_pass_z", "use_pass_normal", "use_pass_position", "use_pass_object
 WATTS = 4 * np.pi
 
 
-def _mesh(given):
+def _mesh(given: Any) -> Any:
     """Return the object of the mesh, with its exact vertex normals."""
     mesh = bpy.data.meshes.new("surface")
     vertices, faces = given["vertices"], given["faces"]
@@ -34,7 +35,7 @@ def _mesh(given):
     return made
 
 
-def _material(given):
+def _material(given: Any) -> Any:
     """Return a white base below a lobe as wide as Phong's: a diffuse and a glossy closure, mixed."""
     material = bpy.data.materials.new("tissue")
     material.use_nodes = True
@@ -52,13 +53,13 @@ def _material(given):
     return material
 
 
-def _matrix(values):
+def _matrix(values: Any) -> Any:
     import mathutils
 
     return mathutils.Matrix(np.asarray(values, float).tolist())
 
 
-def _build(given):
+def _build(given: Any) -> Any:
     """Make the scene: mesh, one point light, pinhole camera; direct light alone, box filter, no denoiser."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene, layer = bpy.context.scene, bpy.context.view_layer
@@ -99,12 +100,12 @@ def _build(given):
     return scene
 
 
-def _used():
+def _used() -> float:
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
-def main(path, picture=None):
+def main(path: str, picture: str | None = None) -> None:
     """Build the scene, then render as often as asked."""
     given = np.load(path)
     scene = _build(given)

@@ -31,9 +31,7 @@ def spotted(highlights: int) -> npt.NDArray[np.float32]:
     return _picture(grid, (0.1 * across, 0.1 * down), 4)
 
 
-def _picture(
-    grid: list[tuple[float, float]], shift: tuple[float, float], widest: float
-) -> npt.NDArray[np.float32]:
+def _picture(grid: list[tuple[float, float]], shift: tuple[float, float], widest: float) -> npt.NDArray[np.float32]:
     """Return tissue with a highlight near each position of a grid, px, shifted by up to `shift` along both axes."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 
+from benchmarks.cost import measure, recipes
 from benchmarks.measuring import Figure
 from simtest.dataset import read
 from simtest.dataset.maker import Maker
@@ -36,11 +37,24 @@ def figures() -> list[Figure]:
         Figure("encoding a 640 x 480 sample", 1e3 * encoding, 20.0, unit="ms"),
         Figure("its size", size, 2.0, unit="MB"),
     ]
+    figures += _with_anatomies()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "train-000000.tar"
         figures += _overlap(maker, samples, path)
         figures += _reading(path)
     return figures
+
+
+def _with_anatomies() -> list[Figure]:
+    """Time samples of new anatomies, each anatomy shared by as many samples as in a real run."""
+    measured = measure(recipes()["smooth: endoscopy"])
+    about = (
+        f"{measured.samples_s.mean():.2f} s of its own, and {measured.anatomies_s.mean():.1f} s of each anatomy over "
+    )
+    about += (
+        f"{measured.per_anatomy} samples; {len(measured.samples_s)} samples of {len(measured.anatomies_s)} anatomies"
+    )
+    return [Figure("a sample with its share of its anatomy, processor", measured.sample_s, unit="s", about=about)]
 
 
 def _overlap(maker: Maker, samples: list[Sample], path: Path) -> list[Figure]:

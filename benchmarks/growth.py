@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.growth_pieces import Piece, pieces
 from benchmarks.measuring import Figure
-from simtest.runtime.arrays import Array
 
 ROUNDS = 3
 LIMIT = 1.05
@@ -75,8 +74,10 @@ def figure(piece: Piece, rounds: int = ROUNDS) -> Figure:
         sizes = list(works)
         if len(sizes) < 5 or max(sizes) < 16 * min(sizes):
             raise ValueError(f"{piece.name}: needs five sizes and a factor of 16, got {sizes}")
-        times: Array = np.array(measure(works, rounds))
+        times = measure(works, rounds)
     whole, upper = exponent(sizes, times), exponent(sizes[-3:], times[-3:])
     about = f"{sizes[0]:.3g} to {sizes[-1]:.3g} {piece.axis}: {1e3 * times[0]:.3g} to {1e3 * times[-1]:.3g} ms; "
-    about += f"over all sizes {whole.exponent:.2f} ± {whole.half_width:.2f}, over the largest three {upper.exponent:.2f}"
+    about += (
+        f"over all sizes {whole.exponent:.2f} ± {whole.half_width:.2f}, over the largest three {upper.exponent:.2f}"
+    )
     return Figure(f"{piece.name}, {piece.axis}", max(whole.exponent, upper.exponent), LIMIT, unit="", about=about)

@@ -29,7 +29,7 @@ from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene, load_experiment
-from simtest.surfaces import forget_meshes, make_surface
+from simtest.surfaces import forget_meshes
 from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.recipe import load_recipe
 from simtest.validation.runner import run_experiment
@@ -39,9 +39,13 @@ Works = dict[float, Callable[[], object]]
 
 EDGES_MM = (2.4, 1.7, 1.2, 0.85, 0.6, 0.42)
 WIDTHS = (160, 240, 320, 480, 640, 960, 1280)
+REALISATIONS = 20
 SPOTS = (4, 8, 16, 32, 64, 128)
 WAVELENGTHS_MM = (9.6, 6.8, 4.8, 3.4, 2.4, 1.7)
-COPIES = (1, 2, 4, 8, 16, 32)
+COPIES = (4, 16, 64, 128, 256)
+SETTINGS = (1, 2, 4, 8, 16)
+"""Copies of the rows, as further realisations or as further settings."""
+
 NIGHTS = (16, 64, 256, 512, 1024)
 
 
@@ -74,7 +78,8 @@ def pieces() -> Iterator[Piece]:
     yield Piece("detection and all normals in a colour picture", "highlights", _pictures(True))
     yield Piece("true highlights of a surface with relief", "highlights", _glints)
     for name, of_rows in _OF_ROWS.items():
-        yield Piece(name, "rows", _results(of_rows))
+        yield Piece(name, "rows", _results(of_rows, False))
+        yield Piece(name, "settings", _results(of_rows, True))
     yield Piece("page of a run", "rows", _pages)
     yield Piece("history read", "nights", _histories(False))
     yield Piece("history read and page of the night", "nights", _histories(True))
@@ -105,9 +110,8 @@ def _scenes() -> Iterator[Works]:
             mesh, _, _ = make_mesh(load_recipe(find("colon", "meshes")), edge)
             path = Path(folder) / f"{edge}.ply"
             trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
-            surface = {"type": "anatomy", "path": str(path), "kind": "lumen", "subdivisions": 0}
-            data = smooth_scene().model_dump(mode="json", exclude_defaults=True) | {"surface": surface}
-            works[float(len(mesh.faces))] = lambda scene=Scene.model_validate(data): _rendered(scene)  # type: ignore[misc]
+            scene = smooth_scene(path=str(path), kind="lumen", subdivisions=0)
+            works[float(len(mesh.faces))] = lambda scene=scene: _rendered(scene)  # type: ignore[misc]
         yield works
     forget_meshes()
 
@@ -157,7 +161,7 @@ def _views(work: Callable[[Session], Callable[[], object]]) -> Callable[[], Abst
         works: Works = {}
         for width in WIDTHS:
             size = {"width": width, "height": width * 3 // 4, "fx": width * 0.625, "fy": width * 0.625}
-            works[float(size["width"] * size["height"])] = work(Session(smooth_scene(**size), labelled=True))
+            works[float(size["width"] * size["height"])] = work(Session(smooth_scene(camera=size), labelled=True))
         yield works
 
     return opened
@@ -174,7 +178,7 @@ def _pictures(normals: bool) -> Callable[[], AbstractContextManager[Works]]:
         names = default_estimators(calibration)
         for spots in SPOTS:
             picture = spotted(spots)
-            found = len(detect_in_picture(picture).detection.regions)
+            found = len(detect_in_picture(picture).detection.highlights)
             if normals:
                 works[float(found)] = lambda p=picture: reconstruct_colour(p, calibration, names)  # type: ignore[misc]
             else:
@@ -190,9 +194,7 @@ def _glints() -> Iterator[Works]:
     works: Works = {}
     for wavelength in WAVELENGTHS_MM:
         relief = {"bands": [{"slope_deg": 4.0, "wavelength_mm": wavelength}]}
-        data = smooth_scene(samples=1).model_dump(mode="json", exclude_defaults=True)
-        data["surface"] |= {"relief": relief}
-        session = Session(Scene.model_validate(data), labelled=True)
+        session = Session(smooth_scene(1, relief=relief), labelled=True)
         radiance = session.radiance()
 
         def search(session: Session = session, radiance: object = radiance) -> int:
@@ -206,19 +208,17 @@ def _glints() -> Iterator[Works]:
 # Rows ---------------------------------------------------------------------------------------------------------------
 
 
-def _rows(folder: Path, copies: int) -> pl.DataFrame:
-    """Return real rows of the published protocol, and copies of them with other realisations and disturbed errors."""
-    run = run_experiment(load_experiment("paper", {"realisations": 20}), folder)
+def _rows(folder: Path, copies: int, settings: bool = False) -> pl.DataFrame:
+    """Return real rows of the published protocol, and copies with disturbed errors: other realisations, or settings."""
+    run = run_experiment(load_experiment("paper", {"realisations": REALISATIONS}), folder)
     rng = from_integer(1)
     parts = []
     for number in range(copies):
         factor = pl.Series(rng.lognormal(0, 0.1, run.results.height))
-        parts.append(
-            run.results.with_columns(
-                pl.col("realisation") + number * (1 + run.results["realisation"].max()),  # type: ignore[operator]
-                pl.col("error_deg", "error_oracle_deg") * factor,
-            )
-        )
+        other = pl.col("realisation") + number * REALISATIONS
+        if settings:
+            other = pl.format("{} {}", "setting", pl.lit(number)).alias("setting")
+        parts.append(run.results.with_columns(other, pl.col("error_deg", "error_oracle_deg") * factor))
     return pl.concat(parts)
 
 
@@ -234,12 +234,15 @@ _OF_ROWS: dict[str, Callable[[pl.DataFrame], Callable[[], object]]] = {
 }
 
 
-def _results(work: Callable[[pl.DataFrame], Callable[[], object]]) -> Callable[[], AbstractContextManager[Works]]:
+def _results(
+    work: Callable[[pl.DataFrame], Callable[[], object]], settings: bool
+) -> Callable[[], AbstractContextManager[Works]]:
     @contextmanager
     def opened() -> Iterator[Works]:
         with tempfile.TemporaryDirectory() as folder:
-            rows = (_rows(Path(folder) / "run", copies) for copies in COPIES)
-            yield {float(own.height): work(own) for own in rows}
+            numbers = SETTINGS if settings else COPIES
+            rows = (_rows(Path(folder) / "run", number, settings) for number in numbers)
+            yield {float(own["setting"].n_unique() if settings else own.height): work(own) for own in rows}
 
     return opened
 
@@ -299,4 +302,3 @@ def _night(run: NightlyRun, reports: Path, page: bool) -> None:
     history, _ = read_history(reports, run.record.profile, TREND_COLUMNS, TRENDS)
     if page:
         write_nightly_page(reports.with_suffix(".page"), JudgedRun(run, verdict_on(run, run), history))
-

@@ -1,8 +1,8 @@
 """Frames by Mitsuba's own integrators, of a session's scene: what our frames are timed against.
 
-All use the box filter, which is Mitsuba's fastest. `nested` is the usual way to labels, `direct` inside `aov`: the labels
-are computed for every sample and averaged, which is no ground truth. `alike` does what our labelled frame does: radiance
-from all samples, labels from one ray a pixel. `radiance` has no labels at all.
+All use the box filter, which is Mitsuba's fastest. `nested` is the usual way to labels, `direct` inside `aov`: the
+labels are computed for every sample and averaged, which is no ground truth. `alike` does what our labelled frame does:
+radiance from all samples, labels from one ray a pixel. `radiance` has no labels at all.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """The published protocol: its speed against making and blurring the noise alone, in single precision.
 
-The floor holds nothing of ours: no texture is warped, and no picture is made. With a light offset each realisation has a
-texture of its own to warp, so its ratio shows what that costs.
+The floor holds nothing of ours: no texture is warped, and no picture is made. With a light offset each realisation has
+a texture of its own to warp, so its ratio shows what that costs.
 """
 
 import math

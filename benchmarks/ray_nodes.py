@@ -1,8 +1,8 @@
 """A dataset on a Ray cluster of one node and of two, of one core each: wall time, and equal bytes.
 
-Needs the extra `bench`. Both nodes are processes of this machine, so it must have two cores, and nothing else to do. The
-nodes start beforehand; each cluster makes a small dataset first, so that its workers have imported all and hold their
-kernels.
+Needs the extra `bench`. Both nodes are processes of this machine, so it must have two cores, and nothing else to do.
+The nodes start beforehand; each cluster makes a small dataset first, so that its workers have imported all and hold
+their kernels.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
 """The renderer: labelled frames against Mitsuba's own integrators, updates, first frames and memory.
 
-The scene is the generated colon, 200,000 triangles, seen at 640 x 480 with 16 samples a pixel or one. The references are
-Mitsuba's `direct` and `aov` on the same scene (`mitsuba_frames`), with the labels that it knows: depth, position, both
-normals, shape and triangle.
+The scene is the generated colon, 200,000 triangles, seen at 640 x 480 with 16 samples a pixel or one. The references
+are Mitsuba's `direct` and `aov` on the same scene (`mitsuba_frames`), with the labels that it knows: depth, position,
+both normals, shape and triangle.
 """
 
 import json

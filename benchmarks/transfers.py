@@ -6,7 +6,7 @@ waits for the kernels before it, and copies. Not counted: what the host uploads 
 casts), which needs no waiting.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -53,7 +53,8 @@ def counted() -> Iterator[Transfers]:
     import drjit as dr
 
     made = Transfers()
-    convert = dr.ArrayBase.__array__
+    kind: Any = dr.ArrayBase
+    convert = kind.__array__
 
     def read(array: Any, *arguments: Any, **options: Any) -> Any:
         values = convert(array, *arguments, **options)
@@ -61,14 +62,14 @@ def counted() -> Iterator[Transfers]:
         made.read_bytes += values.nbytes
         return values
 
-    dr.ArrayBase.__array__ = read
+    kind.__array__ = read
     try:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             yield made
             launched = dr.kernel_history()
     finally:
-        dr.ArrayBase.__array__ = convert
+        kind.__array__ = convert
     own = [kernel for kernel in launched if kernel["type"] == dr.KernelType.JIT]
     made.kernels, made.others = len(own), len(launched) - len(own)
     made.compiled = sum(not kernel["cache_hit"] for kernel in own)
@@ -82,14 +83,14 @@ def count(function: Callable[[], object]) -> Transfers:
     return made
 
 
-def smooth_scene(name: str = "colon", samples: int = 16, offset_mm: float = 3.0, **camera: float) -> Scene:
-    """Return a smooth anatomy under a light beside the camera."""
+def smooth_scene(samples: int = 16, camera: Mapping[str, float] | None = None, **surface: Any) -> Scene:
+    """Return a smooth colon, or another surface, under a light beside the camera."""
     return scene_from_dict(
         {
-            "surface": {"type": "anatomy", "path": name},
+            "surface": {"type": "anatomy", "path": "colon", **surface},
             "reflectance": {"type": "phong", "exponent": 100.0, "diffuse": 0.3},
-            "rig": {"lights": [{"offset_mm": offset_mm}]},
-            "camera": {**SIZE, **camera},
+            "rig": {"lights": [{"offset_mm": 3.0}]},
+            "camera": {**SIZE, **(camera or {})},
             "render": {"samples_per_pixel": samples},
         }
     )
@@ -115,7 +116,7 @@ def steps(session: Session) -> dict[str, Callable[[], object]]:
 def figures() -> list[Figure]:
     """Count for smooth frames, for tissue, and for whole samples of a dataset."""
     shown: list[Figure] = []
-    scenes = {"colon": smooth_scene(), "liver": smooth_scene("liver"), "tissue, colon": load_scene("tissue_colon")}
+    scenes = {"colon": smooth_scene(), "liver": smooth_scene(path="liver"), "tissue, colon": load_scene("tissue_colon")}
     for name, scene in scenes.items():
         session = Session(scene, labelled=True)
         for what, function in steps(session).items():
