@@ -11,7 +11,7 @@ dataset = App(name="dataset", help="Make a labelled dataset for learning, check 
 
 Folder = Annotated[Path, Parameter(help="The dataset's folder.")]
 Settings = Annotated[list[str] | None, replacing("samples_per_anatomy=5 or sensor.noise_sigma=0")]
-Variant = Annotated[str | None, Parameter(help="Mitsuba variant, such as cuda_ad_rgb; default llvm_ad_rgb.")]
+Variant = Annotated[str | None, Parameter(help="llvm (default), cuda on an NVIDIA GPU, or a Mitsuba variant by name.")]
 Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
 
 
@@ -38,6 +38,7 @@ def make(
     """
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
+    from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_dataset, parse_settings
 
@@ -46,7 +47,7 @@ def make(
     }
     wanted = load_dataset(described, values)
     with progress_bar("writing the tables") as progress:
-        gpu = bool(variant and variant.startswith("cuda"))
+        gpu = variant is not None and needs_gpu(variant)
         chosen = make_engine(engine, workers, address, gpu, SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
     print(out / "README.md")

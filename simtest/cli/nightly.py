@@ -54,14 +54,14 @@ def _run(
     from simtest.nightly.layout import Reports
     from simtest.nightly.measure import RunOptions
     from simtest.nightly.run import run_nightly
-    from simtest.rendering.backend import requested_variant
+    from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_profile
 
     described = load_profile(profile)
     command = shlex.join(["simtest", *sys.argv[1:]])
     count = _cores() if workers is None else workers
-    chosen = make_engine(engine, count, address, gpu=requested_variant(variant).startswith("cuda"))
+    chosen = make_engine(engine, count, address, gpu=needs_gpu(variant))
     with progress_bar("writing the page") as progress:
         return run_nightly(described, Reports(reports), RunOptions(command, variant, chosen, count, progress))
 

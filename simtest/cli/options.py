@@ -27,8 +27,8 @@ Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
     str | None,
     Parameter(
-        help="Mitsuba variant, such as cuda_ad_mono; default SIMTEST_VARIANT, else llvm_ad_mono, or llvm_ad_rgb for "
-        "the colours of tissue."
+        help="llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm. A device "
+        "renders one channel, or three for the colours of tissue."
     ),
 ]
 Estimators = Annotated[

@@ -37,7 +37,7 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.cli.progress import progress_bar
-    from simtest.rendering.backend import requested_variant
+    from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_experiment, parse_settings
 
@@ -48,6 +48,6 @@ def validate(
     command = shlex.join(["simtest", *sys.argv[1:]])
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
-        chosen = make_engine(engine, workers, address, gpu=requested_variant(variant).startswith("cuda"))
+        chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
     print(page)

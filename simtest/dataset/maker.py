@@ -31,8 +31,10 @@ from simtest.validation.rough_truth import rough_truth
 
 MAX_INSTANCES = 255
 
-DEFAULT_VARIANT = backend.COLOUR_VARIANT
-"""Learners want colour."""
+
+def colour_variant(variant: str | None = None) -> str:
+    """Return the variant of a dataset: the default, and a device alone, have three channels. Learners want colour."""
+    return backend.requested_variant(variant or backend.COLOUR_VARIANT, coloured=True)
 
 
 class Maker:
@@ -40,7 +42,7 @@ class Maker:
 
     def __init__(self, plan: Plan, variant: str | None = None) -> None:
         self.plan = plan
-        self._variant = variant or DEFAULT_VARIANT
+        self._variant = colour_variant(variant)
         self._session: Session | None = None
         self._anatomy: Anatomy | None = None
         self._estimators = load_estimators(plan.dataset.estimators)

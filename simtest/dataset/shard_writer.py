@@ -11,7 +11,7 @@ from typing import IO
 
 from simtest.dataset.card import CARD, write_card
 from simtest.dataset.index import TABLES, write_tables
-from simtest.dataset.maker import DEFAULT_VARIANT, Maker
+from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.manifest import (
     NAME,
     FileEntry,
@@ -73,7 +73,7 @@ def write_dataset(
     """
     plan = Plan(dataset)
     with _one_line_errors(folder):
-        manifest = _open(folder, plan, variant or DEFAULT_VARIANT)
+        manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
     return manifest
 

@@ -23,8 +23,11 @@ import platformdirs
 from simtest.errors import BackendError
 from simtest.runtime.files import Json, write_json
 
-DEFAULT_VARIANT = "llvm_ad_mono"
-COLOUR_VARIANT = "llvm_ad_rgb"
+LLVM, CUDA = DEVICES = ("llvm", "cuda")
+"""What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""
+
+DEFAULT_VARIANT = f"{LLVM}_ad_mono"
+COLOUR_VARIANT = f"{LLVM}_ad_rgb"
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "SIMTEST_VARIANT"
 PIP_PACKAGE = "karellen-llvm-core"
@@ -73,9 +76,21 @@ class Candidate:
 def requested_variant(variant: str | None = None, coloured: bool = False) -> str:
     """Return the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default.
 
-    The default of a `coloured` scene has three channels.
+    A device alone (see `DEVICES`, the default is the processor) is its variant of one channel, or of three where the
+    scene is `coloured`.
     """
-    return variant or os.environ.get(VARIANT_VARIABLE) or (COLOUR_VARIANT if coloured else DEFAULT_VARIANT)
+    name = variant or os.environ.get(VARIANT_VARIABLE) or LLVM
+    return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
+
+
+def needs_gpu(variant: str | None = None) -> bool:
+    """Return whether a variant (see `requested_variant`) runs on a GPU."""
+    return requested_variant(variant).startswith(CUDA)
+
+
+def needs_llvm(variant: str | None = None) -> bool:
+    """Return whether a variant (see `requested_variant`) needs a libLLVM."""
+    return requested_variant(variant).startswith(LLVM)
 
 
 def candidates() -> list[Candidate]:
@@ -194,7 +209,7 @@ def load(variant: str | None = None) -> Any:
     Parameters
     ----------
     variant : str, optional
-        Such as "llvm_ad_mono" or "cuda_ad_mono"; see `requested_variant`.
+        Such as "llvm_ad_mono" or "cuda_ad_mono", or a device; see `requested_variant`.
 
     Returns
     -------
@@ -209,16 +224,16 @@ def load(variant: str | None = None) -> Any:
     name = requested_variant(variant)
     # Library: chosen before Dr.Jit is imported, checked afterwards.
     if _drjit_loaded():
-        if name.startswith("llvm"):
+        if needs_llvm(name):
             _check_library_in_memory()
     else:
-        _set_library(needed=name.startswith("llvm"))
+        _set_library(needed=needs_llvm(name))
     import mitsuba
 
     # Variant.
-    usable = [v for v in mitsuba.variants() if re.fullmatch(r"(llvm|cuda)_ad_(mono|rgb)", v)]
+    usable = [v for v in mitsuba.variants() if re.fullmatch(f"({'|'.join(DEVICES)})_ad_(mono|rgb)", v)]
     if name not in usable:
-        raise BackendError(f"variant {name!r}: cannot be used; allowed: {', '.join(usable)}")
+        raise BackendError(f"variant {name!r}: cannot be used; allowed: {', '.join((*DEVICES, *usable))}")
     if mitsuba.variant() != name:
         try:
             mitsuba.set_variant(name)
@@ -227,7 +242,7 @@ def load(variant: str | None = None) -> Any:
             # Use it once: without a GPU a GPU variant fails here, not when it is set.
             mitsuba.Float(0.0) + 1.0
         except (ImportError, RuntimeError) as error:
-            cause = "no usable NVIDIA GPU" if name.startswith("cuda") else str(error).splitlines()[0]
+            cause = "no usable NVIDIA GPU" if needs_gpu(name) else str(error).splitlines()[0]
             raise BackendError(f"variant {name}: cannot be used here ({cause})") from error
     return mitsuba
 
@@ -344,7 +359,7 @@ class BackendReport:
 def library_report(variant: str | None = None) -> BackendReport:
     """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
     name = requested_variant(variant)
-    chosen, tried = choose_library() if name.startswith("llvm") else (None, [])
+    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
     versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
-    problem = no_library_message(tried) if name.startswith("llvm") and chosen is None else None
+    problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
     return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from simtest.cli import main as command_line
+from simtest.dataset.maker import colour_variant
 from simtest.errors import BackendError
 from simtest.rendering import backend
 from simtest.rendering.backend import Candidate, candidates, choose_library, probe, requested_variant
@@ -278,6 +280,29 @@ def test_the_variant_is_the_argument_or_the_variable_or_the_default(monkeypatch)
     monkeypatch.setenv(backend.VARIANT_VARIABLE, "llvm_ad_rgb")
     assert requested_variant() == "llvm_ad_rgb"
     assert requested_variant("cuda_ad_mono") == "cuda_ad_mono"
+
+
+def test_a_device_alone_has_as_many_channels_as_the_scene_needs(monkeypatch):
+    for device in ("llvm", "cuda"):
+        assert requested_variant(device) == f"{device}_ad_mono"
+        assert requested_variant(device, coloured=True) == f"{device}_ad_rgb"
+        assert colour_variant(device) == f"{device}_ad_rgb"
+        monkeypatch.setenv(backend.VARIANT_VARIABLE, device)
+        assert requested_variant(coloured=True) == f"{device}_ad_rgb"
+        assert backend.needs_gpu() is (device == "cuda")
+        assert backend.needs_llvm() is (device == "llvm")
+    # A dataset has three channels unless its variant is named whole, whatever the variable says.
+    assert colour_variant() == "llvm_ad_rgb"
+    assert colour_variant("llvm_ad_mono") == "llvm_ad_mono"
+    assert not backend.needs_gpu("llvm_ad_rgb")
+    assert backend.needs_gpu("cuda_ad_mono")
+
+
+def test_no_other_module_names_a_variant_or_a_device():
+    package = Path(backend.__file__).parents[1]
+    named = re.compile(r"""_ad_(mono|rgb)|["'](llvm|cuda)["']\)""")
+    found = {file for file in package.rglob("*.py") if named.search(file.read_text(encoding="utf-8"))}
+    assert found == {Path(backend.__file__)}
 
 
 @pytest.mark.parametrize("name", ["nope", "scalar_mono", "LLVM_AD_MONO", "scalar_rgb", "llvm_ad_spectral"])

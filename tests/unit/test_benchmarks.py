@@ -1,0 +1,219 @@
+"""The benchmarks' own arithmetic: exponents, the simulated scheduler, costs, counts; and that nothing is skipped."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks import blender, cores, cost, growth, memory, nightly_page, ray_nodes
+from benchmarks.__main__ import NAMES, ON_REQUEST, main
+from benchmarks.measuring import Figure, print_markdown
+from benchmarks.scheduler import shard_times, simulate
+from simtest.dataset.plan import Plan
+
+EACH = lambda booked: 0.0  # noqa: E731
+
+
+@pytest.mark.parametrize("name", ON_REQUEST)
+def test_benchmarks_on_request_fit_the_package(name):
+    assert callable(importlib.import_module(f"benchmarks.{name}").figures)
+
+
+def test_an_unknown_benchmark_is_named(capsys):
+    assert main(["nope"]) == 2
+    assert "benchmark 'nope': unknown" in capsys.readouterr().err
+    assert not set(NAMES) & set(ON_REQUEST)
+
+
+# Growth ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.1, 3.0), st.floats(1e-6, 1e3), st.integers(3, 8))
+def test_the_exponent_of_a_power_law_is_found(power, factor, count):
+    sizes = [10.0 * 2**i for i in range(count)]
+    found = growth.exponent(sizes, [factor * size**power for size in sizes])
+    assert found.exponent == pytest.approx(power, abs=1e-9)
+    assert found.half_width < 1e-6
+
+
+def test_the_interval_covers_the_exponent_of_noisy_times():
+    rng = np.random.default_rng(0)
+    sizes, covered, runs = [2.0**i for i in range(6)], 0, 400
+    for _ in range(runs):
+        found = growth.exponent(sizes, np.array(sizes) ** 1.1 * rng.lognormal(0, 0.1, len(sizes)))
+        covered += abs(found.exponent - 1.1) <= found.half_width
+    # 0.95 of 400, 4 standard deviations to either side
+    assert 0.905 * runs <= covered <= 0.995 * runs
+
+
+class Clock:
+    """A processor clock that work advances by as much as it is said to cost."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def work(self, seconds):
+        def run():
+            self.now += seconds
+
+        return run
+
+
+@pytest.mark.parametrize(("power", "fixed", "met"), [(1.0, 0.0, True), (1.5, 0.0, False), (1.5, 500.0, False)])
+def test_growth_beyond_the_limit_is_missed_even_under_a_fixed_cost(monkeypatch, power, fixed, met):
+    clock = Clock()
+    monkeypatch.setattr(growth.time, "process_time", lambda: clock.now)
+    sizes = [16.0, 64.0, 256.0, 1024.0, 4096.0]
+
+    class Works:
+        def __enter__(self):
+            return {size: clock.work(fixed + size**power) for size in sizes}
+
+        def __exit__(self, *_):
+            return None
+
+    figure = growth.figure(growth.Piece("work", "things", Works), rounds=1)
+    assert figure.met is met
+    assert figure.value == pytest.approx(power, abs=0.3 if fixed else 1e-9)
+
+
+def test_growth_needs_five_sizes_and_a_factor_of_sixteen():
+    class Few:
+        def __enter__(self):
+            return {1.0: lambda: None, 2.0: lambda: None}
+
+        def __exit__(self, *_):
+            return None
+
+    with pytest.raises(ValueError, match="needs five sizes"):
+        growth.figure(growth.Piece("work", "things", Few))
+
+
+# Scheduler -------------------------------------------------------------------------------------------------------
+
+
+def test_equal_tasks_on_a_divisor_of_their_number_are_linear():
+    run = simulate(np.full(12, 2.0), 4, EACH)
+    assert (run.makespan_s, run.efficiency) == (6.0, 1.0)
+    # A thirteenth keeps three of the four waiting.
+    assert simulate(np.full(13, 2.0), 4, EACH).makespan_s == 8.0
+    assert simulate(np.full(3, 2.0), 10, EACH, 1.0).makespan_s == 3.0
+
+
+def test_one_process_that_books_bounds_the_run():
+    tasks = np.ones(100)
+    assert simulate(tasks, 100, lambda booked: 0.5).makespan_s == pytest.approx(1 + 50)
+    assert simulate(tasks, 1, lambda booked: 0.5).makespan_s == pytest.approx(150)
+    # Each booking costs more than the one before: 0 + 1 + ... + 99, and the first task.
+    assert simulate(tasks, 100, float).makespan_s == pytest.approx(1 + 99 * 100 / 2)
+
+
+@given(st.lists(st.floats(0.01, 100), min_size=1, max_size=40), st.integers(1, 12), st.floats(0, 2))
+def test_a_run_takes_neither_less_nor_more_than_it_must(lengths, workers, booking):
+    tasks = np.array(lengths)
+    run = simulate(tasks, workers, lambda booked: booking)
+    bookings = booking * len(tasks)
+    assert run.makespan_s >= max(tasks.sum() / workers, tasks.max() + booking, bookings) * (1 - 1e-9)
+    # Graham's bound of list scheduling, each booking counted as if all had to wait for it.
+    assert run.makespan_s <= (tasks.sum() / workers + tasks.max() + bookings) * (1 + 1e-9)
+    assert 0 < run.efficiency <= 1 + 1e-9
+
+
+def test_shards_are_drawn_from_the_measured_times():
+    samples, anatomies = np.array([1.0, 3.0]), np.array([10.0])
+    times = shard_times(samples, anatomies, 4000, 40, 20)
+    # 40 samples of 2 s in the mean, on three anatomies of 20 samples: two, and the one begun before
+    assert times.mean() == pytest.approx(40 * 2 + 30, rel=0.01)
+    assert times.std() == pytest.approx(np.sqrt(40), rel=0.1)
+    assert np.array_equal(times, shard_times(samples, anatomies, 4000, 40, 20))
+
+
+# Cost ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured():
+    plan = Plan(cost.recipes()["smooth: endoscopy"])
+    return cost.Measured(np.array([1.0, 2.0]), np.array([10.0]), 1.5e6, 1e-3, (0.0, 0.0), plan)
+
+
+def test_the_cost_model_is_what_the_measured_times_say(measured):
+    assert measured.sample_s == 1.5 + 10 / 20
+    assert cost.hours(measured) == pytest.approx(2e7 / 3600)
+    assert cost.price(measured) == pytest.approx(2e7 / 3600 * cost.CORE_HOUR + 15 * cost.TB_MONTH)
+    text = {row[0]: row[1] for row in cost.table({"it": measured})}
+    assert text["10^7 samples: core hours"] == "5,556"
+    assert text["10^7 samples: TB"] == "15.0"
+    assert text["10^7 samples: shards"] == f"{-(-(10**7) // measured.plan.samples_per_shard):,}"
+
+
+def test_tables_by_one_process_count_against_many_workers(measured):
+    figures = {figure.name: figure for figure in cost.scheduled("it", measured)}
+    of_many = [figure for name, figure in figures.items() if ", 1000 workers" in name]
+    shards, whole = (next(f for f in of_many if f.name.endswith(end)) for end in ("work, shards", "and tables"))
+    assert shards.met
+    assert not whole.met
+    assert all(figure.met for name, figure in figures.items() if ", 1 worker," in name)
+
+
+def test_anatomies_are_timed_in_the_families_shares():
+    plan = Plan(cost.recipes()["smooth: endoscopy"])
+    blocks = cost._blocks(plan, 3)
+    families = [plan.anatomy(block * plan.dataset.samples_per_anatomy).family for block in blocks]
+    assert sorted(families) == [0, 0, 1]
+    assert len(set(blocks)) == 3
+
+
+def test_each_run_costs_anatomies_that_no_other_has():
+    seeds = {cost.recipes()["tissue"].seed for _ in range(8)}
+    assert len(seeds) == 8
+
+
+def test_tables_are_printed_as_the_manual_holds_them(capsys):
+    print_markdown([["what", "value"], ["time", "1 s"]])
+    assert capsys.readouterr().out == "| what | value |\n| --- | --- |\n| time | 1 s |\n\n"
+
+
+# Nothing is skipped ----------------------------------------------------------------------------------------------
+
+
+def test_a_missing_browser_fails(monkeypatch, tmp_path):
+    monkeypatch.setattr(nightly_page.shutil, "which", lambda name: None)
+    with pytest.raises(SystemExit, match="no browser; install one of chromium"):
+        nightly_page._opened(tmp_path / "index.html")
+
+
+@pytest.mark.parametrize("python", ["/nowhere/python", sys.executable])
+def test_a_missing_cycles_fails(monkeypatch, python):
+    monkeypatch.setenv(blender.INTERPRETER, python)
+    with pytest.raises(SystemExit, match=r"no bpy in .*make bench-cycles"):
+        blender.interpreter()
+
+
+def test_a_missing_ray_fails(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit, match=r"needs Ray; install simtest\[bench\]"), ray_nodes._cluster(1):
+        pass
+
+
+def test_a_command_that_fails_fails_the_benchmark():
+    with pytest.raises(SystemExit, match=r"simtest render nowhere --out .*: exit 2: .*nowhere"):
+        cores.run(["render", "nowhere", "--out", "nowhere"])
+    with pytest.raises(SystemExit, match="exit 3"):
+        memory.run(["-c", "raise SystemExit(3)"])
+
+
+def test_memory_and_processor_time_are_those_of_the_process():
+    used = memory.run(["-c", "held = b'x' * 200_000_000; sum(range(2_000_000))"])
+    assert 0.2 < used.peak_gb < 0.4
+    assert used.processor_s > 0.02
+    assert cores.Used(3.0, 2.0).share == 1.5 / cores.cores()
+
+
+def test_figures_keep_or_miss_their_limits():
+    assert Figure("x", 1.0, 1.0).met
+    assert not Figure("x", 1.1, 1.0).met
+    assert not Figure("x", float("nan"), 1.0).met
