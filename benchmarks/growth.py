@@ -8,6 +8,7 @@ as it must, so the exponent over the upper half of the sizes is given too, and t
 
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.growth_pieces import Piece, pieces
-from benchmarks.measuring import Figure
+from benchmarks.measuring import Figure, print_markdown
 
 ROUNDS = 3
 LIMIT = 1.05
@@ -63,21 +64,58 @@ def measure(works: Mapping[float, Callable[[], object]], rounds: int) -> list[fl
     return [statistics.median(own) for own in times.values()]
 
 
+@dataclass(frozen=True)
+class Grown:
+    """A piece of work that was measured at all its sizes: processor times, s, and exponents.
+
+    Parameters
+    ----------
+    whole, upper : Growth
+        Over all sizes, and over the largest three.
+    """
+
+    piece: Piece
+    sizes: list[float]
+    times: list[float]
+    whole: Growth
+    upper: Growth
+
+    @property
+    def row(self) -> list[str]:
+        """Return the row of the manual's table."""
+        sizes, times = ((f"{ends[0]:,.4g}", f"{ends[-1]:,.4g}") for ends in (self.sizes, [1e3 * s for s in self.times]))
+        whole = f"{self.whole.exponent:.2f} ± {self.whole.half_width:.2f}"
+        return [self.piece.name, self.piece.axis, " to ".join(sizes), " to ".join(times), whole,
+                f"{self.upper.exponent:.2f}"]  # fmt: skip
+
+    @property
+    def figure(self) -> Figure:
+        """The larger of both exponents beside its limit."""
+        value = max(self.whole.exponent, self.upper.exponent)
+        _, _, sizes, times, whole, upper = self.row
+        about = f"{sizes} {self.piece.axis}: {times} ms; {whole} over all sizes, {upper} over the largest three"
+        return Figure(f"{self.piece.name}, {self.piece.axis}", value, LIMIT, unit="", about=about)
+
+
+HEAD = ["work", "of", "from, to", "ms of processor", "exponent, all sizes", "largest three"]
+
+
 def figures() -> list[Figure]:
-    """Measure all pieces."""
-    return [figure(piece) for piece in pieces()]
+    """Measure all pieces, and print the manual's table."""
+    grown = []
+    for piece in pieces():
+        grown.append(grow(piece))
+        # It takes long.
+        print(f"growth: {grown[-1].figure.name}: {grown[-1].figure.value:.2f}", file=sys.stderr, flush=True)
+    print_markdown([HEAD, *(one.row for one in grown)])
+    return [one.figure for one in grown]
 
 
-def figure(piece: Piece, rounds: int = ROUNDS) -> Figure:
+def grow(piece: Piece, rounds: int = ROUNDS) -> Grown:
     """Measure one piece of work at all its sizes, and fit its exponents."""
     with piece.opened() as works:
         sizes = list(works)
         if len(sizes) < 5 or max(sizes) < 16 * min(sizes):
             raise ValueError(f"{piece.name}: needs five sizes and a factor of 16, got {sizes}")
         times = measure(works, rounds)
-    whole, upper = exponent(sizes, times), exponent(sizes[-3:], times[-3:])
-    about = f"{sizes[0]:.3g} to {sizes[-1]:.3g} {piece.axis}: {1e3 * times[0]:.3g} to {1e3 * times[-1]:.3g} ms; "
-    about += (
-        f"over all sizes {whole.exponent:.2f} ± {whole.half_width:.2f}, over the largest three {upper.exponent:.2f}"
-    )
-    return Figure(f"{piece.name}, {piece.axis}", max(whole.exponent, upper.exponent), LIMIT, unit="", about=about)
+    return Grown(piece, sizes, times, exponent(sizes, times), exponent(sizes[-3:], times[-3:]))

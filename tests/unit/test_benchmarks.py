@@ -75,7 +75,7 @@ def test_growth_beyond_the_limit_is_missed_even_under_a_fixed_cost(monkeypatch, 
         def __exit__(self, *_):
             return None
 
-    figure = growth.figure(growth.Piece("work", "things", Works), rounds=1)
+    figure = growth.grow(growth.Piece("work", "things", Works), rounds=1).figure
     assert figure.met is met
     assert figure.value == pytest.approx(power, abs=0.3 if fixed else 1e-9)
 
@@ -89,7 +89,7 @@ def test_growth_needs_five_sizes_and_a_factor_of_sixteen():
             return None
 
     with pytest.raises(ValueError, match="needs five sizes"):
-        growth.figure(growth.Piece("work", "things", Few))
+        growth.grow(growth.Piece("work", "things", Few))
 
 
 # Scheduler -------------------------------------------------------------------------------------------------------
