@@ -41,7 +41,7 @@ EDGES_MM = (2.4, 1.7, 1.2, 0.85, 0.6, 0.42)
 WIDTHS = (160, 240, 320, 480, 640, 960, 1280)
 REALISATIONS = 20
 SPOTS = (4, 8, 16, 32, 64, 128)
-WAVELENGTHS_MM = (9.6, 6.8, 4.8, 3.4, 2.4, 1.7)
+WAVELENGTHS_MM = (2.8, 2.0, 1.4, 1.0, 0.7, 0.5)
 COPIES = (4, 16, 64, 128, 256)
 SETTINGS = (1, 2, 4, 8, 16)
 """Copies of the rows, as further realisations or as further settings."""
@@ -193,7 +193,7 @@ def _glints() -> Iterator[Works]:
     """Search for the glints of ever finer reliefs: there are more, the finer it is."""
     works: Works = {}
     for wavelength in WAVELENGTHS_MM:
-        relief = {"bands": [{"slope_deg": 4.0, "wavelength_mm": wavelength}]}
+        relief = {"bands": [{"slope_deg": 5.0, "wavelength_mm": wavelength}]}
         session = Session(smooth_scene(1, relief=relief), labelled=True)
         radiance = session.radiance()
 
