@@ -20,7 +20,7 @@ ON_REQUEST = (
     "dataset_memory",
     "nightly_page",
 )
-"""The same, run where they are named: they measure no speed, and take minutes."""
+"""The same, run where they are named: they take minutes, or need what is not always there."""
 
 
 def main(names: list[str]) -> int:

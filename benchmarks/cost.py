@@ -40,7 +40,7 @@ CORE_HOUR, TB_MONTH = 0.04, 20.0
 """Prices that the table assumes, in any currency: of a core for an hour, and of a TB for a month."""
 
 START_S = 10.0
-"""What a worker takes before its first sample, s: imports, and kernels from disk; measured on one loaded core."""
+"""What a worker takes before its first sample, s: imports, and kernels from disk. Assumed; it hardly matters here."""
 
 LINEAR = 0.9
 
