@@ -20,7 +20,7 @@ from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Picture
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.rendered_view import RenderedView, render_view, shows_isolated
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
@@ -100,8 +100,7 @@ class Maker:
         # A cheap look, since an attempt may be rejected: one ray per pixel and direct light.
         quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
         scene = drawn.scene.model_copy(update={"render": quick})
-        seen = render_view(self._at(replace(drawn, scene=scene)), scene)
-        return sum(truth.isolated for truth in seen.highlights) >= self.plan.dataset.highlights
+        return shows_isolated(self._at(replace(drawn, scene=scene)), scene, self.plan.dataset.highlights)
 
     def _at(self, drawn: Drawn) -> Session:
         """Return the session, updated to a scene."""

@@ -117,6 +117,11 @@ def judge(
     return highlights
 
 
+def may_be_isolated(point: HighlightPoint) -> bool:
+    """Return whether `judge` may call a highlight point isolated: by light and shape alone, whatever the frame."""
+    return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
+
+
 def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
     """Return the pixels above half height of the maximum that a highlight point makes.
 
