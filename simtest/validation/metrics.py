@@ -152,7 +152,7 @@ def _look_normals(
 ) -> dict[tuple[int, str], Array]:
     """Return the true normals where the estimates at matched detections look, by detection and estimator.
 
-    Those that look beside the surface are left out. All rays are cast at once: a call costs as much as hundreds of rays.
+    Those that look beside the surface are left out. All rays are cast at once: a call costs as much as many rays.
     """
     looks = {
         (i, name): result.look_px
