@@ -13,7 +13,7 @@ from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect
-from simtest.simulation.true_highlights import TrueHighlight, judge, may_be_isolated
+from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
 
@@ -106,9 +106,9 @@ def _judged(session: Session, radiance: Radiance, light: Image) -> tuple[list[Tr
     scene, mean, seen = session.scene, _mean(light), session.camera.seen
     points, rough = session.highlights(radiance), session.surface.relief is not None
     # Noise is independent in each channel; estimators see the channels' mean.
-    full_scale = _full_scale(scene, mean, points, seen, rough)
-    noise = scene.sensor.noise_model()
-    return judge(points, mean, noise, full_scale, radiance.channels, seen, single=rough), full_scale
+    examined = examine(points, mean, seen, single=rough)
+    full_scale = _full_scale(scene, mean, points, examined, seen)
+    return verdicts(points, examined, scene.sensor.noise_model(), full_scale, radiance.channels), full_scale
 
 
 def _placed(
@@ -134,7 +134,9 @@ def _mean(image: Image) -> Image:
     return image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
 
 
-def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: Mask | None, single: bool) -> float:
+def _full_scale(
+    scene: Scene, light: Image, points: list[HighlightPoint], examined: list[Examined], seen: Mask | None
+) -> float:
     """Return the radiance that becomes 1; 0, with a warning, where there is no light at all."""
     exposure, peak = scene.sensor.exposure, float(light.max())
     if peak <= 0:
@@ -154,7 +156,7 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
             radiance = peak
     else:
         # Which highlights are isolated is judged without noise first.
-        isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen, single) if h.isolated]
+        isolated = [h.bp_px for h in verdicts(points, examined, NoiseModel(), peak, 1) if h.isolated]
         radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
     return radiance / exposure.gain
 

@@ -4,8 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.geometry.circle_from_cone import circle_poses
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
@@ -130,9 +130,13 @@ def _mean_ratio_seen(
 
 def _takes_ratio_as_seen(estimate: Estimate) -> bool:
     """Return whether an estimate's axis ratio is that of its cones."""
-    poses = [isophote.pose() for isophote in estimate.isophotes]
-    ratios = [pose.axis_ratio for pose in poses if not isinstance(pose, Failure)]
-    return estimate.axis_ratio is not None and bool(np.isclose(np.mean(ratios), estimate.axis_ratio, atol=1e-9))
+    if estimate.axis_ratio is None or not estimate.isophotes:
+        return False
+    # All poses at once: each alone costs as much.
+    cones = np.array([isophote.cone for isophote in estimate.isophotes])
+    poses = circle_poses(cones, np.array([isophote.sightline for isophote in estimate.isophotes]))
+    sound = [i for i in range(len(poses)) if i not in poses.failures]
+    return bool(sound) and bool(np.isclose(np.mean(poses.axis_ratios[sound]), estimate.axis_ratio, atol=1e-9))
 
 
 def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
