@@ -151,7 +151,7 @@ class Maker:
         radiance, scale = seen.radiance, seen.full_scale or 1.0
         images = {"image": _encoded(picture, drawn.scene.sensor.encodes), **self._truth(drawn, frame)}
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
-        images |= {name: _colour(to_uint8(part / np.float32(scale))) for name, part in parts.items()}
+        images |= {name: _share_of(part, scale) for name, part in parts.items()}
         images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
         if self.plan.dataset.radiance:
             images["radiance"] = _colour(radiance.total / np.float32(scale))
@@ -177,6 +177,12 @@ def _encoded(picture: AnyArray, encoded: bool) -> AnyArray:
     """Return the 8-bit picture: what the sensor itself encoded, or else sRGB."""
     values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8) if encoded else to_uint8(picture)
     return _colour(values)
+
+
+def _share_of(part: AnyArray, scale: float) -> AnyArray:
+    """Return the 8-bit picture of a part of the radiance; without bounces that of the indirect light is black."""
+    encoded = to_uint8(part / np.float32(scale)) if part.any() else np.zeros(part.shape, dtype=np.uint8)
+    return _colour(encoded)
 
 
 def _colour(image: AnyArray) -> AnyArray:

@@ -238,13 +238,20 @@ class Session:
     def frame(self, progress: Progress | None = None) -> Frame:
         """Render the frame with the labels of the rendered shape, in one pass where it has one sample a pixel.
 
-        The labels are kept while surface and camera stay, and serve a frame of more samples. The exact truth that
-        `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
+        The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
+        """
+        radiance = self.labelled_radiance(progress)
+        return Frame(radiance, as_labels(self._labels))
+
+    def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
+        """Render the radiance of `frame`, and trace its labels.
+
+        The labels are kept while surface and camera stay: a frame of more samples takes them over.
         """
         kept = self._labels if self.scene.render.samples_per_pixel > 1 else []
         radiance, channels = self._render(None if kept else self._shape_labels(), progress)
         self._centre = self._labels = kept or channels
-        return Frame(radiance, as_labels(self._labels))
+        return radiance
 
     def _shape_labels(self) -> ShapeLabels:
         if self._built.labels is None:

@@ -96,7 +96,7 @@ def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     session.update(scene)
     if sum(may_be_isolated(point) for point in session.highlights()) < least:
         return False
-    radiance = session.frame().radiance
+    radiance = session.labelled_radiance()
     highlights, _ = _judged(session, radiance, collect(radiance.total, scene.sensor, session.camera))
     return sum(highlight.isolated for highlight in highlights) >= least
 
