@@ -17,7 +17,7 @@ from simtest.estimators import load_estimators
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
-from simtest.runtime.arrays import AnyArray, Picture
+from simtest.runtime.arrays import AnyArray, Image, Picture
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import RenderedView, render_view, shows_isolated
@@ -179,7 +179,7 @@ def _encoded(picture: AnyArray, encoded: bool) -> AnyArray:
     return _colour(values)
 
 
-def _share_of(part: AnyArray, scale: float) -> AnyArray:
+def _share_of(part: Image, scale: float) -> AnyArray:
     """Return the 8-bit picture of a part of the radiance; without bounces that of the indirect light is black."""
     encoded = to_uint8(part / np.float32(scale)) if part.any() else np.zeros(part.shape, dtype=np.uint8)
     return _colour(encoded)
