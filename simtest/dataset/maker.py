@@ -17,10 +17,10 @@ from simtest.estimators import load_estimators
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
-from simtest.runtime.arrays import AnyArray, Picture
+from simtest.runtime.arrays import AnyArray, Image, Picture
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.rendered_view import RenderedView, render_view, shows_isolated
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
@@ -102,8 +102,7 @@ class Maker:
         # A cheap look, since an attempt may be rejected: one ray per pixel and direct light.
         quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
         scene = drawn.scene.model_copy(update={"render": quick})
-        seen = render_view(self._at(replace(drawn, scene=scene)), scene)
-        return sum(truth.isolated for truth in seen.highlights) >= self.plan.dataset.highlights
+        return shows_isolated(self._at(replace(drawn, scene=scene)), scene, self.plan.dataset.highlights)
 
     def _at(self, drawn: Drawn) -> Session:
         """Return the session, updated to a scene."""
@@ -154,7 +153,7 @@ class Maker:
         radiance, scale = seen.radiance, seen.full_scale or 1.0
         images = {"image": _encoded(picture, drawn.scene.sensor.encodes), **self._truth(drawn, frame)}
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
-        images |= {name: _colour(to_uint8(part / np.float32(scale))) for name, part in parts.items()}
+        images |= {name: _share_of(part, scale) for name, part in parts.items()}
         images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
         if self.plan.dataset.radiance:
             images["radiance"] = _colour(radiance.total / np.float32(scale))
@@ -180,6 +179,12 @@ def _encoded(picture: AnyArray, encoded: bool) -> AnyArray:
     """Return the 8-bit picture: what the sensor itself encoded, or else sRGB."""
     values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8) if encoded else to_uint8(picture)
     return _colour(values)
+
+
+def _share_of(part: Image, scale: float) -> AnyArray:
+    """Return the 8-bit picture of a part of the radiance; without bounces that of the indirect light is black."""
+    encoded = to_uint8(part / np.float32(scale)) if part.any() else np.zeros(part.shape, dtype=np.uint8)
+    return _colour(encoded)
 
 
 def _colour(image: AnyArray) -> AnyArray:

@@ -7,8 +7,17 @@ from simtest.runtime.arrays import Array
 
 def angle_deg(first: Array, second: Array) -> Array:
     """Return the angle between unit vectors, shapes (..., 3), deg; exact for small angles too."""
-    cross = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.asarray(np.degrees(np.arctan2(cross, np.sum(np.asarray(first) * second, axis=-1))))
+    # Component by component: for a few vectors NumPy's cross product and norm take ten times as long.
+    x, y, z = _components(first)
+    u, v, w = _components(second)
+    a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+    sine, cosine = np.sqrt(a * a + b * b + c * c), x * u + y * v + z * w
+    return np.asarray(np.degrees(np.arctan2(sine, cosine)))
+
+
+def _components(vectors: Array) -> tuple[Array, Array, Array]:
+    values = np.asarray(vectors)
+    return values[..., 0], values[..., 1], values[..., 2]
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:

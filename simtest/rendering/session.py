@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtest.rendering import backend, emission, glints, highlights, phong, tissue
+from simtest.rendering import backend, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
-from simtest.rendering.base_caster import BaseCaster
 from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
@@ -29,18 +28,11 @@ from simtest.rendering.shapes import make_shape
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
-from simtest.spec.surface import AnatomySurface
 from simtest.spec.translucency import Translucency
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import TissuePattern
-
-FINE_STRIDE_PX = 2
-"""Seeds' grid for anatomies, whose highlights are small and many."""
-
-COARSE_STRIDE_PX = 4
-"""Seeds' grid for analytic surfaces."""
 
 
 @dataclass
@@ -158,10 +150,13 @@ class Session:
     def _forget(self) -> None:
         self._truth: TruthMaps | None = None
         self._centre: list[Image] = []
+        self._labels: list[Image] = []
         self._forget_misfits()
 
     def _forget_misfits(self) -> None:
+        # What depends on surface, camera and rig alone.
         self._misfits: MisfitMaps | None = None
+        self._highlights: dict[bool, list[HighlightPoint]] = {}
 
     def _structure(self) -> tuple[Any, ...]:
         """Return everything of the scene that is compiled into the kernels."""
@@ -245,9 +240,18 @@ class Session:
 
         The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
         """
-        radiance, channels = self._render(self._shape_labels(), progress)
-        self._centre = channels
-        return Frame(radiance, as_labels(channels))
+        radiance = self.labelled_radiance(progress)
+        return Frame(radiance, as_labels(self._labels))
+
+    def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
+        """Render the radiance of `frame`, and trace its labels.
+
+        The labels are kept while surface and camera stay: a frame of more samples takes them over.
+        """
+        kept = self._labels if self.scene.render.samples_per_pixel > 1 else []
+        radiance, channels = self._render(None if kept else self._shape_labels(), progress)
+        self._centre = self._labels = kept or channels
+        return radiance
 
     def _shape_labels(self) -> ShapeLabels:
         if self._built.labels is None:
@@ -391,23 +395,26 @@ class Session:
         # A blocker stands clearly in front of the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))
 
-    def highlights(self, radiance: Radiance) -> list[HighlightPoint]:
+    def highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
         """Find the highlight points of every light in view, the brightest first, with the frame's radiance.
 
         On a surface with relief these are its glints (theory.md 7.1). Where no part of the frame resolves the relief it
-        acts as roughness, and the highlight points are the base's.
+        acts as roughness, and the highlight points are the base's. Without a `radiance` theirs is 0, and they stand in
+        no order.
         """
-        if self.surface.relief is not None:
-            return glints.find(self, radiance) if glints.is_resolved(self) else self.base_highlights(radiance)
-        return highlights.find(self, radiance, stride=self._stride)
+        unresolved = self.surface.relief is not None and not glints.is_resolved(self)
+        return self._found(unresolved, radiance)
 
-    def base_highlights(self, radiance: Radiance) -> list[HighlightPoint]:
+    def base_highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
         """Find the highlight points of the base, without the relief: the centres of the clouds of glints."""
-        return highlights.find(BaseCaster(self), radiance, stride=self._stride)
+        return self._found(True, radiance)
 
-    @property
-    def _stride(self) -> int:
-        return FINE_STRIDE_PX if isinstance(self.scene.surface, AnatomySurface) else COARSE_STRIDE_PX
+    def _found(self, base: bool, radiance: Radiance | None) -> list[HighlightPoint]:
+        """Return the highlight points of the base or of the fine surface, searched for once."""
+        if base not in self._highlights:
+            self._highlights[base] = found_highlights.search(self, base)
+        found = self._highlights[base]
+        return list(found) if radiance is None else found_highlights.lit_by(radiance, found)
 
 
 def _set(parameters: Any, suffix: str, value: Any) -> None:

@@ -13,7 +13,7 @@ from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect
-from simtest.simulation.true_highlights import TrueHighlight, judge
+from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
 
@@ -79,19 +79,36 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     session.update(scene)
     if radiance is None:
         radiance = session.radiance()
-    # Lens.
     light = collect(radiance.total, scene.sensor, session.camera)
-    mean = _mean(light)
-    # Truth and exposure. Noise is independent in each channel; estimators see the channels' mean.
-    points, seen = session.highlights(radiance), session.camera.seen
-    rough = session.surface.relief is not None
-    full_scale = _full_scale(scene, mean, points, seen, rough)
-    highlights = judge(points, mean, scene.sensor.noise_model(), full_scale, radiance.channels, seen, single=rough)
+    highlights, full_scale = _judged(session, radiance, light)
     highlights, clouds = _placed(session, radiance, highlights)
     # What reconstruction is told may include the distance of the brightest highlight.
     brightest = max((h for h in highlights if h.lit), key=lambda h: h.radiance, default=None)
     calibration = scene.calibration(None if brightest is None else brightest.distance)
     return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration)
+
+
+def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
+    """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
+
+    The frame is rendered, with its labels, only where so many highlight points may be isolated at all.
+    """
+    session.update(scene)
+    if sum(may_be_isolated(point) for point in session.highlights()) < least:
+        return False
+    radiance = session.labelled_radiance()
+    highlights, _ = _judged(session, radiance, collect(radiance.total, scene.sensor, session.camera))
+    return sum(highlight.isolated for highlight in highlights) >= least
+
+
+def _judged(session: Session, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
+    """Judge a frame's highlights by its light behind the lens; return them and the full scale."""
+    scene, mean, seen = session.scene, _mean(light), session.camera.seen
+    points, rough = session.highlights(radiance), session.surface.relief is not None
+    # Noise is independent in each channel; estimators see the channels' mean.
+    examined = examine(points, mean, seen, single=rough)
+    full_scale = _full_scale(scene, mean, points, examined, seen)
+    return verdicts(points, examined, scene.sensor.noise_model(), full_scale, radiance.channels), full_scale
 
 
 def _placed(
@@ -117,11 +134,13 @@ def _mean(image: Image) -> Image:
     return image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
 
 
-def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: Mask | None, single: bool) -> float:
+def _full_scale(
+    scene: Scene, light: Image, points: list[HighlightPoint], examined: list[Examined], seen: Mask | None
+) -> float:
     """Return the radiance that becomes 1; 0, with a warning, where there is no light at all."""
     exposure, peak = scene.sensor.exposure, float(light.max())
     if peak <= 0:
-        warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=3)
+        warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=4)
         return 0.0
     # Fixed by the scene, or by a percentile of the frame, or by its brightest isolated highlight.
     if exposure.full_scale is not None:
@@ -132,12 +151,12 @@ def _full_scale(scene: Scene, light: Image, points: list[HighlightPoint], seen: 
             warnings.warn(
                 f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is "
                 f"{radiance:g}, {LEAST_SHARE:g} of its maximum or less; the frame's maximum becomes full scale",
-                stacklevel=3,
+                stacklevel=4,
             )
             radiance = peak
     else:
         # Which highlights are isolated is judged without noise first.
-        isolated = [h.bp_px for h in judge(points, light, NoiseModel(), peak, 1, seen, single) if h.isolated]
+        isolated = [h.bp_px for h in verdicts(points, examined, NoiseModel(), peak, 1) if h.isolated]
         radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
     return radiance / exposure.gain
 

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.arrays import Image, IntArray, Mask
 from simtest.runtime.files import Json
 
 Pixel = tuple[int, int]
@@ -77,6 +78,25 @@ class TrueHighlight(HighlightPoint):
         }
 
 
+@dataclass(frozen=True)
+class Examined:
+    """What a highlight point makes of the noise-free frame, whatever the noise.
+
+    Parameters
+    ----------
+    level : float
+        Smoothed light of the maximum that it makes.
+    height : float or None
+        The maximum above its surroundings; None where it has no closed region of its own.
+    why_not : str
+        Empty for what is isolated if it stands above the noise, else the first condition that it fails.
+    """
+
+    level: float
+    height: float | None
+    why_not: str
+
+
 def judge(
     points: list[HighlightPoint],
     light: Image,
@@ -86,18 +106,21 @@ def judge(
     seen: Mask | None = None,
     single: bool = False,
 ) -> list[TrueHighlight]:
-    """Judge each highlight point by the noise-free frame.
+    """Judge each highlight point by the noise-free frame (see `examine` and `verdicts`)."""
+    return verdicts(points, examine(points, light, seen, single), noise, full_scale, channels)
+
+
+def examine(
+    points: Sequence[HighlightPoint], light: Image, seen: Mask | None = None, single: bool = False
+) -> list[Examined]:
+    """Examine each highlight point in the noise-free frame.
 
     Parameters
     ----------
-    points : list of HighlightPoint
+    points : sequence of HighlightPoint
         All points where the normal bisects light and camera.
     light : ndarray of float32, shape (H, W)
-        Noise-free radiance behind the lens, mean of `channels` channels.
-    noise : NoiseModel
-        Of one channel.
-    full_scale : float
-        Radiance at full scale; 0 where there is no light at all.
+        Noise-free radiance behind the lens, mean of the channels.
     seen : ndarray of bool, shape (H, W), optional
         The pixels inside the camera's view mask; default all.
     single : bool
@@ -107,14 +130,47 @@ def judge(
     smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
     peaks = [_peak_pixel(smoothed, point) for point in points]
     owners = _owners(points, peaks)
-    # Verdicts.
-    highlights = []
+    lit = [point for point in points if point.lit] if single else []
+    pixels = np.array([point.bp_px for point in lit]).reshape(-1, 2).astype(int)
+    examined = []
     for point, peak in zip(points, peaks, strict=True):
-        sigma = float(noise.at(smoothed[peak] / full_scale, channels)) * full_scale if full_scale > 0 else 0.0
-        others = [own.bp_px for own in points if own.lit and own is not point] if single else []
-        snr, why_not = _verdict(point, smoothed, seen, peak, owners.get(peak) is point, sigma, others)
-        highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=why_not))
+        others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
+        height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
+        examined.append(Examined(float(smoothed[peak]), height, why_not))
+    return examined
+
+
+def verdicts(
+    points: Sequence[HighlightPoint], examined: Sequence[Examined], noise: NoiseModel, full_scale: float, channels: int
+) -> list[TrueHighlight]:
+    """Judge highlight points that were examined.
+
+    Parameters
+    ----------
+    points, examined : sequence
+        Of the same length.
+    noise : NoiseModel
+        Of one channel of `channels`.
+    full_scale : float
+        Radiance at full scale; 0 where there is no light at all.
+    """
+    levels, sigmas = np.array([each.level for each in examined], dtype=np.float32), np.zeros(len(points))
+    if full_scale > 0 and len(points):
+        sigmas = np.asarray(noise.at(levels / full_scale, channels)) * full_scale
+    highlights = []
+    for point, each, sigma in zip(points, examined, sigmas.tolist(), strict=True):
+        # Without a maximum of its own it has no SNR.
+        height, snr = each.height or 0.0, 0.0
+        if each.height is not None:
+            snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
+        faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
+        highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
     return highlights
+
+
+def may_be_isolated(point: HighlightPoint) -> bool:
+    """Return whether `judge` may call a highlight point isolated: by light and shape alone, whatever the frame."""
+    return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
 
 
 def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
@@ -126,7 +182,7 @@ def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) 
     return half_height_component(smoothed, *_peak_pixel(smoothed, point), seen)
 
 
-def _owners(points: list[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
+def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
     """Assign each maximum of the smoothed frame to the nearest lit BP: smoothing may merge several highlights."""
     owners: dict[Pixel, HighlightPoint] = {}
     for point, peak in zip(points, peaks, strict=True):
@@ -139,37 +195,35 @@ def _owners(points: list[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, Hig
     return owners
 
 
-def _verdict(
-    point: HighlightPoint,
-    smoothed: Image,
-    seen: Mask | None,
-    peak: Pixel,
-    owns_peak: bool,
-    sigma: float,
-    others: list[Array],
-) -> tuple[float, str]:
-    """Return peak SNR and the first condition that a highlight point fails.
+def _examined(
+    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, others: IntArray
+) -> tuple[float | None, str]:
+    """Return the height of a highlight point's maximum and the first condition but that of noise that it fails.
 
-    `sigma` is the noise at its peak; `others` are the points that may not lie in its half-height region, px.
+    `others` are columns and rows, shape (N, 2), of the points that may not lie in its half-height region.
     """
-    # Without a maximum of its own it has no SNR.
     if not point.lit:
-        return 0.0, "in shadow"
+        return None, "in shadow"
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
     if component is None:
-        return 0.0, "part of a brighter one"
+        return None, "part of a brighter one"
     height = contrast(smoothed, component, float(smoothed[peak]), seen)
-    snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
-    if any(component.holds(other) for other in others):
-        return snr, "holds several glints"
+    if _holds_any(component, others):
+        return height, "holds several glints"
     # Shape, frame, noise: in the order of theory.md section 6.
     if point.min_gain <= HIGHLIGHT_MIN_GAIN:
-        return snr, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
+        return height, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
     if not component.closed:
-        return snr, "isophote at t = 0.5 leaves the frame"
-    if snr < HIGHLIGHT_CONTRAST_SIGMA:
-        return snr, f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma"
-    return snr, ""
+        return height, "isophote at t = 0.5 leaves the frame"
+    return height, ""
+
+
+def _holds_any(component: Component, pixels: IntArray) -> bool:
+    """Return whether any of the pixels, columns and rows, shape (N, 2), belongs to a component."""
+    columns, rows = (pixels - [component.x, component.y]).T
+    height, width = component.mask.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    return bool(component.mask[rows[inside], columns[inside]].any())
 
 
 def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:

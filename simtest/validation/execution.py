@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from simtest.estimators import load_estimators
+from simtest.estimators import AnyEstimator, load_estimators
 from simtest.runtime.engines import OnStep
 from simtest.spec import Experiment
 from simtest.validation import gallery_items as gallery
@@ -51,9 +51,16 @@ def _realiser(variant: str | None) -> Realiser:
     return Realiser(variant)
 
 
+@lru_cache(maxsize=1)
+def _estimators(names: tuple[str, ...]) -> dict[str, AnyEstimator]:
+    """Return the estimators of the last parts: to find them the metadata of all installed packages are read."""
+    return load_estimators(names)
+
+
 def forget() -> None:
-    """Let this process's rendering session go."""
+    """Let this process's rendering session and estimators go."""
     _realiser.cache_clear()
+    _estimators.cache_clear()
 
 
 def parts_of(
@@ -81,7 +88,7 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
 
 def _rendered(part: Part, tell: OnStep) -> list[ResultRow]:
     experiment, case, realiser = part.experiment, part.case, _realiser(part.variant)
-    estimators = load_estimators(experiment.estimators)
+    estimators = _estimators(tuple(experiment.estimators))
     rows: list[ResultRow] = []
     for number in part.numbers:
         made = realiser.make(experiment, case, number, estimators)

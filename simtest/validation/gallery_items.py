@@ -1,10 +1,11 @@
 """Keeps a few frames of a run with everything that is needed to draw them: truth, isophotes, ellipses, normals."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypedDict
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,9 @@ Vector = list[float]
 
 MAP_SIDE = 80
 """Truth maps are thinned to about this many samples along the longer side."""
+
+ZIP_LEVEL = 1
+"""Six times as fast as zlib's usual 6 on noisy frames, for files 6 % larger."""
 
 CONTOUR_POINTS = 200
 """Contours are thinned to about this many points."""
@@ -201,7 +205,15 @@ def write_item(
     content |= {"position": np.asarray(position, np.float32), "normal": np.asarray(normal, np.float32)}
     halves = {name: np.asarray(picture).astype(np.float16) for name, picture in pictures.items()}
     text = np.array(json.dumps(meta.to_json(), allow_nan=False))
-    write_atomically(path, lambda part: np.savez_compressed(part, allow_pickle=False, **content, **halves, meta=text))
+    write_atomically(path, lambda part: _write_npz(part, {**content, **halves, "meta": text}))
+
+
+def _write_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> None:
+    """Write arrays by name as `numpy.savez_compressed` does, at a level that NumPy does not let one choose."""
+    with ZipFile(path, "w", ZIP_DEFLATED, compresslevel=ZIP_LEVEL) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
 
 
 def _estimates(i: int, made: Realisation, camera: Camera) -> list[DrawnEstimate]:

@@ -106,7 +106,11 @@ def axis_ratio_seen(
     level = -2 * np.log(np.asarray(isovalue, float))
     s2 = np.asarray(smoothing_px, float) ** 2
     added = (level * s2 + (level - 1) * LINEAR_INTERPOLATION_PX2) * np.asarray(pixel, float) ** 2
-    first, second = (isophote_half_width(isovalue, exponent, kd) ** 2 + added for kd in (kd_min, kd_max))
+    # Both principal sections at once: each bisection is many small steps.
+    t, n, added, *kd = np.broadcast_arrays(
+        *(np.asarray(values, float) for values in (isovalue, exponent, added, kd_min, kd_max))
+    )
+    first, second = isophote_half_width(t, n, np.stack(kd)) ** 2 + added
     smaller, larger = np.minimum(first, second), np.maximum(first, second)
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(larger), np.sqrt(smaller / larger), np.nan)

@@ -21,13 +21,13 @@ def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> d
     dict
         Index of the point by index of the detection; a point is matched to the nearest of its detections only.
     """
+    points = np.asarray(points_px, dtype=float).reshape(-1, 2)
     # Candidates: points that an isophote encloses, with their distance from its peak.
     pairs = []
     for i, specularity in enumerate(specularities):
-        for j, point in enumerate(points_px):
-            if _encloses(specularity, point):
-                distance = float(np.hypot(*(point - peak_px(specularity))))
-                pairs.append((_is_undetected(specularity), distance, i, j))
+        for j in _enclosed(specularity, points):
+            distance = float(np.hypot(*(points[j] - peak_px(specularity))))
+            pairs.append((_is_undetected(specularity), distance, i, j))
     # Detections before what a frame estimator alone saw, the nearest pair first; each detection and each point once.
     matched: dict[int, int] = {}
     for _, _, i, j in sorted(pairs):
@@ -48,11 +48,16 @@ def peak_px(specularity: Specularity) -> np.ndarray:
     return specularity.patch.peak_px
 
 
-def _encloses(specularity: Specularity, point: np.ndarray) -> bool:
-    """Return whether a detection's isophote encloses a point; where it does not close, its region decides."""
-    patch = specularity.patch
-    contour = patch if isinstance(patch, Failure) else patch.isophote(HIGHLIGHT_ISOVALUE)
-    if not isinstance(contour, Failure):
-        return encloses(contour, point)
+def _enclosed(specularity: Specularity, points: Array) -> list[int]:
+    """Return the indices of the points, shape (N, 2), px, that a detection's isophote encloses.
+
+    Where the isophote does not close, the detection's region decides.
+    """
     x, y, width, height = specularity.region.box
-    return bool(x <= point[0] <= x + width and y <= point[1] <= y + height)
+    # The isophote lies in the region. A frame on a relief has hundreds of regions and of points, far apart.
+    inside = ((points >= [x, y]) & (points <= [x + width, y + height])).all(axis=1)
+    near, patch = np.flatnonzero(inside).tolist(), specularity.patch
+    if not near or isinstance(patch, Failure):
+        return near
+    contour = patch.isophote(HIGHLIGHT_ISOVALUE)
+    return near if isinstance(contour, Failure) else [j for j in near if encloses(contour, points[j])]

@@ -53,7 +53,7 @@ def rows(
     """
     rough = rough or RoughTruth()
     made = []
-    scene = session.scene
+    scene, look_normals = session.scene, _look_normals(session, specularities, matched)
     # Detections: matched, or false.
     for i, specularity in enumerate(specularities):
         true_id = matched.get(i)
@@ -68,7 +68,11 @@ def rows(
                 made.append(replace(row, estimator=name, status=str(result.reason), flags=result.detail))
                 continue
             answered = _estimate_row(replace(row, estimator=name), result)
-            made.append(answered if truth is None else _error_row(answered, session, patch, result, truth))
+            made.append(
+                answered
+                if truth is None
+                else _error_row(answered, scene, patch, result, truth, look_normals.get((i, name)))
+            )
     # Truths without a row of some estimator: no detection found them, or one of a frame estimator alone.
     held = {(row.true_id, row.estimator) for row in made}
     for j, truth in enumerate(truths):
@@ -143,15 +147,39 @@ def _estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
     )
 
 
+def _look_normals(
+    session: Session, specularities: Sequence[Specularity], matched: Mapping[int, int]
+) -> dict[tuple[int, str], Array]:
+    """Return the true normals where the estimates at matched detections look, by detection and estimator.
+
+    Those that look beside the surface are left out. All rays are cast at once: a call costs as much as many rays.
+    """
+    looks = {
+        (i, name): result.look_px
+        for i in matched
+        for name, result in specularities[i].estimates.items()
+        if not isinstance(result, Failure) and np.isfinite(result.look_px).all()
+    }
+    if not looks:
+        return {}
+    found = session.cast(np.stack(list(looks.values())))[0]
+    return {key: found.normal[n] for n, key in enumerate(looks) if found.valid[n]}
+
+
 def _error_row(
-    row: ResultRow, session: Session, patch: Patch | Failure, estimate: Estimate, truth: TrueHighlight
+    row: ResultRow,
+    scene: Scene,
+    patch: Patch | Failure,
+    estimate: Estimate,
+    truth: TrueHighlight,
+    look_normal: Array | None,
 ) -> ResultRow:
-    """Fill in an estimate's errors, and what the laws predict for them."""
-    scene, to_truth = session.scene, angle_deg(estimate.candidates, truth.normal)
-    # The normal where the estimate looks, if there is a surface.
-    error_look_deg = None
-    if np.isfinite(estimate.look_px).all() and (look := session.cast(estimate.look_px[None])[0]).valid[0]:
-        error_look_deg = float(angle_deg(estimate.normal, look.normal[0]))
+    """Fill in an estimate's errors, and what the laws predict for them.
+
+    `look_normal` is the true normal where the estimate looks, None where there is no surface.
+    """
+    to_truth = angle_deg(estimate.candidates, truth.normal)
+    error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
     error_fine_deg = float(angle_deg(estimate.normal, truth.normal))
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px

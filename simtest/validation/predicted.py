@@ -1,9 +1,11 @@
 """Predictions of the laws of theory.md sections 4 and 7 for an estimate at a true highlight."""
 
+from functools import lru_cache
+
 import numpy as np
 
-from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.geometry.circle_from_cone import circle_poses
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
@@ -106,24 +108,35 @@ def axis_ratio_seen(scene: Scene, estimate: Estimate, highlight: HighlightPoint,
     For a Phong lobe without a base under a light at the camera, mean of the estimate's isovalues.
     """
     reflectance = scene.reflectance
-    isovalues = [isophote.isovalue for isophote in estimate.isophotes]
+    isovalues = tuple(float(isophote.isovalue) for isophote in estimate.isophotes)
     if not isinstance(reflectance, PhongReflectance) or reflectance.normalised or reflectance.diffuse != 0:
         return None
     light = scene.rig.lights[highlight.light]
     at_camera = is_at_camera(scene.rig.true_mm()[highlight.light]) and light.source is None
     if not (isovalues and at_camera and _takes_ratio_as_seen(estimate)):
         return None
-    kd_min, kd_max = highlight.kd_min, highlight.kd_max
-    pixel = _pixel_angle(scene, highlight)
-    ratios = laws.axis_ratio_seen(isovalues, reflectance.exponent, kd_min, kd_max, smoothing_px, pixel)
+    curvatures, pixel = (highlight.kd_min, highlight.kd_max), _pixel_angle(scene, highlight)
+    return _mean_ratio_seen(isovalues, reflectance.exponent, curvatures, smoothing_px, pixel)
+
+
+@lru_cache(maxsize=1024)
+def _mean_ratio_seen(
+    isovalues: tuple[float, ...], exponent: float, kd: tuple[float, float], smoothing_px: float, pixel: float
+) -> float | None:
+    """Compute the mean of `laws.axis_ratio_seen` over isovalues; the realisations of one view ask for the same."""
+    ratios = laws.axis_ratio_seen(isovalues, exponent, *kd, smoothing_px, pixel)
     return float(ratios.mean()) if np.isfinite(ratios).all() else None
 
 
 def _takes_ratio_as_seen(estimate: Estimate) -> bool:
     """Return whether an estimate's axis ratio is that of its cones."""
-    poses = [isophote.pose() for isophote in estimate.isophotes]
-    ratios = [pose.axis_ratio for pose in poses if not isinstance(pose, Failure)]
-    return estimate.axis_ratio is not None and bool(np.isclose(np.mean(ratios), estimate.axis_ratio, atol=1e-9))
+    if estimate.axis_ratio is None or not estimate.isophotes:
+        return False
+    # All poses at once: each alone costs as much.
+    cones = np.array([isophote.cone for isophote in estimate.isophotes])
+    poses = circle_poses(cones, np.array([isophote.sightline for isophote in estimate.isophotes]))
+    sound = [i for i in range(len(poses)) if i not in poses.failures]
+    return bool(sound) and bool(np.isclose(np.mean(poses.axis_ratios[sound]), estimate.axis_ratio, atol=1e-9))
 
 
 def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
