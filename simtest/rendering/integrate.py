@@ -4,9 +4,9 @@ A frame of one sample is traced row by row, so that nothing has to be sorted; th
 Several samples are traced in tiles of 4 x 4 pixels and summed in registers: memory does not grow with their number.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +19,14 @@ from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
-from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
+from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
 from simtest.rendering.relief_kernel import ReliefKernel
-from simtest.rendering.shape_labels import ShapeLabels
 from simtest.runtime.arrays import Array, Image
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
+
+Tell = Callable[[int], None]
 
 LANES = 2**22
 """Pixels of one launch: they bound the memory. Another number changes the noise of bounces, and nothing else."""
@@ -47,6 +48,13 @@ Sums = npt.NDArray[np.float64]
 
 Painted = tuple[Any, Any]
 """An albedo, mitsuba.Spectrum, and the point, mitsuba.Point3f, where it was computed."""
+
+
+class Labelling(Protocol):
+    """Computes labels at hits; see `ShapeLabels`."""
+
+    def trace(self, preliminary: Any, hit: Hit, rays: Rays, rotation: Any, relief: ReliefKernel | None) -> list[Any]:
+        """Return channels, mitsuba.Float."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +113,7 @@ class Tracer:
     # One sample --------------------------------------------------------------------------------------------------
 
     def centres(
-        self, bounces: Bounces | None, radiance: bool, labels: ShapeLabels | None, progress: Progress | None = None
+        self, bounces: Bounces | None, radiance: bool, labels: Labelling | None, progress: Progress | None = None
     ) -> tuple[list[Image], list[Image]]:
         """Trace the ray through each pixel's centre; `progress` is called after each launch.
 
@@ -175,11 +183,31 @@ class Tracer:
         `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
         """
         height, width = self.sightlines.tiled_size
-        camera, total = self.sightlines.camera, height * width * samples
-        blocks: list[Image] = []
+        camera = self.sightlines.camera
         # Trace: sums over the samples of each block of pixels.
-        for block, (first, count) in enumerate(_blocks(height * width)):
-            lanes = self.sightlines.lanes(first, count, True, seed)
+        blocks = list(_blocks(height * width))
+        lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
+        channels = self._means(lanes, samples, bounces, _share_of(progress, height * width * samples))
+        # Arrange: from tiles to rows, without what lies beyond the frame.
+        maps = untile(channels, (height, width))
+        return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
+
+    def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
+        """Compute what `mean` does, without bounces, at some pixels alone, by number: channels, shape (C, N).
+
+        `tell` is called with how many samples have been traced.
+        """
+        blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
+                  for first, count in _blocks(len(pixels)))  # fmt: skip
+        return self._means(blocks, samples, None, tell)
+
+    def _means(
+        self, blocks: Iterable[tuple[Lanes, int]], samples: int, bounces: Bounces | None, tell: Tell | None
+    ) -> Image:
+        """Compute the channels, shape (C, N), of the mean over the samples of blocks of lanes and their numbers."""
+        means: list[Image] = []
+        traced = 0
+        for block, (lanes, count) in enumerate(blocks):
             drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
             for start, stop in self._runs(samples, count, bounces):
@@ -189,13 +217,12 @@ class Tracer:
                     parts = self._single(lanes, drawer, start, bounces, count, block)
                 added = np.stack(_evaluate(parts, count)).astype(np.float64)
                 sums = added if sums is None else sums + added
-                if progress:
-                    progress(first * samples + count * stop, total, "rendering")
+                traced += count * (stop - start)
+                if tell:
+                    tell(traced)
             assert sums is not None
-            blocks.append((sums / samples).astype(np.float32))
-        # Arrange: from tiles to rows, without what lies beyond the frame.
-        maps = untile(np.concatenate(blocks, axis=1), (height, width))
-        return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
+            means.append((sums / samples).astype(np.float32))
+        return np.concatenate(means, axis=1)
 
     def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
         """Split a pixel's samples into the runs of single launches."""
@@ -281,6 +308,11 @@ def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
     """Split a number of pixels into runs: first, count."""
     for first in range(0, pixels, LANES):
         yield first, min(LANES, pixels - first)
+
+
+def _share_of(progress: Progress | None, total: int) -> Tell | None:
+    """Return what tells `progress` how many samples of a total have been traced."""
+    return progress and (lambda traced: progress(traced, total, "rendering"))
 
 
 def _evaluate(values: list[Any], count: int) -> list[Image]:
