@@ -134,4 +134,3 @@ class Adaptive:
         rounded = offset[: 3 if self.shape.kind == "sphere" else 2]
         distance = radius * float(np.linalg.norm(rounded))
         return radius * px_per_rad < LEAST_RADIUS_PX * distance
-

@@ -58,9 +58,7 @@ def uneven(centres: Image, whole: Image) -> Mask:
 
 def _curves(centres: Image) -> tuple[Image, Image]:
     """Return second differences along x and y."""
-    across, down = (
-        cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_CURVE, _CURVE.T)
-    )
+    across, down = (cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_CURVE, _CURVE.T))
     return across, down
 
 

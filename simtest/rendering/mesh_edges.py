@@ -153,7 +153,7 @@ class MeshEdges:
         return np.array(kinds)
 
     def _cast(self, points: Array, along: Array, source: Array, aside: Array) -> Array:
-        """Return where rays of a light meet the mesh beyond points that they pass by `aside`, rad; NaN where nowhere."""
+        """Return where a light's rays meet the mesh beyond points that they pass by `aside`, rad; NaN where nowhere."""
         mi = self.mi
         if not len(points):
             return points
