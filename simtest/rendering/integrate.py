@@ -21,6 +21,7 @@ from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
 from simtest.rendering.relief_kernel import ReliefKernel
+from simtest.rendering.shape_labels import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
 
 Progress = Callable[[int, int, str], None]
@@ -91,10 +92,14 @@ class Tracer:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
+        return rays, preliminary, self._points(rays, preliminary, bent)
+
+    def _points(self, rays: Rays, preliminary: Any, bent: bool) -> Hit:
+        """Return the surface points of hits."""
         flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
         si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
         self.refinement.apply(rays.origin, rays.direction, si)
-        return rays, preliminary, make_hit(self.mi, si, self.relief, bent)
+        return make_hit(self.mi, si, self.relief, bent)
 
     def _direct(self, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
         """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`."""
@@ -139,11 +144,34 @@ class Tracer:
             rows.append(_evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
-        # Launches, row after row, become maps.
-        shape = (camera.height, camera.width)
-        maps = [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
-                for pieces in zip(*rows, strict=True)]  # fmt: skip
+        maps = self._maps(rows)
         return maps[:count_of_parts], maps[count_of_parts:]
+
+    def relabelled(self, channels: list[Image], labels: ShapeLabels) -> list[Image]:
+        """Compute labels, as `centres` does, from other labels of the same hits: nothing is traced."""
+        import drjit as dr
+
+        mi, camera = self.mi, self.sightlines.camera
+        depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
+        rows: list[list[Image]] = []
+        for first, count in _blocks(camera.width * camera.height):
+            own = slice(first, first + count)
+            preliminary = dr.zeros(mi.PreliminaryIntersection3f, count)
+            preliminary.t = mi.Float(np.nan_to_num(depth[own], nan=np.inf))
+            preliminary.prim_index = mi.UInt32(face[own].view(np.uint32))
+            preliminary.prim_uv = mi.Point2f(*(mi.Float(share[own]) for share in place))
+            preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
+            rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
+            hit = self._points(rays, preliminary, True)
+            rotation = self.sightlines.camera_from_model
+            rows.append(_evaluate(labels.trace(preliminary, hit, rays, rotation, self.relief), count))
+        return self._maps(rows)
+
+    def _maps(self, rows: list[list[Image]]) -> list[Image]:
+        """Make maps, shape (H, W), of the channels of launches, row after row."""
+        shape = (self.sightlines.camera.height, self.sightlines.camera.width)
+        return [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
+                for pieces in zip(*rows, strict=True)]  # fmt: skip
 
     def misfits(self, lights: Array, division: int, base: bool) -> MisfitMaps:
         """Trace the misfits for lights, shape (L, 3), camera frame, mm, at the centres of pixels divided both ways.

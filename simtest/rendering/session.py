@@ -267,7 +267,7 @@ class Session:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         elif adaptive.applies(self.scene):
             parts, self._centre = self._adaptive(tracer).render(progress)
-            channels = tracer.centres(None, False, labels)[1] if labels else []
+            channels = tracer.relabelled(self._centre, labels) if labels else []
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []

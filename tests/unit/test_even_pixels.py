@@ -1,5 +1,7 @@
 """Which pixels need samples, and the mean of those that need none."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -220,3 +222,23 @@ def test_progress_ends_at_its_total_and_rises():
     session.radiance(lambda done, total, what: told.append((done, total)))
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert told[-1][0] == told[-1][1] == 64 * 48 * 4
+
+
+SHAPES = {
+    "plane": {"type": "plane", "tilt_deg": 30.0},
+    "sphere": {"type": "sphere", "radius_mm": 6.0},
+    "cylinder inside": {"type": "cylinder", "radius_mm": 11.0, "side": "inside"},
+    "saddle": {"type": "quadric", "k1_per_mm": 0.06, "k2_per_mm": -0.04},
+}
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("name", SHAPES)
+def test_labels_need_no_second_trace(name):
+    """Those from the hits of the radiance are, byte for byte, those of a trace of their own."""
+    session = Session(scene(SHAPES[name]))
+    labels = session.frame().labels
+    session.update(scene(SHAPES[name], adaptive=False))
+    traced = session.frame().labels
+    for field in dataclasses.fields(labels):
+        assert getattr(labels, field.name).tobytes() == getattr(traced, field.name).tobytes(), field.name
