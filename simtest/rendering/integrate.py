@@ -4,9 +4,9 @@ A frame of one sample is traced row by row, so that nothing has to be sorted; th
 Several samples are traced in tiles of 4 x 4 pixels and summed in registers: memory does not grow with their number.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +19,15 @@ from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
-from simtest.rendering.rays import Lanes, Rays, Sightlines, untile
+from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
 from simtest.rendering.relief_kernel import ReliefKernel
-from simtest.rendering.shape_labels import ShapeLabels
+from simtest.rendering.shape_labels import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
+
+Tell = Callable[[int], None]
 
 LANES = 2**22
 """Pixels of one launch: they bound the memory. Another number changes the noise of bounces, and nothing else."""
@@ -47,6 +49,13 @@ Sums = npt.NDArray[np.float64]
 
 Painted = tuple[Any, Any]
 """An albedo, mitsuba.Spectrum, and the point, mitsuba.Point3f, where it was computed."""
+
+
+class Labelling(Protocol):
+    """Computes labels at hits; see `ShapeLabels`."""
+
+    def trace(self, preliminary: Any, hit: Hit, rays: Rays, rotation: Any, relief: ReliefKernel | None) -> list[Any]:
+        """Return channels, mitsuba.Float."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +92,14 @@ class Tracer:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
+        return rays, preliminary, self._points(rays, preliminary, bent)
+
+    def _points(self, rays: Rays, preliminary: Any, bent: bool) -> Hit:
+        """Return the surface points of hits."""
         flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
         si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
         self.refinement.apply(rays.origin, rays.direction, si)
-        return rays, preliminary, make_hit(self.mi, si, self.relief, bent)
+        return make_hit(self.mi, si, self.relief, bent)
 
     def _direct(self, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
         """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`."""
@@ -105,7 +118,7 @@ class Tracer:
     # One sample --------------------------------------------------------------------------------------------------
 
     def centres(
-        self, bounces: Bounces | None, radiance: bool, labels: ShapeLabels | None, progress: Progress | None = None
+        self, bounces: Bounces | None, radiance: bool, labels: Labelling | None, progress: Progress | None = None
     ) -> tuple[list[Image], list[Image]]:
         """Trace the ray through each pixel's centre; `progress` is called after each launch.
 
@@ -131,11 +144,34 @@ class Tracer:
             rows.append(_evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
-        # Launches, row after row, become maps.
-        shape = (camera.height, camera.width)
-        maps = [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
-                for pieces in zip(*rows, strict=True)]  # fmt: skip
+        maps = self._maps(rows)
         return maps[:count_of_parts], maps[count_of_parts:]
+
+    def relabelled(self, channels: list[Image], labels: ShapeLabels) -> list[Image]:
+        """Compute labels, as `centres` does, from other labels of the same hits: nothing is traced."""
+        import drjit as dr
+
+        mi, camera = self.mi, self.sightlines.camera
+        depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
+        rows: list[list[Image]] = []
+        for first, count in _blocks(camera.width * camera.height):
+            own = slice(first, first + count)
+            preliminary = dr.zeros(mi.PreliminaryIntersection3f, count)
+            preliminary.t = mi.Float(np.nan_to_num(depth[own], nan=np.inf))
+            preliminary.prim_index = mi.UInt32(face[own].view(np.uint32))
+            preliminary.prim_uv = mi.Point2f(*(mi.Float(share[own]) for share in place))
+            preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
+            rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
+            hit = self._points(rays, preliminary, True)
+            rotation = self.sightlines.camera_from_model
+            rows.append(_evaluate(labels.trace(preliminary, hit, rays, rotation, self.relief), count))
+        return self._maps(rows)
+
+    def _maps(self, rows: list[list[Image]]) -> list[Image]:
+        """Make maps, shape (H, W), of the channels of launches, row after row."""
+        shape = (self.sightlines.camera.height, self.sightlines.camera.width)
+        return [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
+                for pieces in zip(*rows, strict=True)]  # fmt: skip
 
     def misfits(self, lights: Array, division: int, base: bool) -> MisfitMaps:
         """Trace the misfits for lights, shape (L, 3), camera frame, mm, at the centres of pixels divided both ways.
@@ -175,11 +211,31 @@ class Tracer:
         `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
         """
         height, width = self.sightlines.tiled_size
-        camera, total = self.sightlines.camera, height * width * samples
-        blocks: list[Image] = []
+        camera = self.sightlines.camera
         # Trace: sums over the samples of each block of pixels.
-        for block, (first, count) in enumerate(_blocks(height * width)):
-            lanes = self.sightlines.lanes(first, count, True, seed)
+        blocks = list(_blocks(height * width))
+        lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
+        channels = self._means(lanes, samples, bounces, _share_of(progress, height * width * samples))
+        # Arrange: from tiles to rows, without what lies beyond the frame.
+        maps = untile(channels, (height, width))
+        return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
+
+    def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
+        """Compute what `mean` does, without bounces, at some pixels alone, by number: channels, shape (C, N).
+
+        `tell` is called with how many samples have been traced.
+        """
+        blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
+                  for first, count in _blocks(len(pixels)))  # fmt: skip
+        return self._means(blocks, samples, None, tell)
+
+    def _means(
+        self, blocks: Iterable[tuple[Lanes, int]], samples: int, bounces: Bounces | None, tell: Tell | None
+    ) -> Image:
+        """Compute the channels, shape (C, N), of the mean over the samples of blocks of lanes and their numbers."""
+        means: list[Image] = []
+        traced = 0
+        for block, (lanes, count) in enumerate(blocks):
             drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
             for start, stop in self._runs(samples, count, bounces):
@@ -189,13 +245,12 @@ class Tracer:
                     parts = self._single(lanes, drawer, start, bounces, count, block)
                 added = np.stack(_evaluate(parts, count)).astype(np.float64)
                 sums = added if sums is None else sums + added
-                if progress:
-                    progress(first * samples + count * stop, total, "rendering")
+                traced += count * (stop - start)
+                if tell:
+                    tell(traced)
             assert sums is not None
-            blocks.append((sums / samples).astype(np.float32))
-        # Arrange: from tiles to rows, without what lies beyond the frame.
-        maps = untile(np.concatenate(blocks, axis=1), (height, width))
-        return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
+            means.append((sums / samples).astype(np.float32))
+        return np.concatenate(means, axis=1)
 
     def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
         """Split a pixel's samples into the runs of single launches."""
@@ -281,6 +336,11 @@ def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
     """Split a number of pixels into runs: first, count."""
     for first in range(0, pixels, LANES):
         yield first, min(LANES, pixels - first)
+
+
+def _share_of(progress: Progress | None, total: int) -> Tell | None:
+    """Return what tells `progress` how many samples of a total have been traced."""
+    return progress and (lambda traced: progress(traced, total, "rendering"))
 
 
 def _evaluate(values: list[Any], count: int) -> list[Image]:

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Mask
+
+Pixels = npt.NDArray[np.uint32]
 
 TILE = 4
 """Pixels along a side of the tiles in which several samples a pixel are traced: neighbours hit the same triangles."""
@@ -84,6 +87,8 @@ class Sightlines:
 
     Attributes
     ----------
+    pose : ndarray, shape (4, 4)
+        The given one.
     camera_from_model : mitsuba.Matrix3f
         The rotation alone.
     """
@@ -93,7 +98,7 @@ class Sightlines:
 
         self.mi, self.camera = mi, camera
         self.in_kernel = is_pinhole(camera)
-        self._pose = model_from_camera
+        self.pose = model_from_camera
         # Opaque, so that another camera or pose compiles no new kernel.
         self._origin = mi.Vector3d(*model_from_camera[:3, 3].tolist())
         self._rotation = mi.Matrix3d(model_from_camera[:3, :3].tolist())
@@ -133,6 +138,16 @@ class Sightlines:
             row = index // self._width
             column = index - row * self._width
         return Lanes(column, row, *mi.sample_tea_32(row * self._width + column, salt))
+
+    def lanes_of(self, pixels: Pixels, seed: int) -> Lanes:
+        """Return the lanes of pixels by their numbers, row after row; their sample points are those of `lanes`."""
+        import drjit as dr
+
+        mi = self.mi
+        index, salt = mi.UInt32(pixels), mi.UInt32(seed)
+        dr.make_opaque(salt)
+        row = index // self._width
+        return Lanes(index - row * self._width, row, *mi.sample_tea_32(index, salt))
 
     def sample(self, lanes: Lanes, number: Any) -> tuple[Any, Any]:
         """Return the position, px, of a pixel's sample by its number: uniform, and evenly spread over the numbers."""
@@ -179,14 +194,25 @@ class Sightlines:
 
         Positions outside the round field of view have rays too; NaN where the camera has no sightline.
         """
-        directions = self.camera.unproject(points_px) @ self._pose[:3, :3].T
-        return np.broadcast_to(self._pose[:3, 3], directions.shape), directions
+        directions = self.camera.unproject(points_px) @ self.pose[:3, :3].T
+        return np.broadcast_to(self.pose[:3, 3], directions.shape), directions
 
     def in_view(self, points_px: Array) -> tuple[Array, Array]:
         """Return origins and directions as `in_model` does; NaN outside the round field of view."""
         origins, directions = self.in_model(points_px)
         mask = self.camera.view_mask
         return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
+
+
+def in_tiles(chosen: Mask) -> Pixels:
+    """Return the numbers of the pixels where a map, shape (H, W), is true, tile by tile."""
+    height, width = chosen.shape
+    down, across = -(-height // TILE), -(-width // TILE)
+    whole = np.zeros((down * TILE, across * TILE), dtype=bool)
+    whole[:height, :width] = chosen
+    tile, cell = np.nonzero(whole.reshape(down, TILE, across, TILE).swapaxes(1, 2).reshape(-1, TILE * TILE))
+    row, column = tile // across * TILE + cell // TILE, tile % across * TILE + cell % TILE
+    return (row * width + column).astype(np.uint32)
 
 
 def untile(values: Any, size: tuple[int, int]) -> Any:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtest.rendering import backend, emission, found_highlights, glints, phong, tissue
+from simtest.rendering import adaptive, backend, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
 from simtest.rendering.direct import DirectLight, Material
@@ -20,6 +20,7 @@ from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
+from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
@@ -45,6 +46,7 @@ class _Built:
     base: Any
     base_parameters: Any
     labels: ShapeLabels | None = None
+    edges: MeshEdges | None = None
 
 
 class Session:
@@ -267,6 +269,9 @@ class Session:
             bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
         if effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
+        elif adaptive.applies(self.scene):
+            parts, self._centre = self._adaptive(tracer).render(progress)
+            channels = tracer.relabelled(self._centre, labels) if labels else []
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
@@ -274,6 +279,13 @@ class Session:
         if self.scene.translucency is not None:
             radiance = self._translucent(radiance, channels, self.scene.translucency)
         return radiance, channels
+
+    def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
+        built, mesh = self._built, self._shape.mesh
+        if built.edges is None and mesh is not None:
+            built.edges = MeshEdges(self.mi, built.scene, mesh)
+        labels = ShapeLabels(self.mi, built.scene.shapes()[0], None, curved=False)
+        return adaptive.Adaptive(tracer, self.scene, labels, self._shape, built.edges)
 
     def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
         """Return radiance whose diffuse part has spread below the surface."""

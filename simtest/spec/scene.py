@@ -26,6 +26,11 @@ class Effort(Spec):
     samples_per_pixel: int = Field(1, ge=1, le=4096, description="1: one ray through the pixel's centre")
     path_depth: int = Field(2, ge=2, le=64, description="2: direct light; more adds inter-reflections")
     seed: int = Field(0, ge=0, lt=2**32, description="seed of the samples")
+    adaptive: bool = Field(
+        True,
+        description="of 4 samples or more: whether pixels whose mean follows from the rays through the centres around "
+        "them get no samples; it errs less than samples do",
+    )
 
 
 class KnownSpec(Spec):

@@ -195,7 +195,7 @@ def test_a_painted_albedo_reaches_direct_light_and_bounces(samples, depth):
             "surface": tube,
             "reflectance": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.1}, "diffuse": 0.6},
             "camera": {"width": SIZE, "height": SIZE, "fx": WIDE, "fy": WIDE},
-            "render": {"samples_per_pixel": samples, "path_depth": depth},
+            "render": {"samples_per_pixel": samples, "path_depth": depth, "adaptive": False},
         }
     )
     session = Session(described)
