@@ -206,7 +206,7 @@ def validate(
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
     run = run_experiment(described, Path(out), command, variant, progress, engine or make_engine(workers=workers))
-    return write_report(run.folder)
+    return write_report(run.folder, progress)
 
 
 def _scene(scene: Scene | str | Path, settings: Mapping[str, Any] | None) -> Scene:

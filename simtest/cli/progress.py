@@ -34,26 +34,33 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar while the body runs, and yield the callable that moves it: (done, total, what).
 
-    `afterwards` is what the body does once all steps are done. A single step shows no bar.
+    `afterwards` is what the body does once all steps are done, unless the last step says itself how it ended: with a
+    text that ends in "written". A single step shows no bar. What comes after all steps of a bar, such as the steps of
+    a page, has a bar of its own below.
     """
     from rich import progress as rich
     from rich.console import Console
 
     columns = (
-        rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
-        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+        rich.SpinnerColumn(finished_text=" "), rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(),
+        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
     )  # fmt: skip
     bar = rich.Progress(*columns, console=Console(stderr=True))
     task = bar.add_task("starting", total=None)
     with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
+            nonlocal task
             check()
             if done == total and not bar.live.is_started:
                 return
             # Not before the first step: bad input is reported in one line, without a bar.
             bar.start()
-            bar.update(task, completed=done, total=total, description=afterwards if done == total else what)
+            if done < total and bar.tasks[-1].finished:
+                bar.update(task, description="done")
+                task = bar.add_task(what, total=total)
+            described = afterwards if done == total and not what.endswith("written") else what
+            bar.update(task, completed=done, total=total, description=described)
 
         try:
             yield move

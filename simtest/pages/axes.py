@@ -85,6 +85,23 @@ def _power(value: float) -> str:
     return ("" if digit == "1" else f"{digit}·") + "10" + str(int(power)).translate(_SUPERSCRIPTS)
 
 
+def even_ticks(low: float, high: float, most: int) -> list[Tick]:
+    """Return ticks of a linear axis at multiples of 1, 2, 2.5 or 5 times a power of ten, with at most so many gaps."""
+    low, high = min(low, high), max(low, high)
+    if not high > low:
+        return [(low, f"{low:g}")]
+    least = (high - low) / max(most, 1)
+    power = 10.0 ** np.floor(np.log10(least))
+    step = next(factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
+    first, last = np.ceil(low / step - 1e-6), np.floor(high / step + 1e-6)
+    values = [float(number) * step + 0.0 for number in np.arange(first, last + 1)]  # not -0
+    # As many decimals as tell neighbours apart.
+    decimals = next((n for n in range(9) if abs(step * 10**n - round(step * 10**n)) < 1e-6 * step * 10**n), None)
+    if decimals is None or max(map(abs, values), default=0.0) >= 1e6:
+        return [(value, f"{value:.6g}") for value in values]
+    return [(value, f"{value:.{decimals}f}") for value in values]
+
+
 def finite(values: Iterable[npt.ArrayLike]) -> Array:
     """Return the finite values of several arrays, flattened."""
     parts = [np.asarray(part, dtype=float).ravel() for part in values]

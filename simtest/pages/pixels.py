@@ -3,16 +3,17 @@
 import base64
 import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.pages.sheet import Pixels, Sheet, text_width
 from simtest.pages.style import rgb
 from simtest.runtime.arrays import Array
 
-Pixels = npt.NDArray[np.uint8]
+__all__ = ["Canvas", "Pixels", "Window", "data_address", "displayed", "legend", "png"]
+
 Window = tuple[float, float, float, float]
 GAMMA = 2.2  # frames are linear; they are shown with this display gamma. Isophotes are those of the linear frame
 AVIF_QUALITY, AVIF_SPEED = 42, 10
@@ -38,10 +39,14 @@ class Canvas:
         x0, x1, y0, y1 = window or (0.0, float(columns), 0.0, float(rows))
         self.scale = height / (y1 - y0)
         self.corner = np.array([x0, y0])
-        values = np.rint(255 * displayed(frame)).astype(np.uint8)
+        # Only what shows is brought to the display's values.
+        first, last = max(int(x0) - 1, 0), min(int(np.ceil(x1)) + 1, columns)
+        above, below = max(int(y0) - 1, 0), min(int(np.ceil(y1)) + 1, rows)
+        values = np.rint(255 * displayed(frame[above:below, first:last])).astype(np.uint8)
         values = cv2.cvtColor(values, cv2.COLOR_GRAY2RGB) if values.ndim == 2 else values
         # Pixel centres are at + 0.5 here, and integers in OpenCV.
         shift = 0.5 * (self.scale - 1) - self.scale * self.corner
+        shift += self.scale * np.array([first, above])
         affine = np.array([[self.scale, 0.0, shift[0]], [0.0, self.scale, shift[1]]])
         size = (round((x1 - x0) * self.scale), height)
         how = cv2.INTER_NEAREST if self.scale > 1 else cv2.INTER_AREA
@@ -92,31 +97,31 @@ def _dashes(points: Array) -> list[npt.NDArray[np.int32]]:
 
 def legend(width: int, entries: Sequence[tuple[str, str]]) -> Pixels:
     """Return a white strip, px wide, with (colour, text) entries in as many lines as they need."""
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
-
-    font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), _FONT_PX)
     x, line, drawn = 8, 0, []
     for colour, text in entries:
-        wide = 22 + round(font.getlength(text)) + 14
+        wide = 22 + round(text_width(text, _FONT_PX)) + 14
         if x > 8 and x + wide > width:
             x, line = 8, line + 1
         drawn.append((x, 6 + _LINE_PX * line, colour, text))
         x += wide
-    strip = Image.new("RGB", (width, 12 + _LINE_PX * (line + 1)), "white")
-    pen = ImageDraw.Draw(strip)
+    strip = Sheet.white(width, 12 + _LINE_PX * (line + 1))
     for x, y, colour, text in drawn:
-        pen.rectangle((x, y + 3, x + 13, y + 13), fill=colour)
-        pen.text((x + 20, y), text, fill="#1b1f24", font=font)
-    return np.asarray(strip)
+        strip.box(x, y + 3, x + 14, y + 14, colour)
+        strip.text((x + 20, y), text, _FONT_PX, "#1b1f24", across=0.0, down=0.0)
+    return strip.pixels
 
 
-def write_png(path: Path, picture: Pixels) -> None:
-    """Write a picture, RGB."""
+def png(picture: Pixels) -> bytes:
+    """Return a picture, RGB, as PNG.
+
+    Without filters between neighbours: drawings have flat colours and frames have noise, so that filters make both
+    larger, and take longer than the rest.
+    """
     ordered = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".png", ordered, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    how = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+    done, data = cv2.imencode(".png", ordered, how)
     assert done
-    path.write_bytes(data.tobytes())
+    return data.tobytes()
 
 
 def data_address(picture: Pixels, height: int | None = None) -> str:

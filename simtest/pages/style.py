@@ -1,6 +1,7 @@
 """Colours, symbols and number formats of all pages and figures."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +24,9 @@ TRUTH = "#F5D90A"  # yellow of the truth on top of frames
 
 
 class Symbol(NamedTuple):
-    """One marker, by its name in matplotlib, in plotly and as a character."""
+    """One marker, by its letter in files (matplotlib's), its name in plotly and as a character."""
 
-    matplotlib: str
+    letter: str
     plotly: str
     text: str
 
@@ -87,6 +88,7 @@ def hexadecimal(colour: Sequence[float]) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in colour[:3])
 
 
+@cache
 def rgb(colour: str) -> tuple[int, int, int]:
     """Read a hexadecimal colour: red, green and blue in 0..255."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from scipy.special import stdtrit
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.pages.axes import Axis
@@ -114,6 +113,8 @@ def _aggregate(rows: pl.DataFrame, ask: Ask, is_scattered: bool) -> pl.DataFrame
 
 def _interval(table: pl.DataFrame) -> tuple[Array, Array]:
     """95 % t interval of the mean; its lower end is not drawn below the least value seen."""
+    from scipy.special import stdtrit
+
     n = table["n"].to_numpy().astype(float)
     std = table["std"].cast(pl.Float64).to_numpy()
     y, least = table["y"].cast(pl.Float64).to_numpy(), table["least"].cast(pl.Float64).to_numpy()

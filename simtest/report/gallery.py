@@ -35,17 +35,28 @@ def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folde
     """Write gallery_000.png, ... into a folder, which must exist, and return what the page shows of them."""
 
     def drawn(index: int) -> Shown:
-        parts, legend = draw_item(items[index], colours)
-        gap = np.full((HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
-        whole = np.hstack([part for each in parts for part in (gap, each)][1:])
-        strip = pixels.legend(whole.shape[1], legend)
-        pixels.write_png(folder / f"gallery_{index:03d}.png", np.vstack([whole, strip]))
-        pictures = [(pixels.data_address(part, PAGE_PX), part.shape[1] / part.shape[0]) for part in parts]
-        return Shown(items[index], pictures)
+        shown, content = draw_shown(items[index], colours)
+        (folder / f"{file_name(index)}.png").write_bytes(content)
+        return shown
 
     # OpenCV and the encoders leave Python's lock to others.
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(drawn, range(len(items))))
+
+
+def file_name(index: int) -> str:
+    """Return the name of a frame's picture among the figures, without its suffix."""
+    return f"gallery_{index:03d}"
+
+
+def draw_shown(item: GalleryItem, colours: Mapping[str, str]) -> tuple[Shown, bytes]:
+    """Return what the page shows of a frame, and its picture with legend as PNG."""
+    parts, legend = draw_item(item, colours)
+    gap = np.full((HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
+    whole = np.hstack([part for each in parts for part in (gap, each)][1:])
+    strip = pixels.legend(whole.shape[1], legend)
+    pictures = [(pixels.data_address(part, PAGE_PX), part.shape[1] / part.shape[0]) for part in parts]
+    return Shown(item, pictures), pixels.png(np.vstack([whole, strip]))
 
 
 def anchor(item: GalleryItem, estimate: KeptEstimate) -> Array | None:

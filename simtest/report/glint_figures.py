@@ -5,7 +5,6 @@ from itertools import cycle
 
 import numpy as np
 import polars as pl
-from scipy.special import stdtrit
 
 from simtest.pages.axes import Axis, finite, log_range
 from simtest.pages.chart import Bars, Chart, Mark, Panel
@@ -19,7 +18,6 @@ from simtest.validation.statistics import mean_interval
 LEAST_RADIUS_PX = 2.0
 """Below this radius a visible highlight is measured in too few pixels to judge the law."""
 
-_INDEPENDENT = float(relief_laws.independent_centroid_error(1.0, 1.0))
 _COLOURS = (*ESTIMATOR_COLOURS.values(),)
 _BLUE, _ORANGE = _COLOURS[:2]
 _GLINTS, _VISIBLE = Symbol("o", "circle", "●"), Symbol("^", "triangle-up", "▲")
@@ -127,11 +125,11 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     if rows["setting"].n_unique() < 2:
         return
     labels = symbols(rows["label"].to_list())
-    marks, measured = [], []
+    marks, measured, independent = [], [], float(relief_laws.independent_centroid_error(1.0, 1.0))
     for (name, symbol), colour in zip(labels.items(), cycle(_COLOURS), strict=False):
         groups, own = [], rows.filter(pl.col("label") == name)
         for _, part in own.group_by("setting", maintain_order=True):
-            expected = float(part["cloud_error_law_deg"].to_numpy().mean()) / _INDEPENDENT
+            expected = float(part["cloud_error_law_deg"].to_numpy().mean()) / independent
             groups.append((expected, part["cloud_error_deg"].to_numpy()))
         marks.append(_mean_mark(groups, colour, name, symbol, line=False))
         shares = np.concatenate([values / expected for expected, values in groups])
@@ -163,6 +161,8 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
 
 def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     """Describe the axis ratio of the pooled clouds over the base's curvature, along its principal directions."""
+    from scipy.special import stdtrit
+
     rows = clouds.filter(pl.col("cloud_glints_law").is_not_null() & pl.col("cloud_cov_11").is_not_null())
     groups = rows.with_columns(at=pl.col(KD).round(2)).group_by("label", "at", maintain_order=True)
     points: dict[str, list[tuple[float, float, float]]] = {}

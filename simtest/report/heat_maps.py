@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import polars as pl
 
@@ -13,7 +14,7 @@ from simtest.report.curves import prepared, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
 
-_COLOURS = "cividis"  # colour map; perceptually uniform and colour-blind-safe
+_COLOURS = cv2.COLORMAP_CIVIDIS  # perceptually uniform and colour-blind-safe
 
 _EMPTY, _DARK, _HALF = "#888888", 0.55, 0.49
 """Colour of a cell without a value, share of the scale below which text is white, and half a cell's side."""
@@ -119,6 +120,8 @@ def _share(value: float, span: tuple[float, float]) -> float:
 
 
 def _colour(share: float) -> str:
-    import matplotlib
-
-    return hexadecimal(matplotlib.colormaps[_COLOURS](share)) if np.isfinite(share) else _EMPTY
+    if not np.isfinite(share):
+        return _EMPTY
+    level = np.full((1, 1), min(int(256 * share), 255), np.uint8)
+    blue, green, red = cv2.applyColorMap(level, _COLOURS)[0, 0] / 255
+    return hexadecimal((red, green, blue))

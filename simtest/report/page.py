@@ -1,107 +1,122 @@
-"""Writes the page of a run: figures as PNG, and one HTML file that needs nothing else."""
+"""Draws the page of a run: figures as PNG, and one HTML file that needs nothing else."""
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from simtest.pages import chart_web, pixels, style
 from simtest.pages.html import environment
 from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.error_laws import is_tested, law_results, sentence
-from simtest.report.figure_files import FigureFiles
-from simtest.report.gallery import draw_gallery, isophote_keys
+from simtest.report.figure_files import THREADS, FigureFiles
+from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
 from simtest.report.heat_maps import heat_charts, heat_maps
 from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
-from simtest.report.run_folder import ExperimentSummary, Run, read_run
+from simtest.report.run_folder import ExperimentSummary, GalleryItem, Run
 from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
 from simtest.report.triangle_cost import fineness_charts, read_study
-from simtest.report.view3d import view_3d, view_json, view_picture
+from simtest.report.view3d import View3D, view_3d, view_json
+from simtest.report.view3d_picture import view_picture
 from simtest.report.visible_figures import visible_figures
-from simtest.runtime.files import write_atomically
+from simtest.report.write import Progress
 
 _FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
 
 
-def write_report(run: Path) -> Path:
-    """Write the figures and the page of a run.
-
-    Parameters
-    ----------
-    run : pathlib.Path
-        Run folder with results.parquet, summary.json and, if there is one, gallery/*.npz.
+def draw_page(run: Run, folder: Path, progress: Progress | None = None) -> tuple[str, dict[str, str], int]:
+    """Draw the figures of a run into a folder, which must exist.
 
     Returns
     -------
-    pathlib.Path
-        ``run/index.html``. Beside it, ``run/figures/*.png`` are written anew; pictures of an earlier report go.
-
-    Raises
-    ------
-    InputError
-        If a file of the run is missing or malformed.
+    (str, dict of str to str, int)
+        The page; the SHA-256 of each figure by file name, of which those of an earlier report go; and the steps that
+        `progress` was told of, with the last one, writing the page, still to do.
     """
-    data = read_run(Path(run))
-    folder = data.path / "figures"
-    folder.mkdir(exist_ok=True)
-    for old in folder.glob("*.png"):
-        old.unlink()
-    html = _render(data, folder)
-    page = data.path / "index.html"
-    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
-    return page
+    with ThreadPoolExecutor(THREADS) as pool:
+        figures = FigureFiles(folder, pool, progress)
+        # Stages: describe the sections, draw them, fill in the page.
+        sections = _sections(run, figures)
+        figures.finish()
+        figures.tell("writing the page")
+        return _render(run, sections, figures), figures.hashes, len(figures.work) + 1
 
 
-def _render(run: Run, folder: Path) -> str:
-    """Compute and draw the sections of the page; one without data is empty or None."""
+def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
+    """Compute the sections of the page by name, and start drawing them; one without data is empty or None."""
     colours = style.colours(run.estimators)
-    with ThreadPoolExecutor(2) as pool:
-        # Frames are drawn beside the figures: most of their time is spent outside Python.
-        cards = pool.submit(draw_gallery, run.gallery, colours, folder)
-        figures = FigureFiles(folder, pool)
+    # Frames are drawn beside the figures: most of their time is spent outside Python.
+    cards = [
+        figures.start(f"frame {index + 1}", _draw_frame, figures, index, item, colours)
+        for index, item in enumerate(run.gallery)
+    ]
 
-        # Errors over one quantity and over two, and against their laws.
-        curves = line_figures(run)
-        lines = [(curve, figures.draw(curve.key, [line_chart(curve, colours)])[0]) for curve in curves]
-        relief = [*relief_figures(run, colours), *glint_figures(run), *visible_figures(run)]
-        for each in relief:
-            figures.draw(each.chart.key, [each.chart])
-        paper, results = paper_section(run, colours, figures), law_results(run)
-        laws = figures.draw("laws", law_charts(results)) if is_tested(results) else []
-        maps = heat_maps(run)[:_MAX_HEAT_MAPS]
-        heat = figures.draw("heatmap", heat_charts(maps)) if maps else []
+    # Errors over one quantity and over two, and against their laws.
+    figures.tell("comparing with the laws")
+    curves = line_figures(run)
+    lines = [(curve, figures.draw(curve.key, [line_chart(curve, colours)])[0]) for curve in curves]
+    relief = [*relief_figures(run, colours), *glint_figures(run), *visible_figures(run)]
+    for each in relief:
+        figures.draw(each.chart.key, [each.chart])
+    paper, results = paper_section(run, colours, figures), law_results(run)
+    laws = figures.draw("laws", law_charts(results)) if is_tested(results) else []
+    maps = heat_maps(run)[:_MAX_HEAT_MAPS]
+    heat = figures.draw("heatmap", heat_charts(maps)) if maps else []
 
-        # What runs over anatomies show beside, and those without any curve.
-        surfaces = surface_errors(run, has_figures=bool(curves or maps or paper or relief))
-        boxes = figures.draw("anatomy", [surface_chart(surfaces, colours)]) if surfaces and surfaces.boxes else []
-        study = read_study() if is_anatomical(run) else None
-        fineness = figures.draw("fineness", fineness_charts(study)) if study else []
-        view, still = view_3d(run, colours), ""
-        if view is not None:
-            picture = view_picture(view)
-            figures.write(view.key, picture)
-            figures.json[view.key] = view_json(view)
-            still = pixels.data_address(picture)
+    # What runs over anatomies show beside, and those without any curve.
+    surfaces = surface_errors(run, has_figures=bool(curves or maps or paper or relief))
+    boxes = figures.draw("anatomy", [surface_chart(surfaces, colours)]) if surfaces and surfaces.boxes else []
+    study = read_study() if is_anatomical(run) else None
+    fineness = figures.draw("fineness", fineness_charts(study)) if study else []
+    view = view_3d(run, colours)
+    if view is not None:
+        figures.json[view.key] = view_json(view)
+    still = None if view is None else figures.start(view.key, _draw_view, figures, view)
 
-        headline = sentences.headline(run, curves)
-        headline += ([paper.headline] if paper else []) + ([sentence(results)] if laws else [])
-        summary = run.experiments.get(run.experiment) or ExperimentSummary()
-        template = environment().get_template("run.html.j2")
-        return template.render(
-            run=run, title=summary.title or run.experiment, description=summary.description, headline=headline,
-            paper=paper, laws=laws, law_results=results, law_colours=law_colours(results),
-            lines=[(curve, chart, sentences.measured(curve)) for curve, chart in lines],
-            relief=relief,
-            heat=[(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
-            surfaces=surfaces, boxes=boxes, coverage=coverage(run), study=study, fineness=fineness, pairs=pairs(run),
-            gallery=cards.result(), first=_FIRST_CARDS, isophotes=isophote_keys(run.gallery), truth_colour=style.TRUTH,
-            view=view, still=still, summary=table_rows(run), columns=HEADINGS,
-            length_units=" or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
-            colours={name: colours[name] for name in style.estimator_order(colours)},
-            figures=figures.packed(), plotly=chart_web.packed_plotly() if figures.json else None,
-        )  # fmt: skip
+    headline = sentences.headline(run, curves)
+    headline += ([paper.headline] if paper else []) + ([sentence(results)] if laws else [])
+    return {
+        "headline": headline, "paper": paper, "laws": laws, "law_results": results,
+        "law_colours": law_colours(results),
+        "lines": [(curve, chart, sentences.measured(curve)) for curve, chart in lines], "relief": relief,
+        "heat": [(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
+        "surfaces": surfaces, "boxes": boxes, "coverage": coverage(run), "study": study, "fineness": fineness,
+        "pairs": pairs(run), "cards": cards, "view": view, "still": still, "summary": table_rows(run),
+        "colours": {name: colours[name] for name in style.estimator_order(colours)},
+    }  # fmt: skip
+
+
+def _draw_frame(figures: FigureFiles, index: int, item: GalleryItem, colours: Mapping[str, str]) -> Shown:
+    shown, content = draw_shown(item, colours)
+    figures.write(file_name(index), content)
+    return shown
+
+
+def _draw_view(figures: FigureFiles, view: View3D) -> str:
+    picture = view_picture(view)
+    figures.write(view.key, pixels.png(picture))
+    return pixels.data_address(picture)
+
+
+def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
+    """Fill in the page's template."""
+    summary = run.experiments.get(run.experiment) or ExperimentSummary()
+    cards, still = sections["cards"], sections["still"]
+    return environment().get_template("run.html.j2").render(
+        {
+            **sections,
+            "run": run, "title": summary.title or run.experiment, "description": summary.description,
+            "gallery": [card.result() for card in cards], "still": still.result() if still else "",
+            "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
+            "columns": HEADINGS,
+            "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
+            "figures": figures.packed(), "plotly": chart_web.packed_plotly() if figures.json else None,
+        }
+    )  # fmt: skip

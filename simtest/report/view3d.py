@@ -1,17 +1,15 @@
-"""The 3D view: the visible surface of one gallery item with true and estimated normals, for page and file."""
+"""The 3D view: the visible surface of one gallery item with true and estimated normals, as the page turns it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.pages import chart_png
 from simtest.pages.chart import Mark
 from simtest.pages.chart_web import PlotlyJson, rounded
-from simtest.pages.pixels import GAMMA, Pixels
 from simtest.pages.style import LIGHT, NEUTRAL
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
@@ -21,12 +19,9 @@ _GRID, _NORMALS = 72, 9  # samples of the surface along the longer side, and of 
 _OCCLUSION = 1.25  # factor between the distances of neighbouring samples beyond which there is an edge
 _TRUE, _AT_HIGHLIGHT, _SIGHTLINE = "true normals", "true normal at the highlight", "sightline from the camera"
 _COLOURS = {_TRUE: "#5E8FBF", _SIGHTLINE: NEUTRAL, _AT_HIGHLIGHT: "#C9A800"}
-_CURVATURE = ("#053061", "#2166ac", "#4393c3", "#92c5de", "#d1e5f0", "#f7f7f7", "#fddbc7", "#f4a582", "#d6604d",
-              "#b2182b", "#67001f")  # fmt: skip
+CURVATURE_COLOURS = ("#053061", "#2166ac", "#4393c3", "#92c5de", "#d1e5f0", "#f7f7f7", "#fddbc7", "#f4a582", "#d6604d",
+                     "#b2182b", "#67001f")  # fmt: skip
 """From concave to convex: blue to red."""
-
-_SIZE_INCHES = (7.2, 6.2)
-_DPI = 110
 
 
 class Segments(NamedTuple):
@@ -186,7 +181,7 @@ def view_json(data: View3D) -> PlotlyJson:
     limit = data.curvature_limit
     curved = {
         "intensity": rounded(np.nan_to_num(data.curvature)), "cmin": -limit, "cmax": limit,
-        "colorscale": [[i / 10, colour] for i, colour in enumerate(_CURVATURE)],
+        "colorscale": [[i / 10, colour] for i, colour in enumerate(CURVATURE_COLOURS)],
         "lighting": {"ambient": 0.9, "diffuse": 0.2, "specular": 0.0},
         "colorbar": {"title": {"text": title, "font": {"size": 12}}, "thickness": 12, "len": 0.6, "x": 1.0},
     }  # fmt: skip
@@ -209,42 +204,3 @@ def _lines_json(part: Segments) -> PlotlyJson:
     gaps = np.full_like(part.start, np.nan)
     points = np.stack([part.start, part.end, gaps], axis=1).reshape(-1, 3)
     return _scatter_json(part.name, points, "lines") | {"line": {"color": part.colour, "width": part.width}}
-
-
-@chart_png.settings()
-def view_picture(data: View3D) -> Pixels:
-    """Draw the surface seen from beside the camera, by curvature or shaded by the frame, with its normals; RGB."""
-    from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
-
-    figure = Figure(_SIZE_INCHES, dpi=_DPI)
-    ax = cast(Any, figure.add_axes((0.02, 0.14, 0.82, 0.8), projection="3d", computed_zorder=False))
-    x, y, z = _upright(data.vertices)
-    curved = data.curvature is not None
-    shades = dict(cmap="RdBu_r" if curved else "gray", linewidth=0, antialiased=False, zorder=1)
-    mesh = ax.plot_trisurf(x, y, z, triangles=data.triangles, **shades)
-    if data.curvature is None:
-        mesh.set_array(data.intensity[data.triangles].mean(axis=1) ** (1 / GAMMA))
-        mesh.set_clim(-0.35, 1)
-    else:
-        mesh.set_array(data.curvature[data.triangles].mean(axis=1))
-        mesh.set_clim(-data.curvature_limit, data.curvature_limit)
-        bar = figure.add_axes((0.87, 0.3, 0.02, 0.45))
-        figure.colorbar(mesh, cax=bar, label=f"curvature of larger size (1/{data.unit}), convex positive")
-    for part in data.segments:
-        ends = np.stack([np.stack(_upright(points), axis=-1) for points in (part.start, part.end)], axis=1)
-        width = 0.9 if part.width < 3 else 2.2
-        ax.add_collection3d(Line3DCollection(ends, colors=part.colour, linewidths=width, label=part.name, zorder=2))
-    for (name, positions, colour), marker in zip(data.points, "Do", strict=False):
-        ax.scatter(*_upright(positions), color=colour, marker=marker, s=18, label=name, zorder=3)
-    ax.set_aspect("equal")
-    ax.set(xlabel=f"x ({data.unit})", ylabel=f"z, depth ({data.unit})", zlabel=f"−y, up ({data.unit})")
-    ax.view_init(elev=28, azim=-65)
-    ax.set_title(data.title)
-    figure.legend(*ax.get_legend_handles_labels(), loc="lower center", ncol=3, fontsize=9)
-    return chart_png.pixels(figure)
-
-
-def _upright(points: Array) -> tuple[Array, Array, Array]:
-    """Turn camera coordinates (y down, z forward) into those of the plot (z up)."""
-    return points[:, 0], points[:, 2], -points[:, 1]

@@ -1,6 +1,7 @@
 """Descriptions of a scene's keys, from the schema itself: for axes and captions."""
 
 from functools import cache
+from typing import Any
 
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.scene import Scene
@@ -15,8 +16,14 @@ def describe_key(path: str) -> str:
 
     If several types of a table have the key, the first one in the schema counts.
     """
-    nodes = nodes_at(Scene.model_json_schema(), path.split("."))
+    nodes = nodes_at(_schema(), path.split("."))
     return next((str(node["description"]) for node in nodes if node.get("description")), "")
+
+
+@cache
+def _schema() -> dict[str, Any]:
+    """Return the scene's schema; making it takes a quarter of a second."""
+    return Scene.model_json_schema()
 
 
 def name_key(path: str) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -27,8 +28,10 @@ from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
 from simtest.validation.cases import Case, expand, swept_example
-from simtest.validation.execution import Part, forget, make_rows, parts_of
 from simtest.validation.statistics import summarise
+
+if TYPE_CHECKING:
+    from simtest.validation.execution import Part
 
 GALLERY_ITEMS = 18
 PARTS = "parts"
@@ -214,6 +217,11 @@ def _summary(experiment: Experiment, results: pl.DataFrame, record: RunRecord) -
 
 def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: Progress | None) -> dict[Path, int]:
     """Run the cases that are not done yet; return how many of each folder were done before."""
+    if not jobs:
+        return {}
+    # Imported here: finished runs need no renderer.
+    from simtest.validation.execution import forget, make_rows, parts_of
+
     total = sum(case.realisations for job in jobs for case in job.cases)
     missing = {job.folder: job.missing() for job in jobs}
     # Split the missing cases into parts, which an engine may run in any order.
@@ -228,7 +236,8 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {case: {} for case in waiting}
     # Progress counts the realisations of earlier, stopped runs as done.
     done = total - sum(job.cases[index].realisations for job in jobs for index in missing[job.folder])
-    name = parts[0][2].case.setting if parts else ""
+    names = _told([part.case for *_, part in parts])
+    name = names[0] if names else ""
 
     def step() -> None:
         nonlocal done
@@ -237,7 +246,7 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
             progress(done, total, name)
 
     if progress and parts:
-        progress(done, total, name)
+        progress(done, total, f"starting with {name}")
     # Parts come back in any order.
     for number, rows in engine.run(make_rows, [part for *_, part in parts], step):
         folder, index = case = case_of[number]
@@ -246,11 +255,28 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
         if len(made[case]) == waiting[case]:
             rows = pl.concat([rows for _, rows in sorted(made.pop(case).items())])
             write_atomically(_part_file(folder / PARTS, index), rows.write_parquet)
-        name = parts[min(number + 1, len(parts) - 1)][2].case.setting
+        name = names[min(number + 1, len(parts) - 1)]
+        # Tell what comes now, before it is done.
+        if progress and done < total:
+            progress(done, total, name)
     forget()
-    if progress and jobs:
+    if progress:
         progress(total, total, "done")
     return {job.folder: len(job.cases) - len(missing[job.folder]) for job in jobs}
+
+
+def _told(cases: Sequence[Case]) -> list[str]:
+    """Return what the bar tells while each case runs: its setting, and where an anatomy must be made first."""
+    made: set[str] = set()
+    names = []
+    for case in cases:
+        surface = case.data.get("surface", {})
+        is_anatomy = surface.get("type") == "anatomy"
+        shape = json.dumps([surface.get(key) for key in ("path", "seed", "recipe")], default=str)
+        names.append(case.setting + (": making the surface" if is_anatomy and shape not in made else ""))
+        if is_anatomy:
+            made.add(shape)
+    return names
 
 
 def _in_gallery(cases: list[Case]) -> set[int]:

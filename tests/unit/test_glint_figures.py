@@ -7,8 +7,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from simtest.report import write_report
 from simtest.report.glint_figures import LEVEL, glint_figures, pooled_ratio
-from simtest.report.page import write_report
 from simtest.report.relief_figures import KD
 from simtest.report.run_folder import Run, completed
 from simtest.report.visible_figures import visible_figures

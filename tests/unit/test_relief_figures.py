@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.report.page import write_report
+from simtest.report import write_report
 from simtest.report.relief_figures import KD, relief_figures
 from simtest.report.run_folder import Run, completed
 from simtest.spec import load_experiment

@@ -1,6 +1,7 @@
 """The section of the published protocol: the article's statements, figures and the pipeline in pictures."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 from simtest.pages import chart_png, pixels, style
@@ -24,8 +25,13 @@ class PaperSection:
     because: list[tuple[str, str]]  # statements, and the reason why they differ
     isocurves: list[Chart]
     stages: Stages | None
-    pictures: list[str]  # of the stages, as data addresses
+    drawn: Future[list[str]] | None
     sweeps: list[tuple[SweepFigure, Chart]]
+
+    @property
+    def pictures(self) -> list[str]:
+        """Pictures of the stages, as data addresses."""
+        return self.drawn.result() if self.drawn else []
 
 
 def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> PaperSection | None:
@@ -35,14 +41,20 @@ def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> P
         return None
     sweeps = [(figure, files.draw(figure.key, [sweep_chart(figure, colours)])[0]) for figure in figures]
     curves = files.draw("isocurves", isocurve_charts(isocurve_figure()))
-    rows, kept, pictures = statements(figures), stages(run), []
+    rows, kept, drawn = statements(figures), stages(run), None
     if kept is not None:
-        whole, parts = chart_png.draw(stage_charts(kept, colours.get("circle_pose", style.NEUTRAL)))
-        files.write("pipeline", whole)
-        for i, part in enumerate(parts, 1):
-            files.write(f"pipeline_{i}", part)
-        pictures = [pixels.data_address(part) for part in parts]
-    return PaperSection(_headline(rows), rows, _because(rows), curves, kept, pictures, sweeps)
+        charts = stage_charts(kept, colours.get("circle_pose", style.NEUTRAL))
+        drawn = files.start("pipeline", _draw_stages, charts, files)
+    return PaperSection(_headline(rows), rows, _because(rows), curves, kept, drawn, sweeps)
+
+
+def _draw_stages(charts: list[Chart], files: FigureFiles) -> list[str]:
+    """Write the stages in one file and in a file each, and return them as data addresses."""
+    whole, parts = chart_png.draw(charts)
+    files.write("pipeline", pixels.png(whole))
+    for i, part in enumerate(parts, 1):
+        files.write(f"pipeline_{i}", pixels.png(part))
+    return [pixels.data_address(part) for part in parts]
 
 
 def _headline(rows: Sequence[Statement]) -> str:

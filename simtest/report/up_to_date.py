@@ -1,0 +1,67 @@
+"""Tells whether a run's page is up to date: what it was made of, and its figures, stand in a note at its end."""
+
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+from simtest.runtime.provenance import file_hash, source_hash, versions
+
+_OPEN, _CLOSE = "<!-- made of ", " -->\n"
+_PACKAGE = Path(__file__).resolve().parents[1]
+_TEMPLATES = ("*.j2", "*.json", "*.zz")
+_DRAWING = ("pillow", "jinja2", "matplotlib")  # whose versions change a page, beside those that change results
+
+
+def page_key(run: Path) -> str:
+    """Return a hash of all that a run's page is made of: results, summary, frames, simtest's code, and versions.
+
+    Files that are missing count as such; `read_run` refuses them.
+    """
+    files = [run / "results.parquet", run / "summary.json", *sorted((run / "gallery").glob("[!.]*.npz"))]
+    content = {str(file.relative_to(run)): file_hash(file) if file.is_file() else None for file in files}
+    return _hash({"files": content, "code": _code(), "versions": versions() | _drawing_versions()})
+
+
+def signed(html: str, key: str, figures: Mapping[str, str]) -> str:
+    """Return a page with its note: the key, and the SHA-256 of the page itself and of its figures by file name."""
+    digest = hashlib.sha256(html.encode()).hexdigest()
+    note = json.dumps({"key": key, "page": digest, "figures": dict(sorted(figures.items()))}, separators=(",", ":"))
+    return f"{html}{_OPEN}{note}{_CLOSE}"
+
+
+def is_up_to_date(run: Path, key: str) -> bool:
+    """Return whether a run's page was made of what `key` stands for, and it and all its figures are still as made."""
+    try:
+        html, found, end = (run / "index.html").read_text(encoding="utf-8").rpartition(_OPEN)
+        if not found or not end.endswith(_CLOSE):
+            return False
+        note = json.loads(end.removesuffix(_CLOSE))
+        if note["key"] != key or note["page"] != hashlib.sha256(html.encode()).hexdigest():
+            return False
+        return all(file_hash(run / "figures" / name) == digest for name, digest in note["figures"].items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+@cache
+def _code() -> str:
+    """Return a hash of simtest's source and of what its pages are filled into."""
+    files = sorted(file for pattern in _TEMPLATES for file in _PACKAGE.rglob(pattern))
+    return _hash({"source": source_hash()} | {str(file.relative_to(_PACKAGE)): file_hash(file) for file in files})
+
+
+def _drawing_versions() -> dict[str, str]:
+    found = {}
+    for name in _DRAWING:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def _hash(content: object) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,52 @@
+"""Writes the page of a run, where it is not up to date."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from simtest.report.up_to_date import is_up_to_date, page_key, signed
+from simtest.runtime.files import write_atomically
+
+Progress = Callable[[int, int, str], None]
+"""Called with steps done, steps in all, and what is done."""
+
+
+def write_report(run: Path, progress: Progress | None = None) -> Path:
+    """Write the figures and the page of a run; what is up to date stays as it is.
+
+    Parameters
+    ----------
+    run : pathlib.Path
+        Run folder with results.parquet, summary.json and, if there is one, gallery/*.npz.
+    progress : callable, optional
+        Called with steps done, steps in all (a figure or frame each, and the page), and what is done; what it raises
+        stops the report, and the page stays the earlier one.
+
+    Returns
+    -------
+    pathlib.Path
+        ``run/index.html``. Beside it, ``run/figures/*.png`` are written anew; pictures of an earlier report go.
+
+    Raises
+    ------
+    InputError
+        If a file of the run is missing or malformed.
+    """
+    run = Path(run)
+    page, key = run / "index.html", page_key(run)
+    if is_up_to_date(run, key):
+        return page
+    # Imported here: a page that is up to date needs none of what draws it.
+    from simtest.report.page import draw_page
+    from simtest.report.run_folder import read_run
+
+    if progress:
+        progress(0, 1, "reading the results")
+    data = read_run(run)
+    folder = run / "figures"
+    folder.mkdir(exist_ok=True)
+    html, figures, steps = draw_page(data, folder, progress)
+    # The page comes last, so that a stopped report leaves the earlier one.
+    write_atomically(page, lambda part: part.write_text(signed(html, key, figures), encoding="utf-8"))
+    if progress:
+        progress(steps, steps, "page written")
+    return page
