@@ -22,6 +22,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
+from simtest.surfaces.components import Components, chosen, components, solve3
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.stalk import Stalk
@@ -276,6 +277,21 @@ class Tube:
         moved = self._with_stalks(Jet(position, first, second, none, none, none))
         return moved.f, moved.u, moved.v
 
+    def _tangent_components(self, u: Array, v: Array) -> tuple[Components, Components, Components]:
+        """Return the components of `tangents`: P, P_u and P_v by x, y and z."""
+        if self._stalks:
+            position, first, second = self.tangents(u, v)
+            return components(position), components(first), components(second)
+        r, (psi, bend, _) = self.radius(u, v, second=False), self.heading(u)
+        s, c, sv, cv = np.sin(psi), np.cos(psi), np.sin(v), np.cos(v)
+        centre, rho = self.centreline(u), (cv * c, sv, -cv * s)
+        along, tau = 1 - bend * r.f * cv, (-sv * c, cv, sv * s)
+        return (
+            (centre[:, 0] + r.f * rho[0], r.f * rho[1], centre[:, 2] + r.f * rho[2]),
+            (along * s + r.u * rho[0], r.u * rho[1], along * c + r.u * rho[2]),
+            (r.v * rho[0] + r.f * tau[0], r.v * rho[1] + r.f * tau[1], r.v * rho[2] + r.f * tau[2]),
+        )
+
     def jet(self, u: Array, v: Array) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
         r = self.radius(u, v)
@@ -341,24 +357,25 @@ class Tube:
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
+        source, towards = components(origins[active]), components(directions[active])
         for _ in range(NEWTON_STEPS):
-            p, pu, pv = self.tangents(u[active], v[active])
-            miss = p - origins[active] - t[active, None] * directions[active]
-            done = np.einsum("ni,ni->n", miss, miss) < NEWTON_TOLERANCE_MM**2
+            p, pu, pv = self._tangent_components(u[active], v[active])
+            x, y, z = (a - b - t[active] * c for a, b, c in zip(p, source, towards, strict=True))
+            # The linear system P_u du + P_v dv - direction dt = -miss, for -du, -dv and dt
+            du, dv, dt = solve3(pu, pv, towards, (x, y, z))
+            done = x * x + y * y + z * z < NEWTON_TOLERANCE_MM**2
             found[active[done]] = True
-            # The others go on.
-            active, pu, pv, miss = active[~done], pu[~done], pv[~done], miss[~done]
-            if not active.size:
-                break
-            # The linear system P_u du + P_v dv - direction dt = -miss
-            du, dv, dt = _solve3(pu, pv, -directions[active], -miss)
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
-            u[active] += scale * du
-            v[active] += scale * dv
+            scale[done] = 0.0
+            u[active] -= scale * du
+            v[active] -= scale * dv
             t[active] += scale * dt
-            # A ray that leaves the neighbourhood of its hit is given up.
-            active = active[np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM]
+            # A ray that leaves the neighbourhood of its hit is given up; the others go on.
+            kept = np.flatnonzero(~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM))
+            active, source, towards = active[kept], chosen(source, kept), chosen(towards, kept)
+            if not active.size:
+                break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
         return np.where(found & inside, t, np.nan), u, v
 
@@ -366,14 +383,3 @@ class Tube:
 def _powers(chebyshev: Array) -> Array:
     """Return the coefficients of powers, the lowest first, of a series of Chebyshev polynomials."""
     return np.asarray(np.polynomial.chebyshev.cheb2poly(chebyshev))
-
-
-def _solve3(a: Array, b: Array, c: Array, right: Array) -> tuple[Array, Array, Array]:
-    """Solve [a b c] x = right by Cramer's rule, all of shape (N, 3); inf or NaN for a singular matrix."""
-    bc = np.cross(b, c)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / np.einsum("ni,ni->n", a, bc)
-        x = np.einsum("ni,ni->n", right, bc) * inverse
-        y = np.einsum("ni,ni->n", right, np.cross(c, a)) * inverse
-        z = np.einsum("ni,ni->n", right, np.cross(a, b)) * inverse
-    return x, y, z
