@@ -48,7 +48,7 @@ def test_blocks_give_what_one_piece_gives(spec, count, monkeypatch):
     hits = hits_of(surface, origins, directions) if count else RayHits(np.empty(0), np.empty(0, int), np.empty((0, 2)))
     whole = exact.solve(surface, origins, directions, hits)
     blocks = block_truth.solve(surface, origins, directions, hits)
-    assert count < 2 or 0 < whole.valid.sum()
+    assert count < 2 or whole.valid.sum() > 0
     for field in fields(SurfacePoints):
         one, other = getattr(whole, field.name), getattr(blocks, field.name)
         assert (one.shape, one.dtype) == (other.shape, other.dtype)
