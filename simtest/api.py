@@ -1,4 +1,8 @@
-"""The workflows behind the commands: render a labelled frame, run an experiment with its report, reconstruct a file."""
+"""The workflows behind the commands: render a labelled frame, run an experiment with its report, reconstruct a file.
+
+Each imports what it needs when it is called: the renderer, the figures and SciPy are slow to load, and no workflow
+needs them all.
+"""
 
 import warnings
 from collections.abc import Mapping
@@ -7,17 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
-from simtest.reconstruction import reconstruct
-from simtest.runtime.engines import Engine, make_engine
-from simtest.runtime.files import make_folder, write_json
-from simtest.simulation.labelled_frame import LabelledFrame, make_frame
-from simtest.simulation.viewpoints import SampledViews
-from simtest.spec import Experiment, Scene, load_experiment, load_scene
-from simtest.validation.runner import Progress
 
 if TYPE_CHECKING:
+    from simtest.reconstruction import reconstruct
     from simtest.reconstruction.description import PictureRecord
     from simtest.reconstruction.picture import Options
+    from simtest.runtime.engines import Engine
+    from simtest.simulation.labelled_frame import LabelledFrame
+    from simtest.simulation.viewpoints import SampledViews
+    from simtest.spec import Experiment, Scene
+    from simtest.validation.runner import Progress
+
+_HOME = {"LabelledFrame": "simtest.simulation.labelled_frame", "reconstruct": "simtest.reconstruction"}
+"""Names of other modules that are public here, loaded at first use."""
 
 __all__ = [
     "Extras",
@@ -37,11 +43,11 @@ TRIES = 10
 
 
 def render(
-    scene: Scene | str | Path,
+    scene: "Scene | str | Path",
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
-    progress: Progress | None = None,
-) -> LabelledFrame:
+    progress: "Progress | None" = None,
+) -> "LabelledFrame":
     """Render a scene with its ground truth.
 
     Parameters
@@ -66,11 +72,13 @@ def render(
     BackendError
         If the rendering backend cannot be used.
     """
+    from simtest.simulation.labelled_frame import make_frame
+
     return make_frame(_scene(scene, settings), variant, progress)
 
 
 def export(
-    scene: Scene | str | Path,
+    scene: "Scene | str | Path",
     out: str | Path,
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
@@ -104,14 +112,14 @@ def export(
 
 
 def sample_views(
-    scene: Scene | str | Path,
+    scene: "Scene | str | Path",
     out: str | Path,
     count: int = 50,
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
-    progress: Progress | None = None,
+    progress: "Progress | None" = None,
     along: tuple[float, float] | None = None,
-) -> SampledViews:
+) -> "SampledViews":
     """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
 
     At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
@@ -142,6 +150,7 @@ def sample_views(
     BackendError
         If the rendering backend cannot be used.
     """
+    from simtest.runtime.files import make_folder, write_json
     from simtest.simulation.view_files import ViewWriter
     from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
@@ -158,14 +167,14 @@ def sample_views(
 
 
 def validate(
-    experiment: Experiment | str | Path,
+    experiment: "Experiment | str | Path",
     out: str | Path,
     settings: Mapping[str, Any] | None = None,
     command: str = "",
     variant: str | None = None,
-    progress: Progress | None = None,
+    progress: "Progress | None" = None,
     workers: int = 1,
-    engine: Engine | None = None,
+    engine: "Engine | None" = None,
 ) -> Path:
     """Run an experiment and write its report.
 
@@ -200,8 +209,9 @@ def validate(
     BackendError
         If the rendering backend cannot be used.
     """
-    # Imported here: the figures' libraries are slow to load and rendering alone does not need them.
     from simtest.report import write_report
+    from simtest.runtime.engines import make_engine
+    from simtest.spec import Experiment, load_experiment
     from simtest.validation.runner import run_experiment
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
@@ -209,7 +219,17 @@ def validate(
     return write_report(run.folder, progress)
 
 
-def _scene(scene: Scene | str | Path, settings: Mapping[str, Any] | None) -> Scene:
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":
+    from simtest.spec import Scene, load_scene
+
     return scene if isinstance(scene, Scene) else load_scene(scene, settings)
 
 
@@ -261,8 +281,6 @@ def reconstruct_picture(
     from simtest.reconstruction.image_io import read_picture
     from simtest.reconstruction.output_files import write_outputs
     from simtest.reconstruction.picture import NOTHING, read_calibration, reconstruct_values
-    from simtest.validation.depth_maps import depths_at
-    from simtest.validation.reference_surface import compare, load_reference
 
     extras = extras or Extras()
     # read
@@ -270,7 +288,11 @@ def reconstruct_picture(
     calibration, cautions = read_calibration(options, picture)
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
-    reference = load_reference(extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm)
+    reference = None
+    if extras.reference is not None or extras.pose is not None:
+        from simtest.validation.reference_surface import load_reference
+
+        reference = load_reference(extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm)
     # linear light, detect, estimate, describe
     record = reconstruct_values(str(image), picture, calibration, options, cautions)
     if not record.specularities:
@@ -278,9 +300,13 @@ def reconstruct_picture(
         record = replace(record, warnings=[*record.warnings, NOTHING])
     depth = None
     if extras.depth is not None:
+        from simtest.validation.depth_maps import depths_at
+
         peaks = [spot.peak_px for spot in record.specularities]
         depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale_mm)
     if reference is not None:
+        from simtest.validation.reference_surface import compare
+
         record = compare(record, reference)
     # write
     return record, write_outputs(out, record, picture, depth)

@@ -4,7 +4,7 @@ from typing import NotRequired, TypedDict
 
 from pydantic import JsonValue
 
-from simtest.spec.camera_spec import CameraDescription
+from simtest.spec.camera_tables import CameraDescription
 
 
 class AnatomyMeta(TypedDict):

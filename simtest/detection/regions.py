@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
+from simtest.geometry import pixel_sets
 from simtest.runtime.arrays import Array, Image, Mask
 
 EXPANSION = 2.0
@@ -22,8 +22,6 @@ MAX_PEAKS = 2000
 
 NOISE_FREE_SHARE = 1e-3
 """Least contrast where the noise is 0, as a share of the frame's maximum."""
-
-_AROUND = np.ones((3, 3), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -115,8 +113,8 @@ def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tup
     rows, columns = np.nonzero(maxima)
     if len(rows) > MAX_PEAKS:
         # One pixel for each plateau: clipped ones must not crowd out the other peaks.
-        labels, _ = ndimage.label(maxima, np.ones((3, 3)))
-        _, first = np.unique(labels[rows, columns], return_index=True)
+        labels = pixel_sets.connected(maxima, diagonally=True)
+        first = np.sort(np.unique(labels[rows, columns], return_index=True)[1])
         rows, columns = rows[first], columns[first]
     order = np.argsort(-image[rows, columns], kind="stable")[:MAX_PEAKS]
     return [(int(rows[i]), int(columns[i])) for i in order]
@@ -135,14 +133,14 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
         y0, y1 = max(row - half, 0), min(row + half + 1, rows)
         x0, x1 = max(column - half, 0), min(column + half + 1, columns)
         window = image[y0:y1, x0:x1]
-        labels, _ = ndimage.label(window >= HIGHLIGHT_ISOVALUE * peak)
+        labels = pixel_sets.connected(window >= HIGHLIGHT_ISOVALUE * peak)
         mask = labels == labels[row - y0, column - x0]
         if float(window[mask].max()) > peak:
             return None
         edges = ((mask[0], y0 == 0), (mask[-1], y1 == rows), (mask[:, 0], x0 == 0), (mask[:, -1], x1 == columns))
         touched = [at_border for line, at_border in edges if line.any()]
         if all(touched):
-            cut = seen is not None and bool((ndimage.binary_dilation(mask, _AROUND) & ~seen[y0:y1, x0:x1]).any())
+            cut = seen is not None and bool((pixel_sets.dilated(mask) & ~seen[y0:y1, x0:x1]).any())
             return Component(mask, x0, y0, closed=not touched and not cut)
         half *= 2
 

@@ -3,11 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric
-from simtest.geometry import Array, Mask
+from simtest.geometry import Array, Mask, chi_squared
 from simtest.geometry.vectors import tangent_coordinates
 
 RINGS, SECTORS = 6, 8
@@ -50,7 +49,7 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
     used = count >= MIN_IN_BIN
     mean = total[used] / count[used]
     allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
-    return bool(np.sum(mean**2 / allowed) > chi2.ppf(1 - LEVEL, np.count_nonzero(used)))
+    return bool(np.sum(mean**2 / allowed) > chi_squared.quantile(1 - LEVEL, int(np.count_nonzero(used))))
 
 
 def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:

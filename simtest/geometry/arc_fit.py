@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from simtest.errors import Failure, Reason
 from simtest.geometry.ellipse_fit import MAX_AXIS_RATIO, FittedConic, fit_ellipse
@@ -63,6 +62,9 @@ def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
     centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
     L = np.linalg.cholesky(C[:2, :2] / -(C[2, 2] + C[:2, 2] @ centre))
     first = np.array([*centre, L[0, 0], L[1, 0], L[1, 1]])
+    # Imported here: it takes longer to load than a picture to reconstruct, and not every picture has arcs.
+    from scipy.optimize import least_squares
+
     # refine by Levenberg and Marquardt's method
     with np.errstate(all="ignore"):
         # Residuals that are not finite make least_squares raise a ValueError.

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import ndimage
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
+from simtest.geometry import pixel_sets
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.level_sets import Crossings, LevelSet
 from simtest.runtime.arrays import Array, Image, Mask
@@ -223,10 +223,10 @@ def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
     """Return the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
     if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
         return None
-    whole = clipped | ndimage.binary_closing(clipped, np.ones((3, 3), dtype=bool))
+    whole = pixel_sets.closed(clipped)
     if not whole[row, column]:
         return None
-    labels, _ = ndimage.label(whole, np.ones((3, 3)))
+    labels = pixel_sets.connected(whole, diagonally=True)
     plateau = np.asarray(labels == labels[row, column])
     return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX and (plateau & clipped).any() else None
 

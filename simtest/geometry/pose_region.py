@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
+from simtest.geometry import chi_squared
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, Mask
 
@@ -54,7 +54,7 @@ class PoseRegion:
 
     def contains(self, normals: npt.ArrayLike, confidence: float = CONFIDENCE) -> Mask:
         """Return which normals, shape (..., 3), lie in the region that holds the truth with a given confidence."""
-        return np.asarray(self.statistic(normals) <= stats.chi2.ppf(confidence, 2))
+        return np.asarray(self.statistic(normals) <= chi_squared.quantile(confidence, 2))
 
 
 def _products(u: Array, v: Array) -> Array:

@@ -14,7 +14,6 @@ from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.image_io import is_coloured
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, SMOOTHING_BY_COLOUR_PX, run_pipeline
 from simtest.runtime.arrays import Image
-from simtest.spec import load_calibration
 
 DETECTORS = ("auto", "colour", "peaks")
 
@@ -84,6 +83,9 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
     if the camera's file is malformed, or states the response and the options do too.
     """
     if options.camera is not None:
+        # Imported here: the models of files are slow to load, and a field of view needs none.
+        from simtest.spec.calibration_file import load_calibration
+
         calibration, cautions = load_calibration(options.camera), []
     else:
         assert options.fov_deg is not None

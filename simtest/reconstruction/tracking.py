@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.runtime.arrays import Array
@@ -95,6 +94,9 @@ class Tracker:
 
     def update(self, positions_px: Sequence[npt.ArrayLike]) -> list[int]:
         """Return the track of each specularity of the next frame, by their positions, px."""
+        # Imported here: slow to load, and single pictures have no tracks.
+        from scipy.optimize import linear_sum_assignment
+
         points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)
         # continue tracks

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtest.rendering import adaptive, backend, emission, found_highlights, glints, phong, tissue
+from simtest.rendering import adaptive, backend, block_truth, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
 from simtest.rendering.direct import DirectLight, Material
@@ -385,7 +385,7 @@ class Session:
         if stride == 1:
             # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
             hits, shading, geometric = as_hits(self._centre_hits())
-            points = exact.solve(self.surface, *self.sightlines.in_view(pixels), hits)
+            points = block_truth.solve(self.surface, *self.sightlines.in_view(pixels), hits)
         else:
             points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])

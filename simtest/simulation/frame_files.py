@@ -10,6 +10,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
+from simtest.runtime.array_files import write_arrays
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
 from simtest.simulation.camera_chain import to_uint8
@@ -55,7 +56,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     try:
         write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
         write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
-        write_atomically(files[2], lambda part: np.savez_compressed(part, allow_pickle=False, **_truth(frame)))
+        write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
         write_json(files[3], _description(frame))
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
         if _is_calibrated(frame.scene):

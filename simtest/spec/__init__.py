@@ -3,24 +3,51 @@
 `scene` gathers surface, reflectance, rig, camera and sensor; `experiment`, `dataset_recipe` and `profile` say which
 scenes are rendered; `calibration_file` and `camera_spec` read cameras, with `camera_formats` for files of others.
 `spec_model` is the base of all models, `toml_files` reads and writes TOML.
+
+Names are loaded at first use: a command needs few of the models, and making one takes milliseconds.
 """
 
-from simtest.spec.calibration_file import CalibrationSpec, load_calibration
-from simtest.spec.camera_spec import CameraSpec, camera_table, camera_toml, describe_camera, load_camera, save_camera
-from simtest.spec.dataset_recipe import Dataset, load_dataset
-from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
-from simtest.spec.profile import Profile, ProfileEntry, experiments_of, load_profile
-from simtest.spec.rig import Emission, LightSpec, Rig
-from simtest.spec.scene import Scene, load_scene, scene_from_dict
-from simtest.spec.surface import (
-    AnatomySurface,
-    CylinderSurface,
-    PlaneSurface,
-    QuadricSurface,
-    SphereSurface,
-    Surface,
-)
-from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from simtest.spec.calibration_file import CalibrationSpec, load_calibration
+    from simtest.spec.camera_spec import CameraSpec, load_camera, save_camera
+    from simtest.spec.camera_tables import camera_table, camera_toml, describe_camera
+    from simtest.spec.dataset_recipe import Dataset, load_dataset
+    from simtest.spec.experiment import Experiment, Group, Uniform, load_experiment
+    from simtest.spec.profile import Profile, ProfileEntry, experiments_of, load_profile
+    from simtest.spec.rig import Emission, LightSpec, Rig
+    from simtest.spec.scene import Scene, load_scene, scene_from_dict
+    from simtest.spec.surface import (
+        AnatomySurface,
+        CylinderSurface,
+        PlaneSurface,
+        QuadricSurface,
+        SphereSurface,
+        Surface,
+    )
+    from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
+
+_HOMES = {
+    "simtest.spec.calibration_file": ("CalibrationSpec", "load_calibration"),
+    "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
+    "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
+    "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
+    "simtest.spec.experiment": ("Experiment", "Group", "Uniform", "load_experiment"),
+    "simtest.spec.profile": ("Profile", "ProfileEntry", "experiments_of", "load_profile"),
+    "simtest.spec.rig": ("Emission", "LightSpec", "Rig"),
+    "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
+    "simtest.spec.surface": (
+        "AnatomySurface",
+        "CylinderSurface",
+        "PlaneSurface",
+        "QuadricSurface",
+        "SphereSurface",
+        "Surface",
+    ),
+    "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AnatomySurface",
@@ -57,3 +84,17 @@ __all__ = [
     "save_camera",
     "scene_from_dict",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, CameraSpec, is_toml, load_camera
 from simtest.spec.falloff import CosineProfile, Profile
-from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
 from simtest.spec.spec_model import Coordinate, Millimetres, Spec, validate
 from simtest.spec.toml_files import read_toml
@@ -73,7 +72,12 @@ class CalibrationSpec(Spec):
         """Return the priors on lights, distance and lobe."""
         rig, exponent = self.rig, self.surface.phong_exponent
         distance = None if rig.distance_mm is None else Normal(rig.distance_mm, rig.distance_sd_mm)
-        lobe = None if exponent is None else exactly(PhongReflectance(exponent=exponent).lobe_curvature)
+        if exponent is None:
+            return Priors(rig.lights_mm, distance)
+        # Imported here: the reflectances are slower to load than the whole calibration.
+        from simtest.spec.reflectance import PhongReflectance
+
+        lobe = exactly(PhongReflectance(exponent=exponent).lobe_curvature)
         return Priors(rig.lights_mm, distance, lobe)
 
 

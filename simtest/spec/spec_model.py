@@ -30,7 +30,7 @@ Curvature = Annotated[float, Field(ge=-10, le=10)]
 class Spec(BaseModel):
     """Base of all specification models: frozen, no unknown keys, no NaN or infinity, no text where a number belongs."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False, defer_build=True)
 
     @model_validator(mode="before")
     @classmethod

@@ -5,7 +5,6 @@ first principal direction.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import Array, IntArray
 from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
@@ -38,6 +37,9 @@ def placement(distance_mm: float, tilt_deg: float, azimuth_deg: float, spin_deg:
     The anchor is (0, 0, distance); its normal is (0, 0, -1) leaned by `tilt_deg` towards image direction
     `azimuth_deg`; at tilt 0 the model's x axis is image direction `spin_deg`.
     """
+    # Imported here: slow to load, and not every command that imports surfaces makes one.
+    from scipy.spatial.transform import Rotation
+
     # frame at tilt 0: x along spin, z towards the camera
     tilt, azimuth, spin = np.radians([tilt_deg, azimuth_deg, spin_deg])
     x = np.array([np.cos(spin), np.sin(spin), 0.0])

@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 
 import numpy as np
-from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, Mask
@@ -294,6 +292,10 @@ def _make_field(spec: Relief) -> ReliefField:
 
 
 def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
+    # Imported here: slow to load, and smooth scenes have no relief.
+    from scipy import ndimage
+    from scipy.spatial.transform import Rotation
+
     rng = np.random.Generator(np.random.SFC64(branch))
     # A uniformly random rotation; by itself, as scipy changed the name of its generator's argument.
     turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
@@ -334,6 +336,9 @@ def _shell_noise(rng: np.random.Generator, width: float) -> Array:
 
 def _shaped(g: Array, kind: str) -> Array:
     """Turn a gaussian field into crests and grooves, or into pits."""
+    # Imported here: slow to load, and smooth scenes have no relief.
+    from scipy import ndimage
+
     shaped = -np.sqrt(g**2 + RIDGE_ROUNDING**2) if kind == "ridged" else -(np.maximum(g - PIT_THRESHOLD, 0) ** 2)
     shaped = ndimage.gaussian_filter(shaped, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
     return np.asarray(shaped - shaped.mean())
@@ -369,6 +374,9 @@ def _diffused(coefficients: Array, lattice_from_model: Array, length: float) -> 
 
 def _node_values(coefficients: Array) -> Array:
     """Return a spline's values at its nodes."""
+    # Imported here: slow to load, and smooth scenes have no relief.
+    from scipy import ndimage
+
     for axis in range(3):
         coefficients = ndimage.convolve1d(coefficients, [1 / 6, 4 / 6, 1 / 6], axis=axis, mode="wrap")
     return coefficients

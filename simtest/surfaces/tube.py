@@ -22,6 +22,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
+from simtest.surfaces.components import Components, chosen, components, solve3
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.stalk import Stalk
@@ -34,6 +35,9 @@ MAX_SHIFT_MM = 3.0
 _PANEL_MM = 4.0
 _RELIEF_WAVES = 6
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+_PANEL_DEGREE = 12
+"""Of the polynomials that stand for the centreline between two knots: exact to rounding for every bend allowed."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class Tube:
         self._knots = np.linspace(0, recipe.length_mm, max(2, math.ceil(recipe.length_mm / _PANEL_MM) + 1))
         steps = self._integrate(self._knots[:-1], self._knots[1:])
         self._knot_points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._panels = self._fit_panels()
         # Stalks stand on the wall without any, so that is needed first.
         self._stalks: tuple[Stalk, ...] = ()
         self._check()
@@ -148,10 +153,41 @@ class Tube:
         return np.stack([x, np.zeros_like(x), z], axis=1)
 
     def centreline(self, u: Array) -> Array:
-        """Return C(u), mm, shape (N, 3), by Gauss-Legendre quadrature from the nearest knot: exact to rounding."""
+        """Return C(u), mm, shape (N, 3), from the nearest knot, exact to rounding.
+
+        Around each knot polynomials stand for the quadrature; beyond the tube's ends the quadrature itself is used.
+        """
         spacing = self._knots[1] - self._knots[0]
         knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
-        return self._knot_points[knot] + self._integrate(self._knots[knot], u)
+        points = self._knot_points[knot]
+        share = (u - self._knots[knot]) / (spacing / 2)
+        inside = np.abs(share) <= 1 + 1e-9
+        for axis, coefficients in zip((0, 2), self._panels, strict=True):
+            # Horner's scheme
+            value = coefficients[-1, knot]
+            for row in coefficients[-2::-1]:
+                value *= share
+                value += row[knot]
+            points[:, axis] += np.where(inside, value, 0.0)
+        if not inside.all():
+            beyond = np.flatnonzero(~inside)
+            points[beyond] += self._integrate(self._knots[knot[beyond]], u[beyond])
+        return points
+
+    def _fit_panels(self) -> Array:
+        """Fit C(u) - C(knot) within half a spacing of each knot, x and z, shape (2, _PANEL_DEGREE + 1, knots).
+
+        The coefficients are those of the powers of (u - knot) over half the spacing, the lowest first.
+        """
+        half = (self._knots[1] - self._knots[0]) / 2
+        nodes = np.polynomial.chebyshev.chebpts1(_PANEL_DEGREE + 1)
+        start = np.repeat(self._knots, len(nodes))
+        values = self._integrate(start, start + half * np.tile(nodes, len(self._knots)))
+        values = values[:, [0, 2]].reshape(len(self._knots), len(nodes), 2)
+        # Chebyshev's basis is well conditioned; powers are quicker to evaluate.
+        fitted = np.linalg.solve(np.polynomial.chebyshev.chebvander(nodes, _PANEL_DEGREE), values)
+        powers = np.stack([np.pad(p, (0, len(nodes) - len(p))) for p in map(_powers, np.eye(len(nodes)))])
+        return np.ascontiguousarray(np.einsum("kcx,cp->xpk", fitted, powers))
 
     def slice_of(self, points: Array) -> tuple[Array, Array, Array]:
         """Return (u, v) and the distance from the centreline, mm, of points, shape (N, 3), near the tube.
@@ -178,26 +214,31 @@ class Tube:
         across = x * np.cos(psi) - z * np.sin(psi)
         return u, np.arctan2(y, across), np.hypot(across, y)
 
-    def radius(self, u: Array, v: Array) -> Jet:
-        """Return r(u, v), mm, and its derivatives; u, v of shape (N,)."""
+    def radius(self, u: Array, v: Array, second: bool = True) -> Jet:
+        """Return r(u, v), mm, and its derivatives, without `second` only the first; u, v of shape (N,)."""
         # taeniae
         amplitude, angle = self.recipe.taenia_mm, 3 * (v - self._taenia_phase)
         sine, cosine = np.sin(angle), np.cos(angle)
         zero = np.zeros_like(u)
         f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
-        fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
+        fuu, fuv, fvv = (zero.copy(), zero.copy(), -9 * amplitude * cosine) if second else (zero[:0],) * 3
         # folds and sessile polyps
+        sine_v, cosine_v = np.sin(v), np.cos(v)
         for fold in self._folds:
-            sine, cosine = np.sin(v - fold.centre), np.cos(v - fold.centre)
+            # Of v - centre, without a sine of each point for each fold
+            sine_c, cosine_c = math.sin(fold.centre), math.cos(fold.centre)
+            sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
             x, w2 = u - fold.along - fold.slant * sine, fold.width**2
             bump = fold.depth * np.exp(-(x**2) / (2 * w2) + fold.kappa * (cosine - 1))
             # Derivatives of the exponent E; x_v = -slant cos.
             eu, ev = -x / w2, x * fold.slant * cosine / w2 - fold.kappa * sine
-            euv = fold.slant * cosine / w2
-            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
             f -= bump
             fu -= bump * eu
             fv -= bump * ev
+            if not second:
+                continue
+            euv = fold.slant * cosine / w2
+            evv = -((fold.slant * cosine) ** 2 + x * fold.slant * sine) / w2 - fold.kappa * cosine
             fuu -= bump * (eu * eu - 1 / w2)
             fuv -= bump * (eu * ev + euv)
             fvv -= bump * (ev * ev + evv)
@@ -208,6 +249,8 @@ class Tube:
             f += cosine
             fu -= q * sine
             fv -= m * sine
+            if not second:
+                continue
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
@@ -223,7 +266,7 @@ class Tube:
 
     def tangents(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return P, mm, P_u and P_v, three arrays of shape (N, 3)."""
-        r, bend = self.radius(u, v), self.heading(u)[1]
+        r, bend = self.radius(u, v, second=False), self.heading(u)[1]
         T, rho, tau = self.frame(u, v)
         along = (1 - bend * r.f * np.cos(v))[:, None]
         position = self.centreline(u) + r.f[:, None] * rho
@@ -233,6 +276,21 @@ class Tube:
         none = np.zeros_like(position)
         moved = self._with_stalks(Jet(position, first, second, none, none, none))
         return moved.f, moved.u, moved.v
+
+    def _tangent_components(self, u: Array, v: Array) -> tuple[Components, Components, Components]:
+        """Return the components of `tangents`: P, P_u and P_v by x, y and z."""
+        if self._stalks:
+            position, first, second = self.tangents(u, v)
+            return components(position), components(first), components(second)
+        r, (psi, bend, _) = self.radius(u, v, second=False), self.heading(u)
+        s, c, sv, cv = np.sin(psi), np.cos(psi), np.sin(v), np.cos(v)
+        centre, rho = self.centreline(u), (cv * c, sv, -cv * s)
+        along, tau = 1 - bend * r.f * cv, (-sv * c, cv, sv * s)
+        return (
+            (centre[:, 0] + r.f * rho[0], r.f * rho[1], centre[:, 2] + r.f * rho[2]),
+            (along * s + r.u * rho[0], r.u * rho[1], along * c + r.u * rho[2]),
+            (r.v * rho[0] + r.f * tau[0], r.v * rho[1] + r.f * tau[1], r.v * rho[2] + r.f * tau[2]),
+        )
 
     def jet(self, u: Array, v: Array) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
@@ -276,14 +334,17 @@ class Tube:
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
         p = self.jet(u, v)
-        # First fundamental form G and second fundamental form -N . P_ij
         normal = np.cross(p.u, p.v)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        J = np.stack([p.u, p.v], axis=2)
-        second = -np.stack([np.einsum("ni,ni->n", normal, d) for d in (p.uu, p.uv, p.uv, p.vv)], axis=1)
-        # dN(P_i) . P_j = -N . P_ij, so S = J G^-1 (-II) G^-1 J^T with G = J^T J.
-        dual = J @ np.linalg.inv(J.transpose(0, 2, 1) @ J)
-        return normal, dual @ second.reshape(-1, 2, 2) @ dual.transpose(0, 2, 1)
+        # First fundamental form G and second fundamental form II = -N . P_ij
+        E, F, G = (np.einsum("ni,ni->n", a, b) for a, b in ((p.u, p.u), (p.u, p.v), (p.v, p.v)))
+        L, M, N = (-np.einsum("ni,ni->n", normal, d) for d in (p.uu, p.uv, p.vv))
+        # dN(P_i) . P_j = II_ij, so S = sum of II_ij d_i d_j^T with the dual tangents d = J G^-1, J = (P_u, P_v).
+        det = E * G - F * F
+        first = (G / det)[:, None] * p.u - (F / det)[:, None] * p.v
+        second = (E / det)[:, None] * p.v - (F / det)[:, None] * p.u
+        along, across = L[:, None] * first + M[:, None] * second, M[:, None] * first + N[:, None] * second
+        return normal, first[:, :, None] * along[:, None, :] + second[:, :, None] * across[:, None, :]
 
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
@@ -296,34 +357,29 @@ class Tube:
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
+        source, towards = components(origins[active]), components(directions[active])
         for _ in range(NEWTON_STEPS):
-            p, pu, pv = self.tangents(u[active], v[active])
-            miss = p - origins[active] - t[active, None] * directions[active]
-            done = np.linalg.norm(miss, axis=1) < NEWTON_TOLERANCE_MM
+            p, pu, pv = self._tangent_components(u[active], v[active])
+            x, y, z = (a - b - t[active] * c for a, b, c in zip(p, source, towards, strict=True))
+            # The linear system P_u du + P_v dv - direction dt = -miss, for -du, -dv and dt
+            du, dv, dt = solve3(pu, pv, towards, (x, y, z))
+            done = x * x + y * y + z * z < NEWTON_TOLERANCE_MM**2
             found[active[done]] = True
-            # The others go on.
-            active, pu, pv, miss = active[~done], pu[~done], pv[~done], miss[~done]
-            if not active.size:
-                break
-            # The linear system P_u du + P_v dv - direction dt = -miss
-            du, dv, dt = _solve3(pu, pv, -directions[active], -miss)
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
-            u[active] += scale * du
-            v[active] += scale * dv
+            scale[done] = 0.0
+            u[active] -= scale * du
+            v[active] -= scale * dv
             t[active] += scale * dt
-            # A ray that leaves the neighbourhood of its hit is given up.
-            active = active[np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM]
+            # A ray that leaves the neighbourhood of its hit is given up; the others go on.
+            kept = np.flatnonzero(~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM))
+            active, source, towards = active[kept], chosen(source, kept), chosen(towards, kept)
+            if not active.size:
+                break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
         return np.where(found & inside, t, np.nan), u, v
 
 
-def _solve3(a: Array, b: Array, c: Array, right: Array) -> tuple[Array, Array, Array]:
-    """Solve [a b c] x = right by Cramer's rule, all of shape (N, 3); inf or NaN for a singular matrix."""
-    bc = np.cross(b, c)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / np.einsum("ni,ni->n", a, bc)
-        x = np.einsum("ni,ni->n", right, bc) * inverse
-        y = np.einsum("ni,ni->n", right, np.cross(c, a)) * inverse
-        z = np.einsum("ni,ni->n", right, np.cross(a, b)) * inverse
-    return x, y, z
+def _powers(chebyshev: Array) -> Array:
+    """Return the coefficients of powers, the lowest first, of a series of Chebyshev polynomials."""
+    return np.asarray(np.polynomial.chebyshev.cheb2poly(chebyshev))

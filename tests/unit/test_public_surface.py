@@ -6,6 +6,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import simtest
@@ -86,6 +88,34 @@ def test_reconstructing_loads_neither_renderer_nor_viewer():
         " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib'})))"
     )
     assert loaded == []
+
+
+SLOW = {"scipy", "polars", "matplotlib", "mitsuba", "drjit", "trimesh", "igl", "pyvista", "vtk", "multiprocessing"}
+"""Packages that reconstruction of a picture needs no more than a page of figures."""
+
+
+@pytest.mark.parametrize("known", ["camera", "fov"])
+def test_a_picture_is_reconstructed_without_slow_packages(known, tmp_path):
+    y, x = np.mgrid[:90, :120]
+    picture = 40 + 180 * np.exp(-((x - 60) ** 2 / 300 + (y - 45) ** 2 / 200))
+    cv2.imwrite(str(tmp_path / "picture.png"), picture.astype(np.uint8))
+    simtest.save_camera(simtest.Camera.from_fov(60.0, 120, 90), tmp_path / "camera.toml")
+    option = ["--camera", str(tmp_path / "camera.toml")] if known == "camera" else ["--fov", "60"]
+    arguments = ["simtest", "reconstruct", str(tmp_path / "picture.png"), *option, "--out", str(tmp_path / "out")]
+    loaded = child(
+        "import contextlib, io, json, sys, warnings\n"
+        "warnings.simplefilter('ignore')\n"
+        f"sys.argv = {arguments!r}\n"
+        "from simtest.cli.main import main\n"
+        "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()): main()\n"
+        "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules})))"
+    )
+    assert {"numpy", "cv2"} <= set(loaded)
+    assert not SLOW & set(loaded)
+    assert ("pydantic" in loaded) == (known == "camera")
+    records = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
+    assert len(records) == 1
+    assert set(records[0]["estimates"]) == {"circle_pose", "brightest_point", "cone_axis"}
 
 
 def test_estimators_that_are_registered():

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
@@ -56,6 +54,10 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
 def _struct(path: Path) -> Mapping[str, Any]:
     """Return the fields of the one struct in the file that is a calibration."""
+    # Imported here: slow to load, and most cameras come from other files.
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
+
     where = shown(path)
     try:
         if not path.is_file():
