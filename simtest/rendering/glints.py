@@ -65,9 +65,7 @@ def search(session: "Session", index: int) -> Array:
     """Find the glints of the light of an index; return their pixels, shape (N, 2)."""
     # Seeds: pixels whose own Newton step is short.
     seeds, light = _seeds(session, index), session.scene.rig.true_mm()[index]
-    # Lead them on the rendered shape; seeds of one zero meet.
-    seeds = distinct(session.lead_to_glints(seeds, light, MAX_STEP_PX), SAME_PX / 4)
-    # Refine on the exact surface.
+    # Refine on the exact surface; seeds of one zero meet.
     found = _newton(session, seeds, light)
     return distinct(found[session.camera.contains(found)], SAME_PX)
 

@@ -14,7 +14,6 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
 from simtest.rendering.rays import Sightlines
-from simtest.rendering.relief_kernel import KernelJets
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 
 MARGIN = 1
@@ -70,7 +69,7 @@ def trace_grid(mi: Any, scene: Any, sightlines: Sightlines, lights: Array, strid
     # The camera's basis, which is smooth over the frame.
     model_from_camera = sightlines.camera_from_model.T
     basis = tuple(model_from_camera @ axis for axis in mi.coordinate_system(-rays.sightline))
-    values = [part for light in sources for part in misfit_and_turn(mi, rays.traced, basis, si, light)[:4]]
+    values = [part for light in sources for part in _misfit_and_step(mi, rays.traced, basis, si, light)]
     values = [dr.select(si.is_valid(), value, dr.nan) for value in (*values, _gain(mi, rays.traced.d, si))]
     # Together: evaluated one by one, each would trace the rays again.
     dr.eval(values)
@@ -95,26 +94,13 @@ def _gain(mi: Any, r: Any, si: Any) -> Any:
     return dr.minimum(dr.abs(1 + si.t * (mean - half)), dr.abs(1 + si.t * (mean + half)))
 
 
-def misfit_and_turn(
-    mi: Any, ray: Any, basis: tuple[Any, Any], si: Any, light: Any, jets: KernelJets | None = None
-) -> tuple[Any, ...]:
-    """Compute the misfit along a basis (see `exact_misfit.exact_misfit`) and the sightline's turn to its zero.
-
-    The normal is that of the relief with the `jets`, second derivatives included, or else the base's. The last of the
-    five values is the length of the whole misfit.
-    """
+def _misfit_and_step(mi: Any, ray: Any, basis: tuple[Any, Any], si: Any, light: Any) -> list[Any]:
+    """Compute the misfit along a basis (see `exact_misfit.exact_misfit`) and the sightline's turn to its zero."""
     import drjit as dr
 
     r = ray.d
     facing = dr.select(dr.dot(si.sh_frame.n, r) > 0, mi.Float(-1), mi.Float(1))
-    N = mi.Vector3f(si.sh_frame.n) * facing
-    normal, length, rise = N, mi.Float(1), mi.Float(0)
-    if jets is not None:
-        # Of the relief, as `relief_field.normal_derivative` does.
-        rise = dr.dot(N, jets.gradient)
-        normal = N - jets.gradient + N * rise
-        length = dr.norm(normal)
-        normal /= length
+    normal = mi.Vector3f(si.sh_frame.n) * facing
     # Not si.p, which is off by 1e-3 mm on a plane.
     towards = light - (ray.o + r * si.t)
     reach = dr.norm(towards)
@@ -131,26 +117,13 @@ def misfit_and_turn(
         moved = si.t * (turn - r * (dr.dot(si.n, turn) * slope))
         p, q = dr.dot(si.dp_du, moved), dr.dot(si.dp_dv, moved)
         bent = facing * area * (si.dn_du * (bb * p - ab * q) + si.dn_dv * (aa * q - ab * p))
-        if jets is not None:
-            steeper = _times(mi, jets.hessian, moved)
-            bent = bent * (1 + rise) + N * (dr.dot(jets.gradient, bent) + dr.dot(N, steeper)) - steeper
-            bent = (bent - normal * dr.dot(normal, bent)) / length
         swing = -(moved - towards * dr.dot(towards, moved)) / reach - turn
         change = bent - (swing - bisector * dr.dot(bisector, swing)) / size
         columns.append((dr.dot(basis[0], change), dr.dot(basis[1], change)))
     u, v = dr.dot(basis[0], gap), dr.dot(basis[1], gap)
     (a, c), (b, d) = columns
     determinant = dr.rcp(a * d - b * c)
-    return u, v, (b * v - d * u) * determinant, (c * u - a * v) * determinant, dr.norm(gap)
-
-
-def _times(mi: Any, hessian: Any, vector: Any) -> Any:
-    """Multiply a symmetric matrix, given as its six numbers, by a vector."""
-    import drjit as dr
-
-    xx, xy, xz, yy, yz, zz = hessian
-    rows = (mi.Vector3f(xx, xy, xz), mi.Vector3f(xy, yy, yz), mi.Vector3f(xz, yz, zz))
-    return mi.Vector3f(*(dr.dot(row, vector) for row in rows))
+    return [u, v, (b * v - d * u) * determinant, (c * u - a * v) * determinant]
 
 
 def turned_pixels(camera: Camera, pixels: Array, turns: Array) -> Array:

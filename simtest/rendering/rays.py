@@ -174,15 +174,6 @@ class Sightlines:
         traced = mi.Ray3f(mi.Point3f(self._origin), mi.Vector3f(direction))
         return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
 
-    def project(self, directions: Any) -> tuple[Any, Any]:
-        """Return the pixel positions, mitsuba.Float, px, of directions in a pinhole's frame; not finite behind it."""
-        import drjit as dr
-
-        mi, n = self.mi, self._numbers
-        a, b = (mi.Float64(part) / mi.Float64(directions.z) for part in (directions.x, directions.y))
-        x, y = a / n["fx"] + n["skew"] * b + n["cx"], b / n["fy"] + n["cy"]
-        return mi.Float(dr.select(directions.z > 0, x, dr.nan)), mi.Float(dr.select(directions.z > 0, y, dr.nan))
-
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
         """Return origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
 

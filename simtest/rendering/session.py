@@ -16,7 +16,6 @@ from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
 from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
-from simtest.rendering.glint_seeds import lead
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
@@ -349,13 +348,6 @@ class Session:
     def fine_misfits(self, division: int, light: int) -> MisfitMaps:
         """Return the fine misfit of one light at the centres of pixels that are divided along both axes."""
         return self._tracer().misfits(self.scene.rig.true_mm()[[light]], division, base=False)
-
-    def lead_to_glints(self, seeds: Array, light: Array, max_step_px: float) -> Array:
-        """Lead seeds, shape (N, 2), px, close to glints of a light, camera frame, mm; drop those that stray."""
-        if self._relief is None or not self.sightlines.in_kernel:
-            return seeds
-        at = self.to_model(light[None])[0]
-        return lead(self.mi, self._built.scene, self.sightlines, self._relief, seeds, at, max_step_px)
 
     def truth(self, stride: int = 1) -> TruthMaps:
         """Return the ground truth at the centre of every pixel, or of every `stride`-th along both axes.

@@ -211,20 +211,3 @@ def test_spots_hold_the_glints_in_them(sessions):
         values = [view.highlights[number].radiance for number in spot.glints]
         assert values == sorted(values, reverse=True)
     assert glints_of(find_spots(np.zeros((9, 9)), np.zeros((9, 9))), view.highlights) == []
-
-
-@pytest.mark.parametrize("surface", SURFACES)
-def test_led_seeds_lie_at_glints_and_strays_are_dropped(sessions, surface):
-    """The kernel's steps on the rendered shape end where the exact misfit has its zero, to single precision."""
-    session, light = sessions[surface], np.zeros(3)
-    found = glints.search(session, 0)
-    near = found + np.random.default_rng(2).uniform(-0.2, 0.2, found.shape)
-    led = session.lead_to_glints(near, light, glints.MAX_STEP_PX)
-    assert len(led) == len(near)
-    gaps = np.array([np.linalg.norm(found - pixel, axis=1).min() for pixel in led])
-    assert np.median(gaps) < 2e-3
-    # Glints that the exact search finds from the led seeds are the same.
-    again = glints.distinct(glints._newton(session, led, light), glints.SAME_PX)
-    assert all(np.linalg.norm(found - pixel, axis=1).min() < 1e-6 for pixel in again)
-    outside = np.array([[-5000.0, 10.0]])
-    assert session.lead_to_glints(outside, light, glints.MAX_STEP_PX).shape == (0, 2)
