@@ -38,16 +38,10 @@ def trace_hits(
         return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
     import drjit as dr
 
-    # Rays that exist.
-    asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
-    # No NaN may enter the renderer.
-    ray = mi.Ray3f(
-        mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),
-        mi.Vector3f(_columns(np.where(asked[:, None], directions, [0.0, 0.0, 1.0]))),
-    )
+    ray, asked = _rays(mi, origins, directions)
     # Hits: what the exact solution starts from, and the normals of the rendered shape.
-    preliminary = scene.ray_intersect_preliminary(ray, False, mi.Bool(asked))
-    si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(asked))
+    preliminary = scene.ray_intersect_preliminary(ray, False, asked)
+    si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, asked)
     valid = si.is_valid()
     normals = (mi.Vector3f(make_hit(mi, si, relief).fine.sh_frame.n), mi.Vector3f(si.n))
     dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
@@ -66,6 +60,34 @@ def trace_hits(
     for normal in (shading, geometric):
         normal[missed] = np.nan
     return hits, shading, geometric
+
+
+def trace_starts(mi: Any, scene: Any, origins: Array, directions: Array) -> RayHits:
+    """Trace rays as `trace_hits` does, without the normals: the same hits in a fraction of the time."""
+    if not len(origins):
+        return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2)))
+    import drjit as dr
+
+    ray, asked = _rays(mi, origins, directions)
+    preliminary = scene.ray_intersect_preliminary(ray, False, asked)
+    valid = preliminary.is_valid()
+    dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, valid)
+    return pack_hits(
+        np.where(np.array(valid), np.array(preliminary.t), np.nan),
+        np.array(preliminary.prim_index),
+        np.array(preliminary.prim_uv).T,
+    )
+
+
+def _rays(mi: Any, origins: Array, directions: Array) -> tuple[Any, Any]:
+    """Return mitsuba.Ray3f, and mitsuba.Bool: which of them exist."""
+    asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
+    # No NaN may enter the renderer.
+    ray = mi.Ray3f(
+        mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),
+        mi.Vector3f(_columns(np.where(asked[:, None], directions, [0.0, 0.0, 1.0]))),
+    )
+    return ray, mi.Bool(asked)
 
 
 def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:

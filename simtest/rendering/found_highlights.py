@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from simtest.rendering import glints, highlights
-from simtest.rendering.base_caster import BaseCaster
 from simtest.rendering.frames import HighlightPoint, Radiance
 from simtest.spec.surface import AnatomySurface
 
@@ -35,7 +34,7 @@ def search(session: "Session", base: bool) -> list[HighlightPoint]:
     if session.surface.relief is not None and not base:
         return glints.find(session, radiance)
     stride = FINE_STRIDE_PX if isinstance(session.scene.surface, AnatomySurface) else COARSE_STRIDE_PX
-    return highlights.find(BaseCaster(session) if base else session, radiance, stride=stride)
+    return highlights.find(session, radiance, stride=stride)
 
 
 def lit_by(radiance: Radiance, points: Sequence[HighlightPoint]) -> list[HighlightPoint]:

@@ -5,17 +5,15 @@ exact Newton steps with the closed derivative of the fine normal finish.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simtest.geometry.vectors import tangent_basis
+from simtest.rendering.exact_misfit import exact_misfit
 from simtest.rendering.frames import HighlightPoint, Radiance
 from simtest.rendering.highlights import brightest_first, describe
+from simtest.rendering.misfit_grid import crossed
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.surfaces.model import SurfacePoints
-from simtest.surfaces.relief_field import normal_derivative
 
 if TYPE_CHECKING:
     from simtest.rendering.session import Session
@@ -43,26 +41,6 @@ SAME_PX = 0.02
 """Glints closer than this are the same zero, found twice."""
 
 SAME_SEED_PX = 0.5
-DIFFERENCE_PX = 1e-2
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """Misfit between fine normal and bisector at pixel positions.
-
-    Parameters
-    ----------
-    w : ndarray, shape (N, 2)
-        Its components across the sightline.
-    jacobian : ndarray, shape (N, 2, 2)
-        Their derivatives along the image's axes, 1/px.
-    length : ndarray, shape (N,)
-        Of the whole misfit, rad: abs(tau) of theory.md section 7.
-    """
-
-    w: Array
-    jacobian: Array
-    length: Array
 
 
 def is_resolved(session: "Session") -> bool:
@@ -79,7 +57,7 @@ def find(session: "Session", radiance: Radiance) -> list[HighlightPoint]:
     for index in range(len(session.scene.rig.lights)):
         pixels = search(session, index)
         if len(pixels):
-            found += describe(session, radiance, pixels, index)
+            found += describe(session, radiance, pixels, np.full(len(pixels), index))
     return brightest_first(found)
 
 
@@ -131,26 +109,9 @@ def _grid_seeds(w: Image, margin: int, parts: int) -> Array:
     rows, columns = np.nonzero(short)
     stepped = np.stack([columns + 1.5 + step_x[short], rows + 1.5 + step_y[short]], axis=1)
     # Cells in which the interpolated misfit has its zero, where differences over two pixels are too coarse.
-    rows, columns = _crossed(w)
+    rows, columns = crossed(w)
     seeds = (np.concatenate([np.stack([columns + 1.0, rows + 1.0], axis=1), stepped]) - margin) / parts
     return distinct(seeds, SAME_SEED_PX / parts)
-
-
-def _crossed(w: Image) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the cells of a grid in which the linear misfit of a triangle half has its zero."""
-    corners = [w[:, :-1, :-1], w[:, :-1, 1:], w[:, 1:, :-1], w[:, 1:, 1:]]
-    with np.errstate(invalid="ignore"):
-        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        rows, columns = np.nonzero(((low <= 0) & (high >= 0)).all(axis=0))
-    a, b, c, d = (corner[:, rows, columns] for corner in corners)
-
-    def inside(*triangle: Image) -> Mask:
-        p, q, r = triangle
-        signs = np.stack([u[0] * v[1] - u[1] * v[0] for u, v in ((p, q), (q, r), (r, p))])
-        return np.asarray((signs >= 0).all(axis=0) | (signs <= 0).all(axis=0))
-
-    held = inside(a, b, c) | inside(b, d, c)
-    return rows[held], columns[held]
 
 
 def _newton(session: "Session", seeds: Array, light: Array) -> Array:
@@ -178,39 +139,6 @@ def _newton(session: "Session", seeds: Array, light: Array) -> Array:
     return np.concatenate(finished) if finished else np.empty((0, 2))
 
 
-def exact_misfit(session: "Session", points_px: Array, light: Array) -> Misfit:
-    """Compute the exact misfit at pixel positions and its derivative, in the model frame."""
-    origins, r = session.sightlines.in_model(points_px)
-    base = session.base_points(origins, r)
-    N, position, relief = base.normal, base.position, session.surface.relief
-    normal, derivative = N, shape_operator(base)
-    if relief is not None:
-        jets = relief.jets(np.where(base.valid[:, None], position, 0.0))
-        normal, derivative = normal_derivative(N, derivative, jets)
-    # Bisector of the directions to camera and light.
-    towards = session.to_model(light[None]) - position
-    reach = np.linalg.norm(towards, axis=1, keepdims=True)
-    towards /= reach
-    both = towards - r
-    size = np.linalg.norm(both, axis=1, keepdims=True)
-    bisector = both / size
-    gap = normal - bisector
-    # Derivatives along the image's axes: of the point on the tangent plane, of the normal, of the bisector.
-    first, second = tangent_basis(-r)
-    columns = []
-    for axis in np.eye(2):
-        turn = session.sightlines.in_model(points_px + DIFFERENCE_PX * axis)[1]
-        turn = (turn - session.sightlines.in_model(points_px - DIFFERENCE_PX * axis)[1]) / (2 * DIFFERENCE_PX)
-        slant = np.sum(N * turn, axis=1, keepdims=True) / np.sum(N * r, axis=1, keepdims=True)
-        moved = base.distance[:, None] * (turn - r * slant)
-        bent = np.einsum("nij,nj->ni", derivative, moved)
-        swing = -(moved - towards * np.sum(towards * moved, axis=1, keepdims=True)) / reach - turn
-        swing = (swing - bisector * np.sum(bisector * swing, axis=1, keepdims=True)) / size
-        columns.append(np.stack([np.sum(e * (bent - swing), axis=1) for e in (first, second)], axis=1))
-    w = np.stack([np.sum(e * gap, axis=1) for e in (first, second)], axis=1)
-    return Misfit(w, np.stack(columns, axis=-1), np.linalg.norm(gap, axis=1))
-
-
 def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_width: float) -> Array:
     """Compute the radii, shape (N,), px, at which highlights fall to half height, from their shape alone (theory 7.3).
 
@@ -226,14 +154,6 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
             with np.errstate(divide="ignore"):
                 radii[own] = half_width / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
     return radii
-
-
-def shape_operator(points: SurfacePoints) -> Array:
-    """Return S, shape (N, 3, 3), of the principal curvatures and directions of points."""
-    return np.asarray(
-        points.k_min[:, None, None] * points.direction_min[:, :, None] * points.direction_min[:, None, :]
-        + points.k_max[:, None, None] * points.direction_max[:, :, None] * points.direction_max[:, None, :]
-    )
 
 
 def distinct(points: Array, apart: float) -> Array:

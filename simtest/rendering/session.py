@@ -21,6 +21,7 @@ from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
 from simtest.rendering.mesh_edges import MeshEdges
+from simtest.rendering.misfit_grid import MisfitGrid, trace_grid
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
@@ -325,19 +326,6 @@ class Session:
         """
         return self._cast(*self.sightlines.in_model(points_px))
 
-    def cast_rendered(self, points_px: Array) -> tuple[Array, Array]:
-        """Cast rays through pixel positions, shape (N, 2), onto the rendered shape.
-
-        Returns points, mm, and shading normals, with the relief, shape (N, 3), camera frame; NaN where the ray misses.
-        """
-        return self._cast_rendered(points_px, self._relief)
-
-    def _cast_rendered(self, points_px: Array, relief: ReliefKernel | None) -> tuple[Array, Array]:
-        hits, shading, _ = self._hits(*self.sightlines.in_model(points_px), relief)
-        distance = np.where(np.isfinite(hits.distance), hits.distance, np.nan)
-        position = self.camera.unproject(points_px) * distance[:, None]
-        return position, shading @ self.surface.model_from_camera[:3, :3]
-
     def _cast(
         self, origins: Array, directions: Array, relief: ReliefKernel | None = None
     ) -> tuple[SurfacePoints, Array, Array]:
@@ -354,9 +342,19 @@ class Session:
     ) -> tuple[RayHits, Array, Array]:
         return exact.trace_hits(self.mi, self._built.scene, self._shape, origins, directions, relief)
 
-    def base_points(self, origins: Array, directions: Array) -> SurfacePoints:
-        """Return the exact points of the base on rays of the model frame, shape (N, 3), in the model frame."""
-        return self.surface.points(np.asarray(origins), directions, self._hits(origins, directions)[0])
+    def exact_points(self, points_px: Array, fine: bool = True) -> SurfacePoints:
+        """Return the exact points at pixel positions, shape (N, 2), camera frame, of the fine surface or the base."""
+        rays = self.sightlines.in_model(points_px)
+        return exact.solve(self.surface, *rays, self.exact_hits(*rays), fine)
+
+    def exact_hits(self, origins: Array, directions: Array) -> RayHits:
+        """Return the hits from which exact points start, of rays of the model frame, shape (N, 3)."""
+        return exact.trace_starts(self.mi, self._built.scene, origins, directions)
+
+    def misfit_grid(self, stride: int) -> MisfitGrid:
+        """Return the misfits of all lights, without the relief, at the centres of every `stride`-th pixel."""
+        lights = self.to_model(self.scene.rig.true_mm())
+        return trace_grid(self.mi, self._built.scene, self.sightlines, lights, stride)
 
     def misfits(self) -> MisfitMaps:
         """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
@@ -403,7 +401,7 @@ class Session:
         # Shadow rays from the light.
         pose = self.surface.model_from_camera
         origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
-        hits, _, _ = self._hits(origins, directions @ pose[:3, :3].T)
+        hits = self.exact_hits(origins, directions @ pose[:3, :3].T)
         # A blocker stands clearly in front of the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))
 

@@ -17,7 +17,7 @@ from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.fineness import DEFAULT_EXPONENT, needed_edge, phong_concentration
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, other_unit, read_mesh
 from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, isoperimetric_quotient
-from simtest.surfaces.model import RayHits, TriangleMesh, principal_curvatures
+from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
 from simtest.surfaces.poses import AXIS_RANGE_MM, ORGAN_RANGE_MM, lumen_pose, organ_pose
 from simtest.surfaces.repair import examine
 from simtest.surfaces.subdivision import (
@@ -98,6 +98,29 @@ class PreparedMesh(BuiltMesh):
         operator = np.einsum("nc,ncij->nij", hits.weights, self.operators[corners])
         projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
         return hits.distance, normal, projector @ operator @ projector
+
+    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
+        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
+        faces = self.mesh.faces[hits.face]
+        corner, second, third = np.moveaxis(self.mesh.vertices[faces], 1, 0)
+        a, b, c = np.moveaxis(self.mesh.normals[faces], 1, 0)
+        first_edge, second_edge = second - corner, third - corner
+        plane = np.cross(first_edge, second_edge)
+        # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1 / np.einsum("ni,ni->n", plane, plane)[:, None]
+        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
+            c - a, np.cross(plane, first_edge) * scale
+        )
+        mean = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[faces])
+        # Turned as the points' normals are, which face the rays.
+        length = np.linalg.norm(mean, axis=1) * np.sign(np.einsum("ni,ni->n", mean, points.normal_base))
+        across = np.eye(3) - _outer(points.normal_base, points.normal_base)
+        return plane, across @ gradient / length[:, None, None]
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return np.asarray(a[:, :, None] * b[:, None, :])
 
 
 def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: TriangleMesh) -> RayHits:
@@ -236,6 +259,10 @@ class MeshSurface(MeshedSurface):
             pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
         self.solid = not lumen
         self.model_from_camera = pose
+
+    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
+        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
+        return self.prepared.motion(points, hits)
 
 
 def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:

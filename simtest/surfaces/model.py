@@ -161,6 +161,25 @@ class SurfaceModel(ABC):
         points = self.points(origins, directions, hits)
         return points if self.relief is None else self.relief.apply(points)
 
+    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
+        """Return how points of the base and their normals move between neighbouring rays.
+
+        Parameters
+        ----------
+        points : SurfacePoints
+            Of `points`, in the model frame.
+        hits : RayHits
+            What they were computed from.
+
+        Returns
+        -------
+        plane : ndarray, shape (N, 3)
+            Normals, of any length, of the planes on which the points move.
+        derivative : ndarray, shape (N, 3, 3)
+            Change of the unit normal along these planes, 1/mm: S, except for a mesh that is itself the surface.
+        """
+        return points.normal_base, shape_operator(points)
+
     @abstractmethod
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the exact points where rays meet the base surface, in the model frame.
@@ -230,6 +249,15 @@ def pack_points(
         pool=np.zeros(len(valid), dtype=bool),
         valid=valid,
     )
+
+
+def shape_operator(points: SurfacePoints) -> Array:
+    """Return S, shape (N, 3, 3), of the principal curvatures and directions of points."""
+    parts = [
+        (k[:, None] * direction)[:, :, None] * direction[:, None, :]
+        for k, direction in ((points.k_min, points.direction_min), (points.k_max, points.direction_max))
+    ]
+    return np.asarray(parts[0] + parts[1])
 
 
 def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:

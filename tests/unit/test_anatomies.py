@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.rendering import Session, highlights
+from simtest.rendering import Session, found_highlights, highlights
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.runner import run_experiment
 
@@ -45,28 +45,27 @@ def test_real_meshes_give_results(shared_data, tmp_path, name):
     assert median_error(results, "circle_pose")[0] > 20
 
 
-def test_exact_points_elsewhere_than_near_seeds_would_change_nothing(monkeypatch):
-    """The search for true highlights against the one that knows the exact surface at every pixel of its grid."""
+def test_a_finer_grid_of_seeds_finds_nothing_more(monkeypatch):
+    """The search for true highlights against the one that looks at every pixel, and for longer steps."""
     camera = {"camera.width": 320, "camera.height": 240, "camera.fx": 160.0, "camera.fy": 160.0}
     lights = [{"offset_mm": 0.0}, {"offset_mm": 2.0, "azimuth_deg": 45.0}]
+    session = Session(load_scene("anatomy", {"surface.path": "colon", **camera}))
 
     def found():
-        all_found, solved = [], 0
+        pixels = []
         for viewpoint in (50006, 50012):
             values = {"surface.path": "colon", "surface.viewpoint": viewpoint, "rig.lights": lights, **camera}
             session.update(load_scene("anatomy", values))
-            all_found.append(session.highlights(session.radiance()))
-            grid = highlights._seed_grid(session, 2, session.scene.rig.true_mm())[1]
-            solved += int(np.count_nonzero(grid.valid))
-        return [[(h.light, *h.bp_px, *h.normal, h.kd_min) for h in each] for each in all_found], solved
+            pixels += [(viewpoint, h.light, *h.bp_px) for h in session.highlights(session.radiance())]
+        return np.array(sorted(pixels))
 
-    session = Session(load_scene("anatomy", {"surface.path": "colon", **camera}))
-    quick, few = found()
-    monkeypatch.setattr(highlights, "_may_be_near", lambda w: np.ones(w.shape[:2], dtype=bool))
-    full, all_points = found()
-    assert sum(map(len, quick)) >= 8
-    assert quick == full
-    assert few < all_points / 5
+    quick = found()
+    monkeypatch.setattr(found_highlights, "FINE_STRIDE_PX", 1)
+    monkeypatch.setattr(highlights, "NEAR_CELLS", 12.0)
+    full = found()
+    assert len(quick) >= 8
+    assert quick.shape == full.shape
+    np.testing.assert_allclose(quick, full, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -1,22 +1,129 @@
-"""The search for the places where the normal bisects the directions to light and camera."""
-
-from types import SimpleNamespace
+"""The search for the points where the normal bisects the directions to light and camera."""
 
 import numpy as np
+import pytest
 
-from simtest.rendering import highlights
+from simtest.rendering import Session, highlights
+from simtest.rendering.exact_misfit import exact_misfit
+from simtest.rendering.misfit_grid import crossed, turned_pixels
+from simtest.spec.scene import scene_from_dict
+
+CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}
+RIG = {"lights": [{"position_mm": [3.0, 0.0, 0.0]}, {"position_mm": [-1.0, 4.0, 0.0]}]}
+SURFACES = {
+    "plane": {"type": "plane", "distance_mm": 20, "tilt_deg": 10},
+    "inside": {"type": "cylinder", "distance_mm": 20, "radius_mm": 70, "side": "inside", "spin_deg": 20},
+    "sphere": {"type": "sphere", "distance_mm": 20, "radius_mm": 30},
+    "bead": {"type": "sphere", "distance_mm": 20, "radius_mm": 1.0},
+    "saddle": {"type": "quadric", "distance_mm": 20, "k1_per_mm": 0.03, "k2_per_mm": -0.02, "tilt_deg": 8},
+}
+WIDE = ("plane", "inside", "sphere", "saddle")
+"""Those that fill the frame."""
 
 
-class Facing:
-    """A plane across the optical axis, lit from the camera: the misfit is linear in the pixel and 0 at the centre."""
-
-    def cast(self, points_px):
-        x, y = (np.asarray(points_px) - 50.0).T
-        position = np.stack([x, y, np.full_like(x, 400.0)], axis=1)
-        normal = np.tile([0.0, 0.0, -1.0], (len(position), 1))
-        return SimpleNamespace(position=position, normal=normal), None, None
+def scene(surface, **more):
+    return scene_from_dict({"surface": SURFACES[surface], "camera": CAMERA, "rig": RIG, **more})
 
 
-def test_a_seed_may_be_the_place_itself():
-    found = highlights._newton(Facing(), np.array([[50.0, 50.0], [52.0, 49.0]]), np.zeros(3))
-    np.testing.assert_allclose(found, 50.0, atol=1e-6)
+@pytest.fixture(scope="module")
+def sessions():
+    return {name: Session(scene(name)) for name in WIDE}
+
+
+def test_a_seed_may_be_the_point_itself(sessions):
+    session = sessions["sphere"]
+    lights = session.scene.rig.true_mm()
+    near = np.array([[104.0, 82.0], [95.0, 77.0]])
+    found, owners = highlights._newton(session, near, np.array([0, 0]), lights)
+    again, _ = highlights._newton(session, found, owners, lights)
+    np.testing.assert_allclose(again, found, atol=1e-9)
+    np.testing.assert_allclose(found[0], found[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("surface", WIDE)
+def test_highlights_are_zeros_of_the_misfit(sessions, surface):
+    session = sessions[surface]
+    found = session.highlights(session.radiance())
+    assert sorted(h.light for h in found) == [0, 1]
+    for h in found:
+        light = session.scene.rig.true_mm()[h.light]
+        bisector = -h.position / np.linalg.norm(h.position) + (light - h.position) / np.linalg.norm(light - h.position)
+        assert np.linalg.norm(np.cross(h.normal, bisector)) < 1e-9
+
+
+@pytest.mark.parametrize("surface", WIDE)
+def test_jacobian_is_the_misfits_derivative(sessions, surface):
+    session, step = sessions[surface], 1e-3
+    pixels = np.random.default_rng(5).uniform(40, 120, (20, 2))
+    lights = session.scene.rig.true_mm()[np.arange(20) % 2]
+
+    def state(points):
+        return exact_misfit(session, points, lights, faceted=True)
+
+    for axis in range(2):
+        move = step * np.eye(2)[axis]
+        slope = (state(pixels + move).w - state(pixels - move).w) / (2 * step)
+        jacobian = state(pixels).jacobian
+        # The tangent basis turns with the sightline, which moves w by w itself times the turn.
+        bound = 2 * np.abs(state(pixels).w).max() / CAMERA["fx"] + 1e-7
+        assert np.abs(slope - jacobian[:, :, axis]).max() < bound
+
+
+@pytest.mark.parametrize("surface", WIDE)
+def test_the_grids_misfits_and_steps_are_the_exact_ones(sessions, surface):
+    session = sessions[surface]
+    grid = session.misfit_grid(8)
+    assert grid.w.shape == grid.steps.shape == (2, 2, 22, 27)
+    rows, columns = (index.ravel() for index in np.mgrid[3:19, 3:24])
+    pixels = grid.pixels(rows, columns)
+    assert np.array_equal(pixels[0], [20.5, 20.5])
+    for number, light in enumerate(session.scene.rig.true_mm()):
+        exact = exact_misfit(session, pixels, light, faceted=True)
+        length = np.linalg.norm(grid.w[number], axis=0)[rows, columns]
+        # The misfit across the sightline is at most the whole one.
+        assert (length <= exact.length + 3e-5).all()
+        step = exact.newton_steps()
+        near = np.linalg.norm(step, axis=1) < 20
+        stepped = turned_pixels(session.camera, pixels, grid.steps[number][:, rows, columns].T.astype(float))
+        # A turn of the sightline is a straight step to first order.
+        gap = np.linalg.norm(stepped - pixels - step, axis=1)[near]
+        assert near.any()
+        assert gap.max() < 1.5
+        assert np.median(gap) < 0.5
+
+
+def test_a_cell_that_the_linear_misfit_crosses_holds_its_zero():
+    y, x = np.mgrid[:12, :15].astype(np.float32)
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        zero, matrix = rng.uniform(1, 10, 2), rng.normal(size=(2, 2))
+        w = np.einsum("ij,jhw->ihw", matrix, np.stack([x - zero[0], y - zero[1]]))
+        rows, columns = crossed(w)
+        assert (int(zero[1]), int(zero[0])) in set(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def test_the_order_of_lights_and_what_ran_before_change_nothing(sessions):
+    session = sessions["saddle"]
+    first = [(h.light, *h.bp_px) for h in session.highlights(session.radiance())]
+    alone = []
+    for number in range(2):
+        session.update(scene("saddle", rig={"lights": [RIG["lights"][number]]}))
+        alone += [(number, *h.bp_px) for h in session.highlights(session.radiance())]
+    session.update(scene("saddle"))
+    assert [(h.light, *h.bp_px) for h in session.highlights(session.radiance())] == first
+    np.testing.assert_allclose(sorted(alone), sorted(first), atol=1e-9)
+
+
+def test_seeds_beside_the_surface_find_nothing():
+    session = Session(scene("bead", rig={"lights": [{"position_mm": [0, 0, 0]}]}))
+    (found,) = session.highlights(session.radiance())
+    np.testing.assert_allclose(found.bp_px, [100.0, 80.0], atol=1e-6)
+    none, owners = highlights._newton(session, np.array([[5.0, 5.0]]), np.array([0]), np.zeros((1, 3)))
+    assert none.shape == (0, 2)
+    assert owners.shape == (0,)
+
+
+def test_first_of_each_keeps_the_earliest_of_each_light():
+    points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
+    kept = highlights._first_of_each(points, np.array([0, 0, 1, 0, 0, 0]), 0.5)
+    assert kept.tolist() == [True, False, True, True, False, True]

@@ -148,7 +148,8 @@ def test_a_frame_that_cannot_be_drawn_stops_the_page(run, monkeypatch):
 def test_a_page_is_drawn_without_matplotlib_and_kept_without_what_draws_it(run):
     (run / "index.html").unlink()
     script = (
-        "import sys; from pathlib import Path; from simtest.report import write_report; write_report(Path(sys.argv[1]));"
+        "import sys; from pathlib import Path; from simtest.report import write_report;"
+        "write_report(Path(sys.argv[1]));"
         "print(*sorted({'matplotlib', 'scipy.stats', 'mitsuba', 'cv2', 'polars', 'jinja2', 'PIL'} & set(sys.modules)))"
     )
     loaded = [

@@ -60,10 +60,14 @@ def test_a_single_step_shows_no_bar(bars):
 
 
 def test_a_stop_waits_for_the_next_step(bars):
-    with pytest.raises(KeyboardInterrupt), progress_bar() as move:
-        move(0, 2, "one")
-        signal.raise_signal(signal.SIGINT)
-        move(1, 2, "two")
+    def stopped_between_steps():
+        with progress_bar() as move:
+            move(0, 2, "one")
+            signal.raise_signal(signal.SIGINT)
+            move(1, 2, "two")
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped_between_steps()
     assert not bars[0].live.is_started
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
