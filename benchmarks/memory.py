@@ -5,7 +5,6 @@ shows what adds up; this shows how much there must be.
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -29,6 +28,16 @@ for index in range(samples):
 """
 
 
+# A process starts with its parent's peak, so it is started by a small one.
+_LAUNCHER = """
+import resource, subprocess, sys
+code = subprocess.run([sys.executable, *sys.argv[1:]], stdout=subprocess.DEVNULL).returncode
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss)
+sys.exit(code)
+"""
+
+
 @dataclass(frozen=True)
 class Ended:
     """A process that has ended: its processor time, s, and its peak memory, GB."""
@@ -42,14 +51,15 @@ def run(arguments: list[str]) -> Ended:
 
     The system's account of the one process is used; what its children took is not in the peak.
     """
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"benchmark memory: {' '.join(arguments[:4])}: exit {process.returncode}")
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", _LAUNCHER, *arguments], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"benchmark memory: {' '.join(arguments[:4])}: exit {done.returncode}")
+    processor, peak = (float(word) for word in done.stdout.split()[-2:])
     # Linux counts in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
-    return Ended(used.ru_utime + used.ru_stime, used.ru_maxrss * unit / 1e9)
+    return Ended(processor, peak * unit / 1e9)
 
 
 def figures() -> list[Figure]:

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from benchmarks.measuring import Figure
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
@@ -99,6 +101,7 @@ def smooth_scene(samples: int = 16, camera: Mapping[str, float] | None = None, *
 def steps(session: Session) -> dict[str, Callable[[], object]]:
     """Return what is done with one view of a scene, in the order in which it is done."""
     radiance = session.frame().radiance
+    middle = np.array([[session.camera.width / 2, session.camera.height / 2]])
 
     def search() -> object:
         session._forget_misfits()
@@ -109,7 +112,7 @@ def steps(session: Session) -> dict[str, Callable[[], object]]:
         "radiance": session.radiance,
         "labelled frame": session.frame,
         "search for highlights": search,
-        "cast of one ray": lambda: session.cast(session.camera.pixel_centres()[240:241, 320]),
+        "cast of one ray": lambda: session.cast(middle),
     }
 
 
