@@ -51,8 +51,8 @@ class ViewMask:
 
     def __post_init__(self) -> None:
         for name in ("cx", "cy", "radius", "corner", "half_height"):
-            if (value := getattr(self, name)) is not None:
-                check_number(f"view_mask.{name}", value)
+            if name not in ("corner", "half_height") or getattr(self, name) is not None:
+                check_number(f"view_mask.{name}", getattr(self, name))
         for name in ("radius", "half_height"):
             if (value := getattr(self, name)) is not None and value <= 0:
                 raise InputError(f"view_mask.{name} = {value!r}: must be > 0")

@@ -49,7 +49,7 @@ def test_cuts_of_no_length_leave_a_rectangle():
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"corner": -1.0}, "view_mask.corner = -1.0: must lie from 0 to 10"),
+        ({"corner": -1.0}, "view_mask.corner = -1.0: must lie between 0 and 10"),
         ({"corner": 11.0}, "view_mask.corner = 11.0"),
         ({"half_height": 5.0}, "view_mask.half_height = 5.0: needs corner"),
         ({"corner": 1.0, "half_height": 0.0}, "view_mask.half_height = 0.0: must be > 0"),
