@@ -16,10 +16,11 @@ from simtest.detection.blobs import Highlight
 from simtest.detection.colour import ColourDetector
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from simtest.reconstruction.image_io import is_coloured
 from simtest.runtime.arrays import Array, Image, Mask
 
 CLIPPED = 250 / 255
-"""A highlight is clipped where all channels of a pixel above half of its peak reach this encoded value."""
+"""A highlight is clipped where a channel of its peak reaches this encoded value: coding leaves few peaks at 1."""
 
 LEAST_SIDE = 64
 """Frames below this size, px, hold no spectrum between 4 and 64 px."""
@@ -97,8 +98,8 @@ def measure(picture: Image) -> Measured:
     InputError
         If the picture has no colours or is smaller than 64 px.
     """
-    if picture.ndim != 3 or picture.shape[2] != 3:
-        raise InputError(f"frame has shape {picture.shape}: realism takes colour frames, (H, W, 3)")
+    if not is_coloured(picture):
+        raise InputError(f"frame of shape {picture.shape} has no colours: realism takes colour frames, (H, W, 3)")
     height, width = picture.shape[:2]
     if min(height, width) < LEAST_SIDE:
         raise InputError(f"frame of {width} x {height} px: must be at least {LEAST_SIDE} px along both sides")
@@ -140,7 +141,7 @@ def _highlights(
     """Measure count, size, shape, clipping, area, clustering and halos of a frame's highlights."""
     area, width = int(np.count_nonzero(seen)), picture.shape[1]
     radii = np.array([_radius(h) for h in highlights])
-    clipped = picture.min(axis=2) >= CLIPPED
+    clipped = picture.max(axis=2) >= CLIPPED
     tops = [bool(clipped[h.region.peak[::-1]]) for h in highlights]
     return {
         "per_frame": np.array([len(highlights)]),
@@ -148,7 +149,7 @@ def _highlights(
         "radius": radii / width,
         "axis_ratio": np.array([h.axis_ratio for h in highlights if h.axis_ratio is not None]),
         "clipped": np.array([np.mean(tops)] if tops else []),
-        "area": np.array([np.count_nonzero(bright & seen) / area if area else np.nan]),
+        "area": np.array([sum(h.area_px for h in highlights) / area if area else np.nan]),
         "clustering": _clustering(np.array([h.region.peak for h in highlights], dtype=float), radii),
         "halo": _halos(bright, luma, seen),
     }
