@@ -21,36 +21,74 @@ FOLD_CIRCLE = 256
 
 @dataclass(frozen=True)
 class ViewMask:
-    """The round field of view of an endoscope: pixels whose centres lie outside see nothing.
+    """The field of view of an endoscope: pixels whose centres lie outside see nothing.
+
+    Round, or a rectangle with corners cut at 45 deg, as a video processor masks the picture of a colonoscope.
 
     Parameters
     ----------
     cx, cy : float
         Centre, px, pixel centres at integer + 0.5.
     radius : float
-        px; positive.
+        Radius, or half width of the rectangle, px; positive.
+    corner : float, optional
+        Length that each cut takes off the sides that it joins, px; None: round. A square with corners of
+        ``(2 - sqrt(2)) * radius`` is a regular octagon.
+    half_height : float, optional
+        Of the rectangle, px; default `radius`.
 
     Raises
     ------
     InputError
-        If a number is not finite or the radius is not positive.
+        If a number is not finite, the radius is not positive, or the cuts are longer than the sides.
     """
 
     cx: float
     cy: float
     radius: float
+    corner: float | None = None
+    half_height: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("cx", "cy", "radius"):
-            check_number(f"view_mask.{name}", getattr(self, name))
-        if self.radius <= 0:
-            raise InputError(f"view_mask.radius = {self.radius!r}: must be > 0")
+        for name in ("cx", "cy", "radius", "corner", "half_height"):
+            if name not in ("corner", "half_height") or getattr(self, name) is not None:
+                check_number(f"view_mask.{name}", getattr(self, name))
+        for name in ("radius", "half_height"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise InputError(f"view_mask.{name} = {value!r}: must be > 0")
+        if self.corner is None:
+            if self.half_height is not None:
+                raise InputError(f"view_mask.half_height = {self.half_height!r}: needs corner; a round view has none")
+            return
+        most = min(self.radius, self.half_height or self.radius)
+        if not 0 <= self.corner <= most:
+            raise InputError(
+                f"view_mask.corner = {self.corner!r}: must lie between 0 and {most:g}, half the shorter side"
+            )
 
     def contains(self, points_px: npt.ArrayLike) -> Mask:
-        """Return which pixel positions, shape (..., 2), lie inside the circle."""
+        """Return which pixel positions, shape (..., 2), lie inside."""
         points = np.asarray(points_px, dtype=float)
-        # Squared distances, as in the renderer, so that both decide alike at the border.
-        return np.asarray((points[..., 0] - self.cx) ** 2 + (points[..., 1] - self.cy) ** 2 <= self.radius**2)
+        x, y = points[..., 0] - self.cx, points[..., 1] - self.cy
+        # Terms as in the renderer, so that both decide alike at the border.
+        if self.corner is None:
+            return np.asarray(x**2 + y**2 <= self.radius**2)
+        across, down = np.abs(x), np.abs(y)
+        height = self.half_height or self.radius
+        within = (across <= self.radius) & (down <= height)
+        return np.asarray(within & (across + down <= self.radius + height - self.corner))
+
+    def outline(self, count: int) -> Array:
+        """Return points on the border, shape (N, 2), px; `count` on a circle or on each side of a rectangle."""
+        if self.corner is None:
+            phase = np.linspace(0, 2 * np.pi, count)
+            return np.array([self.cx, self.cy]) + self.radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+        w, h, c = self.radius, self.half_height or self.radius, self.corner
+        right = np.array([[w - c, -h], [w, c - h], [w, h - c], [w - c, h]])
+        corners = np.concatenate([right, -right])
+        share = np.linspace(0, 1, count)[:, None]
+        sides = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+        return np.array([self.cx, self.cy]) + np.concatenate(sides)
 
 
 @dataclass(frozen=True)
@@ -107,14 +145,12 @@ class Camera:
 
     def _check_fold(self, distortion: Distortion) -> None:
         """Raise `InputError` where a pixel that should be seen has no sightline on the lens's first branch."""
-        # candidates: a grid over the image, and the circle of the view mask
+        # candidates: a grid over the image, and the border of the view mask
         x, y = (np.linspace(0.0, size, FOLD_GRID) for size in (self.width, self.height))
         tried = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.view_mask is not None:
-            phase = np.linspace(0, 2 * np.pi, FOLD_CIRCLE)
-            centre, radius = [self.view_mask.cx, self.view_mask.cy], self.view_mask.radius
-            circle = centre + radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
-            tried = np.concatenate([tried[self.view_mask.contains(tried)], circle])
+            border = self.view_mask.outline(FOLD_CIRCLE)
+            tried = np.concatenate([tried[self.view_mask.contains(tried)], border])
             tried = tried[(tried >= 0).all(axis=1) & (tried <= [self.width, self.height]).all(axis=1)]
         # reject a camera with a folded point, and name the one nearest to the principal point
         folded = tried[np.isnan(self.unproject(tried)).any(axis=1)]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.geometry.camera import Camera
+from simtest.geometry.camera import Camera, ViewMask
 from simtest.runtime.arrays import Array, Mask
 
 Pixels = npt.NDArray[np.uint32]
@@ -107,7 +107,7 @@ class Sightlines:
         self._numbers = {name: mi.Float64(value) for name, value in numbers.items()}
         mask = camera.view_mask
         # In double precision, to decide as `Camera.seen` does.
-        self._mask = None if mask is None else [mi.Float64(v) for v in (mask.cx, mask.cy, mask.radius**2)]
+        self._mask = None if mask is None else _mask_numbers(mi, mask)
         self._width, self._tiles = mi.UInt32(camera.width), mi.UInt32(-(-camera.width // TILE))
         dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
         dr.make_opaque(self._mask, self._width, self._tiles)
@@ -180,11 +180,10 @@ class Sightlines:
             # No NaN may enter the renderer.
             directions = np.where(imaged[:, None], directions, [0.0, 0.0, 1.0])
             sightline, active = mi.Vector3d(np.ascontiguousarray(directions.T)), mi.Bool(imaged)
-        # Round field of view.
+        # Field of view.
         if self._mask is not None:
-            cx, cy, squared = self._mask
             column, row = (mi.Float64(dr.floor(v)) + PIXEL_CENTRE for v in (x, y))
-            active &= dr.square(column - cx) + dr.square(row - cy) <= squared
+            active &= _is_seen(self._mask, column, row)
         direction = self._rotation @ sightline
         traced = mi.Ray3f(mi.Point3f(self._origin), mi.Vector3f(direction))
         return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
@@ -192,13 +191,13 @@ class Sightlines:
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
         """Return origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
 
-        Positions outside the round field of view have rays too; NaN where the camera has no sightline.
+        Positions outside the field of view have rays too; NaN where the camera has no sightline.
         """
         directions = self.camera.unproject(points_px) @ self.pose[:3, :3].T
         return np.broadcast_to(self.pose[:3, 3], directions.shape), directions
 
     def in_view(self, points_px: Array) -> tuple[Array, Array]:
-        """Return origins and directions as `in_model` does; NaN outside the round field of view."""
+        """Return origins and directions as `in_model` does; NaN outside the field of view."""
         origins, directions = self.in_model(points_px)
         mask = self.camera.view_mask
         return origins, directions if mask is None else np.where(mask.contains(points_px)[:, None], directions, np.nan)
@@ -213,6 +212,27 @@ def in_tiles(chosen: Mask) -> Pixels:
     tile, cell = np.nonzero(whole.reshape(down, TILE, across, TILE).swapaxes(1, 2).reshape(-1, TILE * TILE))
     row, column = tile // across * TILE + cell // TILE, tile % across * TILE + cell % TILE
     return (row * width + column).astype(np.uint32)
+
+
+def _mask_numbers(mi: Any, mask: ViewMask) -> list[Any]:
+    """Return a view mask's centre and limits for the kernel: the circle's square, or those of sides and cuts."""
+    limits = [mask.radius**2]
+    if mask.corner is not None:
+        height = mask.half_height or mask.radius
+        limits = [mask.radius, height, mask.radius + height - mask.corner]
+    return [mi.Float64(value) for value in (mask.cx, mask.cy, *limits)]
+
+
+def _is_seen(numbers: list[Any], column: Any, row: Any) -> Any:
+    """Return which pixels lie inside a view mask (see `_mask_numbers`), with the terms of `ViewMask.contains`."""
+    import drjit as dr
+
+    cx, cy, *limits = numbers
+    x, y = column - cx, row - cy
+    if len(limits) == 1:
+        return dr.square(x) + dr.square(y) <= limits[0]
+    across, down = dr.abs(x), dr.abs(y)
+    return (across <= limits[0]) & (down <= limits[1]) & (across + down <= limits[2])
 
 
 def untile(values: Any, size: tuple[int, int]) -> Any:

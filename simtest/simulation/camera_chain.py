@@ -1,18 +1,27 @@
-"""The camera chain: point spread, vignetting, exposure, noise, saturation, response, quantisation.
+"""The camera chain: lens, sensor and video processor, in the order of `spec.Sensor`.
 
-`collect` is the lens, `capture` the sensor. Images are float32, shape (H, W) or (H, W, 3).
+`collect` is the lens, `capture` the sensor, and `encode` what follows its linear values. Images are float32, shape
+(H, W) or (H, W, 3).
 """
+
+import math
 
 import numpy as np
 
 from simtest.calibration import srgb_encode
 from simtest.calibration.calibration import falloff_map
 from simtest.geometry import Camera, smooth
-from simtest.runtime.arrays import Image, Picture
+from simtest.runtime.arrays import Image, Mask, Picture
+from simtest.simulation import mosaic, video_processor
+from simtest.simulation.coding import code
 from simtest.spec.sensor import Sensor
 
 MAX_COUNT = 1e15
 """Beyond this many electrons shot noise is below the resolution of a float32 frame, and no Poisson numbers exist."""
+
+
+METERED = 20_000
+"""Pixels by which the automatic exposure measures a frame, evenly spread over it."""
 
 
 def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
@@ -29,7 +38,9 @@ def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
     return np.asarray(light * (share if light.ndim == 2 else share[:, :, None]), dtype=np.float32)
 
 
-def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Generator | None) -> Image:
+def capture(
+    light: Image, full_scale: float, sensor: Sensor, rng: np.random.Generator | None, seen: Mask | None = None
+) -> Image:
     """Compute the sensor's frame, as encoded: in [0, 1] where the sensor clips.
 
     Parameters
@@ -42,29 +53,65 @@ def capture(light: Image, full_scale: float, sensor: Sensor, rng: np.random.Gene
         The sensor.
     rng : numpy.random.Generator or None
         Draws shot noise, then read noise, then white noise; may be None where there is no noise.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the camera's view mask; default all.
+
+    Returns
+    -------
+    ndarray of float32
+        Of the light's shape, (H, W, 3) with a mosaic or colour processing.
 
     Raises
     ------
+    InputError
+        If a package for the coding is missing.
     ValueError
         If noise is asked for without a generator.
     """
+    # The sensor's own colours, each pixel behind its filter.
+    if sensor.colour is not None or sensor.mosaic is not None:
+        light, full_scale = expose(light, full_scale, 0.0, None), 1.0
+        light = light if sensor.colour is None else video_processor.as_seen_by_sensor(light, sensor.colour)
+        light = light if sensor.mosaic is None else mosaic.sample(light, sensor.mosaic)
     # Electrons: shot and read noise.
     if sensor.full_well is not None:
         light = _electrons(expose(light, full_scale, 0.0, None), sensor.full_well, sensor.read_noise, rng)
         full_scale = 1.0
     # White noise, then the sensor's values.
     frame = expose(light, full_scale, sensor.noise_sigma, rng)
-    return encode(frame, sensor) if sensor.clips else frame
+    # The picture's colours.
+    if sensor.mosaic is not None:
+        frame = mosaic.demosaic(frame, sensor.mosaic)
+    if sensor.colour is not None:
+        frame = video_processor.develop(frame, sensor.colour, sensor.clips)
+    return encode(frame, sensor, seen) if sensor.clips or sensor.is_processed else frame
 
 
-def encode(frame: Image, sensor: Sensor) -> Image:
-    """Clip a linear frame to full scale, apply the response and quantise."""
-    # Saturation and response, then quantisation.
-    values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0))
+def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
+    """Turn a linear frame into the picture: clip, apply the response, process, quantise and code it.
+
+    `seen`, shape (H, W), are the pixels inside the camera's view mask, default all.
+    """
+    values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0) if sensor.clips else frame)
+    if sensor.is_processed:
+        values = np.asarray(_processed(values.astype(np.float32), sensor, seen), dtype=float)
     if sensor.bits is not None:
         largest = 2**sensor.bits - 1
         values = np.rint(values * largest) / largest
+    if sensor.coding is not None:
+        values = code(np.rint(values * 255).astype(np.uint8), sensor.coding) / 255
     return values.astype(np.float32)
+
+
+def _processed(picture: Image, sensor: Sensor, seen: Mask | None) -> Image:
+    """Sharpen, scale and draw, in this order."""
+    if sensor.sharpening is not None:
+        picture = video_processor.sharpen(picture, sensor.sharpening)
+        picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
+    if sensor.scaling is not None:
+        picture = video_processor.rescale(picture, sensor.scaling)
+        picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
+    return picture if sensor.overlay is None else video_processor.draw(picture, sensor.overlay, seen)
 
 
 def _electrons(frame: Image, full_well: float, read_noise: float, rng: np.random.Generator | None) -> Image:
@@ -97,6 +144,27 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
             raise ValueError("noise needs a generator")
         frame = frame + np.float32(noise_sigma) * rng.standard_normal(radiance.shape, dtype=np.float32)
     return np.asarray(frame, dtype=np.float32)
+
+
+def full_scale_of_average(light: Image, average: float, sensor: Sensor) -> float:
+    """Return the radiance at full scale for which the mean of the clipped, encoded light is `average`.
+
+    `light` is noise-free, any shape; at least one value is positive. Where even the smallest full scale leaves the mean
+    below `average`, since too few pixels receive light, it is the smallest.
+    """
+    response, peak = sensor.response.model(), float(light.max())
+    # An automatic exposure measures fields, not single pixels.
+    values = light.ravel()[:: max(1, light.size // METERED)]
+
+    def excess(log_scale: float) -> float:
+        return float(response.encode(np.clip(values / math.exp(log_scale), 0.0, 1.0)).mean()) - average
+
+    # Between the brightest pixel and a tiny share of it the mean falls steadily with the full scale.
+    low, high = math.log(peak * 1e-6), math.log(peak * 1e3)
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return math.exp((low + high) / 2)
 
 
 def to_uint8(frame: Image) -> Picture:

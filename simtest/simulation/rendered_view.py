@@ -12,7 +12,7 @@ from simtest.rendering import HighlightPoint, Radiance, Session, glints
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
 from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
@@ -71,7 +71,7 @@ class RenderedView:
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
-        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed))
+        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed), self.calibration.camera.seen)
 
 
 def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
@@ -142,9 +142,11 @@ def _full_scale(
     if peak <= 0:
         warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=4)
         return 0.0
-    # Fixed by the scene, or by a percentile of the frame, or by its brightest isolated highlight.
+    # Fixed by the scene, or by the frame, or by its brightest isolated highlight.
     if exposure.full_scale is not None:
         radiance = exposure.full_scale
+    elif exposure.average is not None:
+        radiance = full_scale_of_average(light if seen is None else light[seen], exposure.average, scene.sensor)
     elif exposure.percentile is not None:
         radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))
         if radiance <= LEAST_SHARE * peak:

@@ -69,9 +69,13 @@ DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec, Field(discrimin
 
 
 class ViewMaskSpec(Spec):
-    """The round field of view of an endoscope; pixels whose centres lie outside see nothing."""
+    """The field of view of an endoscope, a circle or a rectangle with cut corners; outside, pixels see nothing."""
 
-    radius: float = Field(gt=0, le=1e6, description="px")
+    radius: float = Field(gt=0, le=1e6, description="of the circle, or half width of the rectangle, px")
+    corner: float | None = Field(
+        None, ge=0, le=1e6, description="what the cuts take off the sides of a rectangle, px; default a circle"
+    )
+    half_height: float | None = Field(None, gt=0, le=1e6, description="of the rectangle, px; default radius: a square")
     cx: PrincipalPoint | None = Field(None, description="centre, px; default the image's centre")
     cy: PrincipalPoint | None = Field(None, description="centre, px; default the image's centre")
 
@@ -109,7 +113,8 @@ class CameraSpec(Spec):
         lens = None if self.distortion is None else self.distortion.model()
         mask = None
         if self.view_mask is not None:
-            mask = ViewMask(*_centre(self.view_mask.cx, self.view_mask.cy, middle), self.view_mask.radius)
+            told = self.view_mask
+            mask = ViewMask(*_centre(told.cx, told.cy, middle), told.radius, told.corner, told.half_height)
         return Camera(self.width, self.height, self.fx, self.fy, cx, cy, self.skew, lens, mask)
 
 

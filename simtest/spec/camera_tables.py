@@ -43,7 +43,7 @@ def camera_table(camera: Camera) -> CameraTable:
         kind = "brown_conrady" if isinstance(camera.distortion, BrownConrady) else "kannala_brandt"
         table["distortion"] = {"type": kind, **asdict(camera.distortion)}
     if camera.view_mask is not None:
-        table["view_mask"] = asdict(camera.view_mask)
+        table["view_mask"] = {name: value for name, value in asdict(camera.view_mask).items() if value is not None}
     return table
 
 

@@ -1,6 +1,7 @@
 """The sensor of a scene, which turns radiance into a frame."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -8,7 +9,9 @@ from simtest.calibration import NoiseModel, Response
 from simtest.calibration.response import check_table
 from simtest.errors import InputError
 from simtest.spec.falloff import CosineProfile, Profile
-from simtest.spec.spec_model import Share, Spec
+from simtest.spec.processing import Coding, ColourProcessing, Mosaic, Overlay, Scaling, Sharpening
+from simtest.spec.sensor_presets import PRESETS, SensorPreset
+from simtest.spec.spec_model import Share, Spec, with_preset
 
 FullWell = Annotated[float, Field(ge=1, le=1e9)]
 ReadNoise = Annotated[float, Field(ge=0, le=1e6)]
@@ -86,21 +89,37 @@ class Exposure(Spec):
         le=100,
         description="automatic: this percentile of the frame's radiance, inside the view mask, becomes full scale",
     )
+    average: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="automatic: the mean value of the picture, clipped and encoded, inside the view mask; tissue keeps "
+        "its level, and highlights clip",
+    )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 
     @model_validator(mode="after")
     def _one_way(self) -> "Exposure":
-        if self.full_scale is not None and self.percentile is not None:
-            raise ValueError("full_scale and percentile exclude each other; give one of them")
+        given = [name for name in ("full_scale", "percentile", "average") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
         return self
+
+
+def _rules(exposure: Any) -> dict[str, Any]:
+    """Return what a table of exposure gives of the keys that exclude each other."""
+    given = exposure if isinstance(exposure, Mapping) else {}
+    return {name: given[name] for name in ("full_scale", "percentile", "average") if name in given}
 
 
 class Sensor(Spec):
     """From radiance to a frame, in this order.
 
-    Point spread, vignetting, exposure, noise, saturation, response, quantisation.
+    Point spread, vignetting, exposure, colour filter mosaic, noise, demosaicing, white balance and colour matrix,
+    saturation, response, sharpening, scaling, captions, quantisation, coding.
     """
 
+    preset: SensorPreset | None = Field(None, description="whose numbers hold where none are given; default none")
     point_spread_px: float = Field(0.0, ge=0, le=50, description="standard deviation of the Gaussian point spread, px")
     vignetting: Profile = Field(
         CosineProfile(), description="share of the light that is left, over the angle from the optical axis"
@@ -118,16 +137,47 @@ class Sensor(Spec):
     )
     response: ResponseSpec = LinearResponse()
     bits: Bits | None = Field(None, description="of the values; default not quantised")
+    mosaic: Mosaic | None = Field(None, description="default: each pixel measures all colours")
+    colour: ColourProcessing | None = Field(None, description="default: the sensor's colours are the picture's")
+    sharpening: Sharpening | None = Field(None, description="default none")
+    scaling: Scaling | None = Field(None, description="default: recorded at the camera's size")
+    overlay: Overlay | None = Field(None, description="default: nothing is drawn")
+    coding: Coding | None = Field(None, description="lossy coding of the picture; needs bits = 8; default none")
     response_known: bool = Field(True, description="whether reconstruction knows the response; else it assumes linear")
     vignetting_known: bool = Field(
         True, description="whether reconstruction knows the vignetting; else it assumes none"
     )
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the noise; experiments draw one for each realisation")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _from_preset(cls, data: Any) -> Any:
+        """Fill in the preset's numbers; an unknown preset is refused by its field."""
+        named = data.get("preset") if isinstance(data, Mapping) else None
+        preset = PRESETS.get(named) if isinstance(named, str) else None
+        if preset is None:
+            return data
+        filled = with_preset(data, preset)
+        if any(value is not None for value in _rules(data.get("exposure")).values()):
+            # The rules of exposure exclude each other, so a given one replaces the preset's.
+            filled["exposure"] = data["exposure"]
+        return filled
+
     @model_validator(mode="after")
     def _electrons(self) -> "Sensor":
         check_electrons(self.full_well, self.read_noise)
         return self
+
+    @model_validator(mode="after")
+    def _codable(self) -> "Sensor":
+        if self.coding is not None and self.bits != 8:
+            raise ValueError(f"bits = {self.bits}: must be 8 where coding is given")
+        return self
+
+    @property
+    def is_processed(self) -> bool:
+        """Whether the picture goes through stages behind the response, which change neighbouring pixels."""
+        return any(stage is not None for stage in (self.sharpening, self.scaling, self.overlay, self.coding))
 
     @property
     def encodes(self) -> bool:
@@ -137,7 +187,7 @@ class Sensor(Spec):
     @property
     def clips(self) -> bool:
         """Whether values end at full scale."""
-        return self.saturation or self.encodes
+        return self.saturation or self.encodes or self.mosaic is not None
 
     def noise_model(self) -> NoiseModel:
         """Return the noise of one channel of the linear frame as a function of its level."""

@@ -50,6 +50,20 @@ class Spec(BaseModel):
         return data
 
 
+def with_preset(data: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a model's keys with a preset's where none are given.
+
+    A table that both give is the preset's with the given keys replaced, unless the two are of different types.
+    """
+    filled = {**preset, **data}
+    for name, value in preset.items():
+        given = data.get(name)
+        if isinstance(value, Mapping) and isinstance(given, Mapping):
+            alike = given.get("type", value.get("type")) == value.get("type")
+            filled[name] = {**value, **given} if alike else given
+    return filled
+
+
 @cache
 def _leaf_types(annotation: Any) -> frozenset[Any]:
     """Return the types at the leaves of an annotation such as ``tuple[float, float] | None``."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from simtest.spec.spec_model import Share, Spec
+from simtest.spec.spec_model import Share, Spec, with_preset
 
 Preset = Literal["colon_mucosa", "liver_capsule", "gallbladder", "stomach"]
 
@@ -112,13 +112,4 @@ class TissueColour(Spec):
             return data
         named = data.get("preset", "colon_mucosa")
         preset = PRESETS.get(named) if isinstance(named, str) else None
-        if preset is None:
-            return data
-        filled = dict(data)
-        for name, value in preset.items():
-            given = data.get(name)
-            if name not in data:
-                filled[name] = dict(value) if isinstance(value, Mapping) else value
-            elif isinstance(value, Mapping) and isinstance(given, Mapping):
-                filled[name] = {**value, **given}
-        return filled
+        return data if preset is None else with_preset(data, preset)

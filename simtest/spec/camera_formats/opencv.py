@@ -272,4 +272,9 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
 def _shifted_mask(camera: Camera) -> list[float] | None:
     """Return the view mask's centre and radius in the other convention; OpenCV and ROS skip a key that they lack."""
     mask = camera.view_mask
-    return None if mask is None else [float(mask.cx) - PIXEL_CENTRE, float(mask.cy) - PIXEL_CENTRE, float(mask.radius)]
+    if mask is None:
+        return None
+    if mask.corner is not None:
+        corner = f"camera.view_mask.corner = {mask.corner:g}"
+        raise InputError(f"{corner}: OpenCV and ROS know round views alone; must be left out, or saved as TOML")
+    return [float(mask.cx) - PIXEL_CENTRE, float(mask.cy) - PIXEL_CENTRE, float(mask.radius)]

@@ -1,0 +1,360 @@
+"""Stages of the camera chain behind the lens, each against a plain reference or a closed form."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage, stats
+
+from simtest.errors import InputError
+from simtest.simulation import camera_chain, coding, mosaic, video_processor
+from simtest.spec.processing import (
+    Box,
+    Caption,
+    H264Coding,
+    JpegCoding,
+    Mosaic,
+    Overlay,
+    Scaling,
+    Sharpening,
+)
+from simtest.spec.scene import scene_from_dict
+from simtest.spec.sensor import Sensor
+
+PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
+
+
+def picture(shape=(48, 64, 3), seed=0, smooth=2.0):
+    """Return a smooth random picture in [0, 1]."""
+    noise = np.random.default_rng(seed).standard_normal(shape)
+    blurred = ndimage.gaussian_filter(noise, (smooth, smooth, 0)[: len(shape)])
+    return ((blurred - blurred.min()) / np.ptp(blurred)).astype(np.float32)
+
+
+def sensor(**keys):
+    return Sensor.model_validate(keys)
+
+
+# Mosaic ---------------------------------------------------------------------------------------------------------------
+
+
+def colour_at(pattern, row, column):
+    return "rgb".index(pattern[2 * (row % 2) + column % 2])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_each_pixel_measures_the_colour_of_its_filter(pattern):
+    frame = picture((5, 7, 3))
+    plane = mosaic.sample(frame, Mosaic(pattern=pattern))
+    expected = [[frame[i, j, colour_at(pattern, i, j)] for j in range(7)] for i in range(5)]
+    np.testing.assert_array_equal(plane, np.array(expected))
+
+
+def bilinear(plane, pattern):
+    """Fill in each colour by the mean of its nearest measured neighbours."""
+    height, width = plane.shape
+    filled = np.zeros((height, width, 3))
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            for channel in range(3):
+                if colour_at(pattern, i, j) == channel:
+                    filled[i, j, channel] = plane[i, j]
+                    continue
+                near = [(i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+                own = [p for p in near if colour_at(pattern, *p) == channel]
+                closest = min(abs(p[0] - i) + abs(p[1] - j) for p in own)
+                filled[i, j, channel] = np.mean([plane[p] for p in own if abs(p[0] - i) + abs(p[1] - j) == closest])
+    return filled
+
+
+def edge_aware(plane, pattern):
+    """The same, but green at red and blue pixels along the direction in which green changes less."""
+    filled = bilinear(plane, pattern)
+    for i in range(1, plane.shape[0] - 1):
+        for j in range(1, plane.shape[1] - 1):
+            if colour_at(pattern, i, j) != 1:
+                across, down = plane[i, [j - 1, j + 1]], plane[[i - 1, i + 1], j]
+                chosen = across if abs(across[0] - across[1]) < abs(down[0] - down[1]) else down
+                filled[i, j, 1] = chosen.mean()
+    return filled
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize(("method", "reference"), [("bilinear", bilinear), ("edge_aware", edge_aware)])
+def test_demosaicing_equals_a_plain_reference_to_rounding(pattern, method, reference):
+    spec = Mosaic(pattern=pattern, demosaicing=method)
+    plane = mosaic.sample(picture((24, 30, 3), smooth=1.0), spec)
+    found = mosaic.demosaic(plane, spec)
+    inside = np.s_[2:-2, 2:-2]
+    gap = np.abs(found[inside] - reference(plane, pattern)[inside])
+    # Red and blue of the edge-aware method differ in how they are rounded and, at edges, filled.
+    channels = [1] if method == "edge_aware" else [0, 1, 2]
+    assert gap[..., channels].max() <= 1.5 / 65535
+    # Negative control: another pattern is not this one.
+    other = PATTERNS[(PATTERNS.index(pattern) + 1) % 4]
+    assert np.abs(found[inside] - reference(plane, other)[inside]).max() > 0.01
+
+
+@pytest.mark.parametrize("method", ["bilinear", "vng", "edge_aware"])
+def test_demosaicing_keeps_a_constant_and_the_measured_values(method):
+    spec = Mosaic(demosaicing=method)
+    constant = np.broadcast_to(np.float32([0.2, 0.5, 0.7]), (16, 16, 3))
+    step = 1 / 65535 if method != "vng" else 2 / 255
+    found = mosaic.demosaic(mosaic.sample(constant, spec), spec)
+    np.testing.assert_allclose(found, constant, atol=step)
+    frame = picture(seed=3)
+    found = mosaic.demosaic(mosaic.sample(frame, spec), spec)[4:-4, 4:-4]
+    again = mosaic.sample(found, spec)
+    np.testing.assert_allclose(again, mosaic.sample(frame[4:-4, 4:-4], spec), atol=step)
+
+
+def test_demosaicing_of_an_edge_shows_false_colour():
+    """What a mosaic does to a white edge: grey pixels become coloured; without one they do not."""
+    edge = np.repeat((np.arange(32) > 15).astype(np.float32)[None, :], 32, axis=0)
+    white = np.repeat(edge[..., None], 3, axis=2)
+    found = camera_chain.capture(white, 1.0, sensor(mosaic={"demosaicing": "bilinear"}), None)
+    assert np.ptp(found[4:-4, 4:-4], axis=2).max() > 0.4
+    assert np.ptp(camera_chain.capture(white, 1.0, sensor(saturation=True), None), axis=2).max() == 0
+    # A mono frame is white light.
+    np.testing.assert_array_equal(
+        camera_chain.capture(edge, 1.0, sensor(mosaic={"demosaicing": "bilinear"}), None), found
+    )
+
+
+# Colour ---------------------------------------------------------------------------------------------------------------
+
+WARM = {"white_balance": [2.0, 1.0, 1.6], "matrix": [[1.6, -0.4, -0.2], [-0.3, 1.5, -0.2], [0.0, -0.6, 1.6]]}
+
+
+def test_colour_processing_undoes_the_sensors_colours():
+    frame = 0.3 + 0.3 * picture()
+    found = camera_chain.capture(frame, 1.0, sensor(colour=WARM), None)
+    np.testing.assert_allclose(found, frame, atol=2e-6)
+    assert found.dtype == np.float32
+
+
+def test_white_stays_white_and_a_large_gain_is_noisy():
+    white = np.full((200, 200, 3), 0.5, np.float32)
+    told = sensor(colour={"white_balance": [4.0, 1.0, 1.0]}, full_well=5000)
+    found = camera_chain.capture(white, 1.0, told, np.random.default_rng(0))
+    assert found.mean(axis=(0, 1)) == pytest.approx([0.5] * 3, rel=2e-3)
+    # A quarter of the light: the variance of the value grows fourfold.
+    ratio = found[..., 0].var() / found[..., 1].var()
+    assert ratio == pytest.approx(4.0, rel=0.06)
+
+
+def test_a_highlight_of_a_tinted_sensor_is_white():
+    """Behind gains of at least 1 a pixel that fills all wells is white, whatever the gains."""
+    bright = np.full((8, 8, 3), 50.0, np.float32)
+    found = camera_chain.capture(bright, 1.0, sensor(colour=WARM, saturation=True), None)
+    np.testing.assert_allclose(found, 1.0, atol=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("colour", "words"),
+    [
+        ({"matrix": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "must be invertible"),
+        ({"matrix": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "white stays white"),
+        ({"white_balance": [0, 1, 1]}, "white_balance"),
+    ],
+)
+def test_bad_colours_are_named(colour, words):
+    with pytest.raises(InputError, match=words) as caught:
+        scene_from_dict({"surface": {"type": "plane"}, "sensor": {"colour": colour}})
+    assert "\n" not in str(caught.value)
+
+
+# Detail ---------------------------------------------------------------------------------------------------------------
+
+
+def test_sharpening_equals_direct_convolution():
+    frame = picture((40, 50, 3))
+    spec = Sharpening(radius_px=1.3, amount=0.9)
+    found = video_processor.sharpen(frame, spec)
+    value = frame @ np.float32([0.299, 0.587, 0.114])
+    # OpenCV takes the Gaussian of floats out to 4 sigma.
+    radius = (round(1.3 * 4 * 2 + 1) | 1) // 2
+    smooth = ndimage.gaussian_filter(value.astype(float), 1.3, radius=radius, mode="mirror")
+    np.testing.assert_allclose(found, frame + (0.9 * (value - smooth))[..., None], atol=2e-6)
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.5, 1.5])
+def test_halo_of_a_step_has_its_closed_form(amount):
+    """Beside a step of height h the sharpened value undershoots by amount h (1 - Phi(1/2 / sigma)): the dark halo."""
+    low, high, sigma = 0.3, 0.8, 2.0
+    edge = np.where(np.arange(64) < 32, low, high).astype(np.float32)
+    frame = np.repeat(edge[None, :], 16, axis=0)
+    found = video_processor.sharpen(frame, Sharpening(radius_px=sigma, amount=amount))
+    depth = low - found[8, 31]
+    assert depth == pytest.approx(amount * (high - low) * stats.norm.sf(0.5 / sigma), abs=2e-3)
+    assert (depth > 0.01) == (amount > 0)
+
+
+@given(st.floats(0.3, 0.95), st.sampled_from(["linear", "cubic", "area", "lanczos"]))
+@settings(max_examples=20, deadline=None)
+def test_scaling_keeps_size_and_mean_and_loses_detail(factor, method):
+    frame = picture((40, 60), seed=1, smooth=1.0)
+    found = video_processor.rescale(frame, Scaling(factor=factor, method=method))
+    assert found.shape == frame.shape
+    assert found.mean() == pytest.approx(frame.mean(), abs=0.01)
+    assert np.abs(np.diff(found)).mean() < np.abs(np.diff(frame)).mean()
+
+
+def test_scaling_by_half_averages_areas():
+    frame = picture((32, 48), smooth=0.5)
+    found = video_processor.rescale(frame, Scaling(factor=0.5, method="area"))
+    halves = frame.reshape(16, 2, 24, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(found, halves.repeat(2, axis=0).repeat(2, axis=1), atol=1e-6)
+
+
+# Graphics -------------------------------------------------------------------------------------------------------------
+
+
+def test_overlay_blanks_paints_and_writes():
+    frame = np.full((100, 200, 3), 0.4, np.float32)
+    seen = np.ones((100, 200), bool)
+    seen[:, :50] = False
+    box = Box(x=0.5, y=0.1, width=0.25, height=0.2, colour=(0.0, 0.0, 1.0))
+    text = Caption(text="15/03/2012", x=0.3, y=0.9, height_px=14, colour=(1.0, 1.0, 0.0))
+    found = video_processor.draw(frame, Overlay(boxes=(box,), captions=(text,)), seen)
+    assert (found[:, :50] == 0).all()
+    np.testing.assert_array_equal(found[10:30, 100:150], np.broadcast_to([0.0, 0.0, 1.0], (20, 50, 3)))
+    rows, columns = np.nonzero((found[..., 0] > 0.9) & (found[..., 2] < 0.1))
+    assert 12 <= np.ptp(rows) <= 20
+    assert rows.max() == pytest.approx(90, abs=4)
+    assert columns.min() == pytest.approx(60, abs=3)
+    # Everything else stays, and the given picture too.
+    untouched = np.ones_like(seen)
+    untouched[:, :50] = untouched[10:30, 100:150] = False
+    untouched[70:95, 55:] = False
+    assert (found[untouched] == np.float32(0.4)).all()
+    assert (frame == np.float32(0.4)).all()
+
+
+def test_overlay_of_a_grey_picture_takes_the_lumas():
+    frame = np.full((40, 40), 0.4, np.float32)
+    found = video_processor.draw(frame, Overlay(boxes=(Box(x=0, y=0, width=0.5, height=1, colour=(0, 1, 0)),)), None)
+    assert found[0, 0] == pytest.approx(0.587)
+    assert found[0, -1] == np.float32(0.4)
+
+
+# Coding ---------------------------------------------------------------------------------------------------------------
+
+LUMA_75_DC, LUMA_75_FIRST = 8, 6
+"""Annex K of the JPEG standard: the luma table's 16 and 11, halved at quality 75."""
+
+
+@pytest.mark.parametrize("quality", [50, 75, 90])
+def test_jpeg_quality_shows_in_the_blocks(quality):
+    """The mean of a coded 8 x 8 block is a multiple of the table's first entry over 8; of another's it is not."""
+    values = (255 * picture((64, 64), seed=2)).astype(np.uint8)
+    coded = coding.code(values, JpegCoding(quality=quality)).astype(float)
+    means = coded.reshape(8, 8, 8, 8).mean(axis=(1, 3)) - 128
+
+    def residue(step):
+        return np.abs(means * 8 / step - np.rint(means * 8 / step)).mean()
+
+    scale = 5000 / quality if quality < 50 else 200 - 2 * quality
+    table = max(1, int((16 * scale + 50) / 100))
+    assert residue(table) < 0.08
+    assert residue(table * 1.37) > 0.15
+
+
+def test_jpeg_of_colours_blurs_chroma_at_420_only():
+    frame = np.zeros((32, 32, 3), np.uint8)
+    frame[:, 15:, 0] = 255
+    sharp = coding.code(frame, JpegCoding(quality=98, chroma="4:4:4")).astype(int)
+    soft = coding.code(frame, JpegCoding(quality=98, chroma="4:2:0")).astype(int)
+    assert np.abs(sharp - frame).max() < 20
+    assert np.abs(soft - frame)[:, 13:17].max() > 40
+
+
+def test_every_generation_loses():
+    frame = (255 * picture(seed=4, smooth=0.7)).astype(np.uint8)
+    once, often = (coding.code(frame, JpegCoding(quality=60, generations=n)).astype(float) for n in (1, 8))
+    assert np.square(often - frame).mean() >= np.square(once - frame).mean() > 1
+
+
+@pytest.mark.parametrize("shape", [(48, 64, 3), (47, 63, 3), (33, 50)])
+def test_h264_keeps_the_picture_and_loses_with_crf(shape):
+    pytest.importorskip("av", reason="the extra video is not installed")
+    frame = (255 * picture(shape, smooth=1.5)).astype(np.uint8)
+    errors = []
+    for crf in (10, 30, 45):
+        coded = coding.code(frame, H264Coding(crf=crf, frames=3))
+        assert coded.shape == frame.shape
+        np.testing.assert_array_equal(coded, coding.code(frame, H264Coding(crf=crf, frames=3)))
+        luma = coded.astype(float) if frame.ndim == 2 else coded @ [0.299, 0.587, 0.114]
+        expected = frame.astype(float) if frame.ndim == 2 else frame @ [0.299, 0.587, 0.114]
+        errors.append(float(np.sqrt(np.square(luma - expected).mean())))
+    assert errors == sorted(errors)
+    assert errors[0] < 4 < errors[-1]
+
+
+def test_a_missing_codec_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(InputError, match=r"needs the package av; install simtest\[video\]"):
+        coding.code(np.zeros((8, 8), np.uint8), H264Coding())
+
+
+def test_coding_needs_8_bits():
+    with pytest.raises(InputError, match=r"sensor: bits = None: must be 8 where coding is given"):
+        scene_from_dict({"surface": {"type": "plane"}, "sensor": {"coding": {"type": "jpeg"}}})
+
+
+# Exposure and the whole -----------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.1, 0.7), st.sampled_from(["linear", "srgb"]), st.floats(1e-6, 1e6))
+@settings(max_examples=30, deadline=None)
+def test_automatic_exposure_reaches_its_mean(average, response, unit):
+    light = unit * picture((60, 80), seed=5)
+    light[10:14, 10:14] *= 100
+    told = sensor(saturation=True, response={"type": response})
+    scale = camera_chain.full_scale_of_average(light, average, told)
+    frame = camera_chain.capture(light, scale, told, None)
+    assert frame.mean() == pytest.approx(average, abs=1e-3)
+    assert (frame[10:14, 10:14] == 1).all()
+
+
+def test_brighter_highlights_leave_the_tissue_at_its_level():
+    light = 0.2 + 0.1 * picture((60, 80))
+    told = sensor(response={"type": "srgb"})
+    levels = []
+    for peak in (3.0, 300.0):
+        light[5:9, 5:9] = peak
+        scale = camera_chain.full_scale_of_average(light, 0.4, told)
+        levels.append(float(np.median(camera_chain.capture(light, scale, told, None))))
+    assert levels[0] == pytest.approx(levels[1], abs=0.005)
+
+
+def test_stages_come_in_physical_order():
+    """The whole chain equals its stages called one by one, in the order of the sensor's docstring."""
+    told = sensor(mosaic={}, colour=WARM, full_well=4000, read_noise=3.0, noise_sigma=0.005, response={"type": "srgb"},
+                  sharpening={}, scaling={"factor": 0.7}, overlay={"captions": [{"text": "A"}]}, bits=8,
+                  coding={"type": "jpeg", "quality": 80})  # fmt: skip
+    light = (4 * picture((64, 96, 3))).astype(np.float32)
+    found = camera_chain.capture(light, 2.0, told, np.random.default_rng(7))
+    # One by one.
+    rng = np.random.default_rng(7)
+    own = video_processor.as_seen_by_sensor(light / np.float32(2), told.colour)
+    plane = mosaic.sample(own, told.mosaic)
+    electrons = rng.poisson(plane.astype(float) * 4000) + 3.0 * rng.standard_normal(plane.shape)
+    plane = (electrons / 4000).astype(np.float32)
+    plane = plane + np.float32(0.005) * rng.standard_normal(plane.shape, dtype=np.float32)
+    linear = video_processor.develop(mosaic.demosaic(plane, told.mosaic), told.colour, True)
+    values = told.response.model().encode(np.clip(linear, 0, 1)).astype(np.float32)
+    values = np.clip(video_processor.sharpen(values, told.sharpening), 0, 1)
+    values = np.clip(video_processor.rescale(values, told.scaling), 0, 1)
+    values = video_processor.draw(values, told.overlay, None)
+    expected = coding.code(np.rint(values * 255).astype(np.uint8), told.coding)
+    np.testing.assert_array_equal(np.rint(found * 255).astype(np.uint8), expected)
+    assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize("height", [8.0, 12.0, 20.0, 40.0])
+def test_captions_have_the_asked_height(height):
+    overlay = Overlay(captions=(Caption(text="H", x=0.1, y=0.8, height_px=height),))
+    found = video_processor.draw(np.zeros((100, 100), np.float32), overlay, None)
+    rows = np.nonzero(found.max(axis=1) > 0.5)[0]
+    assert np.ptp(rows) + 1 == pytest.approx(height, abs=1)
