@@ -95,6 +95,7 @@ def test_a_camera_on_the_path_looks_along_it_and_one_that_faces_the_wall_across_
     np.testing.assert_allclose(np.sum(across[:, :3, 2] * tangents, axis=1), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_organ_has_no_path():
     with pytest.raises(InputError, match=r"surface\.view = wall: liver is an organ"):
         make_surface(AnatomySurface(path="liver", view="wall"))

@@ -156,6 +156,7 @@ def test_interpolated_normals_are_those_of_the_surface(recipe):
     assert np.quantile(error, 0.999) < 0.3
 
 
+@pytest.mark.slow
 def test_the_fossa_is_a_hollow_and_the_size_is_that_of_a_liver(recipe):
     mesh = build(recipe).mesh
     assert (np.ptp(mesh.vertices, axis=0) <= [220, 210, 190]).all()

@@ -116,7 +116,15 @@ def recipe(family, **values):
     return validate(Dataset, described, "reuse")
 
 
-@pytest.mark.parametrize(("family", "least"), [("colon", 3), ("liver", 3), ("rough", 6), ("one sample", 3)])
+@pytest.mark.parametrize(
+    ("family", "least"),
+    [
+        pytest.param("colon", 3, marks=pytest.mark.slow),
+        ("liver", 3),
+        pytest.param("rough", 6, marks=pytest.mark.slow),
+        pytest.param("one sample", 3, marks=pytest.mark.slow),
+    ],
+)
 def test_samples_are_the_same_bytes_without_reuse(family, least, monkeypatch):
     plan = Plan(recipe(family, highlights=least))
     kept = [Maker(plan).make(index) for index in range(1)] + [(maker := Maker(plan)).make(1), maker.make(2)]
