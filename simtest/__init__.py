@@ -24,6 +24,7 @@ Public names are loaded at first use; importing the package loads neither the re
 from typing import TYPE_CHECKING, Any
 
 from simtest import _renamed
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.api import LabelledFrame, export, render, validate
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
         save_camera,
     )
 
-_HOMES = {
+_load = lazy_names(__name__, {
     "simtest.api": ("LabelledFrame", "export", "render", "validate"),
     "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
@@ -52,8 +53,7 @@ _HOMES = {
     "simtest.spec": (
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
     ),
-}  # fmt: skip
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+})  # fmt: skip
 
 __all__ = [
     "BackendError",
@@ -91,13 +91,7 @@ def __getattr__(name: str) -> Any:
         from simtest.runtime.provenance import version
 
         return version()
-    if name not in _HOME:
-        raise AttributeError(f"module 'simtest' has no attribute {name!r}")
-    import importlib
-
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+    return _load(name)
 
 
 def __dir__() -> list[str]:

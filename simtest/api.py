@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
@@ -22,8 +23,9 @@ if TYPE_CHECKING:
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
-_HOME = {"LabelledFrame": "simtest.simulation.labelled_frame", "reconstruct": "simtest.reconstruction"}
-"""Names of other modules that are public here, loaded at first use."""
+__getattr__ = lazy_names(
+    __name__, {"simtest.simulation.labelled_frame": ("LabelledFrame",), "simtest.reconstruction": ("reconstruct",)}
+)
 
 __all__ = [
     "Extras",
@@ -217,14 +219,6 @@ def validate(
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
     run = run_experiment(described, Path(out), command, variant, progress, engine or make_engine(workers=workers))
     return write_report(run.folder, progress)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
-
-    return getattr(importlib.import_module(_HOME[name]), name)
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":

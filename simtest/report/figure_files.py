@@ -52,7 +52,7 @@ class FigureFiles:
         self.hashes[file] = hashlib.sha256(content).hexdigest()
 
     def tell(self, what: str) -> None:
-        """Tell what is done now; writing the page is the last step. What `progress` raises stops what is drawn."""
+        """Report what is done now; writing the page is the last step. What `progress` raises stops what is drawn."""
         if self.progress:
             try:
                 self.progress(sum(future.done() for future in self.work), len(self.work) + 1, what)

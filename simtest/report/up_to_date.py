@@ -1,13 +1,12 @@
 """Tells whether a run's page is up to date: what it was made of, and its figures, stand in a note at its end."""
 
 import hashlib
-import importlib.metadata
 import json
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from simtest.runtime.provenance import file_hash, source_hash, versions
+from simtest.runtime.provenance import file_hash, package_versions, source_hash, versions
 
 _OPEN, _CLOSE = "<!-- made of ", " -->\n"
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -22,7 +21,7 @@ def page_key(run: Path) -> str:
     """
     files = [run / "results.parquet", run / "summary.json", *sorted((run / "gallery").glob("[!.]*.npz"))]
     content = {str(file.relative_to(run)): file_hash(file) if file.is_file() else None for file in files}
-    return _hash({"files": content, "code": _code(), "versions": versions() | _drawing_versions()})
+    return _hash({"files": content, "code": _code(), "versions": versions() | package_versions(_DRAWING)})
 
 
 def signed(html: str, key: str, figures: Mapping[str, str]) -> str:
@@ -51,16 +50,6 @@ def _code() -> str:
     """Return a hash of simtest's source and of what its pages are filled into."""
     files = sorted(file for pattern in _TEMPLATES for file in _PACKAGE.rglob(pattern))
     return _hash({"source": source_hash()} | {str(file.relative_to(_PACKAGE)): file_hash(file) for file in files})
-
-
-def _drawing_versions() -> dict[str, str]:
-    found = {}
-    for name in _DRAWING:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found
 
 
 def _hash(content: object) -> str:

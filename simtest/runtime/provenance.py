@@ -4,6 +4,7 @@ import hashlib
 import importlib.metadata
 import platform
 import subprocess
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TypedDict
@@ -50,8 +51,13 @@ def _git(*arguments: str) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of the packages that numbers depend on."""
-    found = {"simtest": version()}
-    for name in PACKAGES:
+    return {"simtest": version()} | package_versions(PACKAGES)
+
+
+def package_versions(names: Iterable[str]) -> dict[str, str]:
+    """Return the versions of packages; "missing" of those that are not installed."""
+    found = {}
+    for name in names:
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

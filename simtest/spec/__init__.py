@@ -7,7 +7,9 @@ scenes are rendered; `calibration_file` and `camera_spec` read cameras, with `ca
 Names are loaded at first use: a command needs few of the models, and making one takes milliseconds.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.spec.calibration_file import CalibrationSpec, load_calibration
@@ -28,26 +30,28 @@ if TYPE_CHECKING:
     )
     from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
-_HOMES = {
-    "simtest.spec.calibration_file": ("CalibrationSpec", "load_calibration"),
-    "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
-    "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
-    "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
-    "simtest.spec.experiment": ("Experiment", "Group", "Uniform", "load_experiment"),
-    "simtest.spec.profile": ("Profile", "ProfileEntry", "experiments_of", "load_profile"),
-    "simtest.spec.rig": ("Emission", "LightSpec", "Rig"),
-    "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
-    "simtest.spec.surface": (
-        "AnatomySurface",
-        "CylinderSurface",
-        "PlaneSurface",
-        "QuadricSurface",
-        "SphereSurface",
-        "Surface",
-    ),
-    "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
-}
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "simtest.spec.calibration_file": ("CalibrationSpec", "load_calibration"),
+        "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
+        "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
+        "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
+        "simtest.spec.experiment": ("Experiment", "Group", "Uniform", "load_experiment"),
+        "simtest.spec.profile": ("Profile", "ProfileEntry", "experiments_of", "load_profile"),
+        "simtest.spec.rig": ("Emission", "LightSpec", "Rig"),
+        "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
+        "simtest.spec.surface": (
+            "AnatomySurface",
+            "CylinderSurface",
+            "PlaneSurface",
+            "QuadricSurface",
+            "SphereSurface",
+            "Surface",
+        ),
+        "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
+    },
+)
 
 __all__ = [
     "AnatomySurface",
@@ -84,16 +88,6 @@ __all__ = [
     "save_camera",
     "scene_from_dict",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
-
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
 
 
 def __dir__() -> list[str]:

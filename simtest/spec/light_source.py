@@ -1,6 +1,7 @@
 """The exits of light guides: discs, rings and crescents in the plane across a light's direction."""
 
 import math
+from abc import abstractmethod
 from typing import Annotated, Literal
 
 import numpy as np
@@ -22,18 +23,18 @@ class _Source(Spec):
     """A part of a disc around the origin of the source's plane; lengths in mm, coordinates (side, up)."""
 
     @property
+    @abstractmethod
     def area_mm2(self) -> float:
         """Area, mm^2."""
-        raise NotImplementedError
 
     @property
     def centroid_mm(self) -> tuple[float, float]:
         """Centroid of the area, mm, in the source's plane."""
         return (0.0, 0.0)
 
+    @abstractmethod
     def rim(self) -> Array:
         """Return points of the rim, shape (N, 2), mm, in the source's plane."""
-        raise NotImplementedError
 
 
 class DiscSource(_Source):

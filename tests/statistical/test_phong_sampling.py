@@ -9,12 +9,11 @@ import pytest
 from scipy import stats
 
 from simtest.rendering import backend, phong
+from tests.hypothesis_tests import ALPHA, chi_square, rejected
 
 pytestmark = pytest.mark.render
 
-ALPHA = 0.01
 SAMPLES = 150_000
-LEAST_EXPECTED = 10
 ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 85.0)
 EXPONENTS = (1.0, 2.0, 5.0, 20.0, 50.0, 100.0, 500.0)
 ALBEDOS = (0.0, 0.3, 0.9)
@@ -133,33 +132,6 @@ def p_value(mi, case, seed, drawn_exponent=None, factor=1.0):
     observed = np.bincount(row * AROUND + column, minlength=len(expected))
     observed = np.append(observed, np.count_nonzero(density <= 0))
     return chi_square(observed, SAMPLES * np.append(expected, refused))
-
-
-def chi_square(observed, expected):
-    """Return the p-value; the rarest bins are pooled until each pool is expected often enough."""
-    order = np.argsort(expected)
-    observed, expected = observed[order], expected[order]
-    few = np.searchsorted(np.cumsum(expected), LEAST_EXPECTED) + 1
-    observed = np.append(observed[few:], observed[:few].sum())
-    expected = np.append(expected[few:], expected[:few].sum())
-    while len(expected) > 1 and (rare := expected < LEAST_EXPECTED).any():
-        first = int(np.flatnonzero(rare)[0])
-        other = first - 1 if first else 1
-        observed[other] += observed[first]
-        expected[other] += expected[first]
-        observed, expected = np.delete(observed, first), np.delete(expected, first)
-    statistic = float(((observed - expected) ** 2 / expected).sum())
-    return float(stats.chi2.sf(statistic, len(expected) - 1))
-
-
-def rejected(p_values, alpha=ALPHA):
-    """Return which hypotheses Holm's procedure rejects."""
-    p = np.asarray(p_values)
-    order = np.argsort(p)
-    passes = np.logical_and.accumulate(p[order] <= alpha / np.arange(len(p), 0, -1))
-    out = np.zeros(len(p), dtype=bool)
-    out[order[passes]] = True
-    return out
 
 
 @pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.slow)])

@@ -10,12 +10,11 @@ from scipy import stats
 from scipy.special import erf
 
 from simtest.rendering import backend, tissue
+from tests.hypothesis_tests import ALPHA, chi_square, rejected
 
 pytestmark = pytest.mark.render
 
-ALPHA = 0.01
 SAMPLES = 100_000
-LEAST_EXPECTED = 10
 INDEX = 1.36
 CASES = [
     (alpha, kind, angle, albedo)
@@ -138,29 +137,6 @@ def p_value(mi, case, seed, drawn_alpha=None, factor=1.0):
     observed = np.bincount(row * AROUND + column, minlength=len(expected))
     observed = np.append(observed, np.count_nonzero(density <= 0))
     return chi_square(observed, SAMPLES * np.append(expected, refused_share(alpha, kind, wi, albedo)))
-
-
-def chi_square(observed, expected):
-    """Return the p-value; the rarest bins are pooled until the pool is expected often enough."""
-    order = np.argsort(expected)
-    observed, expected = observed[order], expected[order]
-    few = int(np.searchsorted(np.cumsum(expected), LEAST_EXPECTED)) + 1
-    while few < len(expected) and expected[few] < LEAST_EXPECTED:
-        few += 1
-    observed = np.append(observed[few:], observed[:few].sum())
-    expected = np.append(expected[few:], expected[:few].sum())
-    statistic = float(((observed - expected) ** 2 / expected).sum())
-    return float(stats.chi2.sf(statistic, len(expected) - 1))
-
-
-def rejected(p_values, alpha=ALPHA):
-    """Return which hypotheses Holm's procedure rejects."""
-    p = np.asarray(p_values)
-    order = np.argsort(p)
-    passes = np.logical_and.accumulate(p[order] <= alpha / np.arange(len(p), 0, -1))
-    out = np.zeros(len(p), dtype=bool)
-    out[order[passes]] = True
-    return out
 
 
 @pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.slow)])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtest.errors import Failure, InputError, Reason
+from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
@@ -17,18 +17,7 @@ from simtest.surfaces import make_surface
 from simtest.surfaces.recipe import load_recipe
 from simtest.validation import realisation, runner
 from simtest.validation.cases import expand
-
-
-def refused(call, *fragments):
-    """Check that a call raises an `InputError` of one readable line that holds the fragments."""
-    with pytest.raises(InputError) as error:
-        call()
-    text = str(error.value)
-    assert text.isprintable()
-    assert len(text) < 700
-    for fragment in fragments:
-        assert fragment in text
-
+from tests.refusals import refused
 
 # Scenes ----------------------------------------------------------------------------------------------------------
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from simtest.errors import InputError
 from simtest.spec import scene_from_dict
 from simtest.spec.relief import Relief
 from simtest.surfaces import make_surface
+from tests.refusals import refused
 
 MESH = Path(__file__).resolve().parents[2] / "meshes" / "colon_40mm.ply"
 
@@ -51,16 +51,6 @@ RELIEFS = {
     "diffusion negative": (RELIEF + "diffusion_mm = -1\n" + GOOD, "diffusion_mm = -1: must be greater than or"),
     "relief a number": (PLANE + "relief = 3", "surface.relief = 3: must be a table"),
 }
-
-
-def refused(call, *fragments):
-    with pytest.raises(InputError) as error:
-        call()
-    text = str(error.value)
-    assert text.isprintable()
-    assert len(text) < 700
-    for fragment in fragments:
-        assert fragment in text
 
 
 @pytest.mark.parametrize("name", [*CASES, *RELIEFS])
