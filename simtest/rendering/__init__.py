@@ -1,7 +1,7 @@
 """The only package that imports Mitsuba.
 
-`backend` chooses libLLVM and variant. `session` holds the scene, which `shapes`, `materials`, `phong` and `emission`
-describe to Mitsuba; `rays`, `integrate`, `direct` and `indirect` trace its radiance. Ground truth comes from
+`backend` chooses libLLVM and variant. `session` holds the scene, which `shapes`, `materials`, `phong`, `tissue` and
+`emission` describe to Mitsuba; `rays`, `integrate`, `direct` and `indirect` trace its radiance. Ground truth comes from
 `shape_labels` (the rendered shape), `exact_points` (the smooth surface) and `highlights` (the points where the normal
 bisects light and camera). `frames` defines the records; `mitsuba_export` writes a scene for Mitsuba.
 """

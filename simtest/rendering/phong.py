@@ -4,6 +4,7 @@ from functools import cache
 from typing import Any
 
 from simtest.rendering import lobes
+from simtest.rendering.lobe_over_base import lobe_over_base
 
 PLUGIN = "simtest_phong"
 
@@ -19,10 +20,10 @@ def register(mi: Any, variant: str) -> str:
 
 
 @cache
-def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
+def _make_class(mi: Any, variant: str) -> Any:
     import drjit as dr
 
-    class Phong(mi.BSDF):
+    class Phong(lobe_over_base(mi, variant)):  # type: ignore[misc]
         """Specular c cos^n(beta) plus a Lambertian base, beta between mirror direction and view [P75].
 
         As published, the specular radiance has no cosine of incidence: f cos(theta) = c cos^n(beta). The radiance stays
@@ -32,37 +33,20 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
         """
 
         def __init__(self, props: Any) -> None:
-            super().__init__(props)
+            super().__init__(props, 0.0)
             self.exponent = mi.Float(props.get("exponent", 50.0))
             self.specular = mi.Float(props.get("specular", 1.0))
             self.normalised = bool(props.get("normalised", False))
-            self.base = props.get_texture("diffuse_reflectance", 0.0)
-            # Called with surface points and a mask in place of the texture, where it is set.
-            self.albedo_at: Any = None
-            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-            self.m_components = [glossy, diffuse]
-            self.m_flags = glossy | diffuse
             self.parameters_changed()
 
         def traverse(self, callback: Any) -> None:
             callback.put("exponent", self.exponent, mi.ParamFlags.Differentiable)
             callback.put("specular", self.specular, mi.ParamFlags.Differentiable)
-            callback.put("diffuse_reflectance", self.base, mi.ParamFlags.Differentiable)
+            super().traverse(callback)
 
         def parameters_changed(self, keys: Any = ()) -> None:
             # Literal parameters would be baked into the kernel, and each change would recompile it.
             dr.make_opaque(self.exponent, self.specular)
-
-        def _albedo(self, si: Any, active: Any) -> Any:
-            return self.base.eval(si, active) if self.albedo_at is None else self.albedo_at(si, active)
-
-        def _enabled(self, ctx: Any) -> tuple[bool, bool]:
-            """Return whether the lobe and the base are asked for."""
-            return (
-                ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
-                ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
-            )
 
         def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             """Compute f cos(theta) and the sampling density of the enabled lobes."""
@@ -97,37 +81,13 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             whole = lobe + base
             return dr.detach(dr.select(whole > 0, lobe / dr.select(whole > 0, whole, 1), 0.5))
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            share = self._share(ctx, si, active)
-            # Lobe: cos(beta) = u^(1/(n+1)) about the mirror direction, its sine without cancellation; u in (0, 1].
+        def _draw(self, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any, Any, Any]:
+            # cos(beta) = u^(1/(n+1)) about the mirror direction, its sine without cancellation; u in (0, 1].
             slope = -dr.log(1 - sample2.x) / (dr.detach(self.exponent) + 1)
             cosine, sine = dr.exp(-slope), dr.sqrt(2 * dr.exp(-slope) * dr.sinh(slope))
             s, c = dr.sincos(dr.two_pi * sample2.y)
-            glossy = mi.Frame3f(mi.reflect(si.wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
-            chosen = sample1 < share
-            bs = mi.BSDFSample3f()
-            # Base: cosine-weighted about the normal.
-            bs.wo = dr.select(chosen, glossy, mi.warp.square_to_cosine_hemisphere(sample2))
-            value, bs.pdf = self._values(ctx, si, bs.wo, mi.Bool(active))
-            bs.eta = 1.0
-            bs.sampled_type = dr.select(
-                chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            )
-            bs.sampled_component = dr.select(chosen, mi.UInt32(0), mi.UInt32(1))
-            drawn = bs.pdf > 0
-            return bs, dr.select(drawn, value / dr.select(drawn, bs.pdf, 1), 0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._values(ctx, si, wo, mi.Bool(active))[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._values(ctx, si, wo, mi.Bool(active))[1]
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            return self._values(ctx, si, wo, mi.Bool(active))
-
-        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
-            return self._albedo(si, active)
+            lobe = mi.Frame3f(mi.reflect(si.wi)).to_world(mi.Vector3f(sine * c, sine * s, cosine))
+            return lobe, self._share(ctx, si, active), active
 
         def to_string(self) -> str:
             return f"Phong[exponent={self.exponent}, specular={self.specular}, normalised={self.normalised}]"

@@ -1,9 +1,10 @@
 """The wet tissue as a Mitsuba plugin, usable by any Mitsuba integrator: a rough liquid film over a diffuse base."""
 
 import math
-from collections.abc import Callable
 from functools import cache
 from typing import Any
+
+from simtest.rendering.lobe_over_base import lobe_over_base
 
 PLUGIN = "simtest_tissue"
 
@@ -16,9 +17,6 @@ this in any direction for alpha up to 0.1 and an index from 1.33 to 1.40, so tha
 
 STEEPEST = 10.0
 """Where the Smith function is 1 to the last digit: cot(theta) / alpha."""
-
-Albedo = Callable[[Any, Any], Any]
-"""Albedo of the base, mitsuba.Spectrum, at a surface point, mitsuba.SurfaceInteraction3f, in the lanes of a mask."""
 
 
 @cache
@@ -79,7 +77,7 @@ def visible_over_cosine(direction: Any, alpha: Any, ggx: bool) -> Any:
 def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
     import drjit as dr
 
-    class Tissue(mi.BSDF):
+    class Tissue(lobe_over_base(mi, variant)):  # type: ignore[misc]
         """A film's rough dielectric reflection D G F / (4 cos_i cos_o) over a diffuse base below the film.
 
         D is Beckmann's or GGX's, G = G1(i) G1(o) Smith's, F Fresnel's for unpolarised light at the facet. What is not
@@ -93,26 +91,19 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
         """
 
         def __init__(self, props: Any) -> None:
-            super().__init__(props)
+            super().__init__(props, 0.5)
             self.alpha = mi.Float(props.get("alpha", 0.03))
             self.index = mi.Float(props.get("index", 1.33))
             distribution = props.get("distribution", "beckmann")
             if distribution not in ("beckmann", "ggx"):
                 raise ValueError(f"distribution = {distribution!r}: unknown; allowed: beckmann, ggx")
             self.ggx = distribution == "ggx"
-            self.base = props.get_texture("diffuse_reflectance", 0.5)
-            # Called with surface points and a mask in place of the texture, where it is set.
-            self.albedo_at: Albedo | None = None
-            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-            self.m_components = [glossy, diffuse]
-            self.m_flags = glossy | diffuse
             self.parameters_changed()
 
         def traverse(self, callback: Any) -> None:
             callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
             callback.put("index", self.index, mi.ParamFlags.Differentiable)
-            callback.put("diffuse_reflectance", self.base, mi.ParamFlags.Differentiable)
+            super().traverse(callback)
 
         def parameters_changed(self, keys: Any = ()) -> None:
             # Literal parameters would be baked into the kernel, and each change would recompile it.
@@ -122,19 +113,9 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             self.returned, self.passage = 1 - passed, (1 - MARGIN * self.alpha) / dr.square(self.index)
             dr.make_opaque(self.returned, self.passage)
 
-        def _albedo(self, si: Any, active: Any) -> Any:
-            return self.base.eval(si, active) if self.albedo_at is None else self.albedo_at(si, active)
-
         def _lift(self, albedo: Any) -> Any:
             """Compute the base's share of the light within the film that leaves it upwards, times eta^2."""
             return albedo / (1 - albedo * self.returned)
-
-        def _enabled(self, ctx: Any) -> tuple[bool, bool]:
-            """Return whether the film's reflection and the base are asked for."""
-            return (
-                ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
-                ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1),
-            )
 
         def _film(self, wi: Any, wo: Any) -> tuple[Any, Any]:
             """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
@@ -175,36 +156,13 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             base = (1 - film) * (1 - self.returned) * dr.mean(self._lift(self._albedo(si, active)))
             return dr.detach(film / (film + base))
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            active = mi.Bool(active) & (si.wi.z > 0)
+        def _draw(self, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any, Any, Any]:
+            active &= si.wi.z > 0
             wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-            # Film: the normals of the facets that are seen from the direction of incidence.
+            # The normals of the facets that are seen from the direction of incidence.
             kind = mi.MicrofacetType.GGX if self.ggx else mi.MicrofacetType.Beckmann
             facet, _ = mi.MicrofacetDistribution(kind, dr.detach(self.alpha)).sample(wi, sample2)
-            chosen = sample1 < self._share(ctx, si, wi, active)
-            bs = mi.BSDFSample3f()
-            # Base: cosine-weighted about the normal.
-            bs.wo = dr.select(chosen, mi.reflect(wi, facet), mi.warp.square_to_cosine_hemisphere(sample2))
-            value, bs.pdf = self._values(ctx, si, bs.wo, active)
-            bs.eta = 1.0
-            bs.sampled_type = dr.select(
-                chosen, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            )
-            bs.sampled_component = dr.select(chosen, mi.UInt32(0), mi.UInt32(1))
-            drawn = bs.pdf > 0
-            return bs, dr.select(drawn, value / dr.select(drawn, bs.pdf, 1), 0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._values(ctx, si, wo, mi.Bool(active))[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self._values(ctx, si, wo, mi.Bool(active))[1]
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            return self._values(ctx, si, wo, mi.Bool(active))
-
-        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
-            return self._albedo(si, mi.Bool(active))
+            return mi.reflect(wi, facet), self._share(ctx, si, wi, active), active
 
         def to_string(self) -> str:
             return f"Tissue[alpha={self.alpha}, index={self.index}, ggx={self.ggx}]"
