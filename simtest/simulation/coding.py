@@ -25,12 +25,12 @@ def code(picture: Picture, coding: Coding) -> Picture:
 def _jpeg(picture: Picture, coding: JpegCoding) -> Picture:
     options = [cv2.IMWRITE_JPEG_QUALITY, coding.quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, _SAMPLING[coding.chroma]]
     # OpenCV wants blue first.
-    values = picture if picture.ndim == 2 else picture[..., ::-1]
+    values = np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     for _ in range(coding.generations):
         ok, data = cv2.imencode(".jpg", values, options)
         assert ok
         values = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
-    return np.ascontiguousarray(values if values.ndim == 2 else values[..., ::-1])
+    return np.asarray(values if values.ndim == 2 else cv2.cvtColor(values, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def _h264(picture: Picture, coding: H264Coding) -> Picture:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.errors import InputError
-from simtest.simulation import camera_chain, coding, mosaic, video_processor
+from simtest.simulation import camera_chain, coding, mosaic, shot_noise, video_processor
 from simtest.spec.processing import (
     Box,
     Caption,
@@ -207,6 +207,32 @@ def test_scaling_by_half_averages_areas():
     np.testing.assert_allclose(found, halves.repeat(2, axis=0).repeat(2, axis=1), atol=1e-6)
 
 
+def overlaps(size, count):
+    """Return the matrix that averages `size` pixels to `count`, by how much of each the new ones cover."""
+    ends = np.arange(count + 1) * size / count
+    covered = np.minimum(ends[1:, None], np.arange(1, size + 1)) - np.maximum(ends[:-1, None], np.arange(size))
+    return np.maximum(covered, 0) * count / size
+
+
+def between(size, count):
+    """Return the matrix of linear interpolation from `size` pixels to `count`, about the pixels' centres."""
+    at = np.clip((np.arange(count) + 0.5) * size / count - 0.5, 0, size - 1)
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(size)), 0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.6, 2 / 3, 2.0])
+def test_scaling_equals_plain_matrices(factor):
+    """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
+    frame = picture((30, 48), smooth=0.7)
+    found = video_processor.rescale(frame, Scaling(factor=factor, method="linear"))
+    there, back = (overlaps, between) if factor < 1 else (between, overlaps)
+    expected = frame
+    for _ in range(2):
+        size = len(expected)
+        expected = (back(round(size * factor), size) @ there(size, round(size * factor)) @ expected).T
+    np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
 # Graphics -------------------------------------------------------------------------------------------------------------
 
 
@@ -339,11 +365,11 @@ def test_stages_come_in_physical_order():
     rng = np.random.default_rng(7)
     own = video_processor.as_seen_by_sensor(light / np.float32(2), told.colour)
     plane = mosaic.sample(own, told.mosaic)
-    electrons = rng.poisson(plane.astype(float) * 4000) + 3.0 * rng.standard_normal(plane.shape)
-    plane = (electrons / 4000).astype(np.float32)
+    share = shot_noise.poisson(plane * np.float32(4000), rng) * np.float32(1 / 4000)
+    plane = share + np.float32(3.0 / 4000) * rng.standard_normal(plane.shape, dtype=np.float32)
     plane = plane + np.float32(0.005) * rng.standard_normal(plane.shape, dtype=np.float32)
     linear = video_processor.develop(mosaic.demosaic(plane, told.mosaic), told.colour, True)
-    values = told.response.model().encode(np.clip(linear, 0, 1)).astype(np.float32)
+    values = told.response.model().encode_picture(np.clip(linear, 0, 1))
     values = np.clip(video_processor.sharpen(values, told.sharpening), 0, 1)
     values = np.clip(video_processor.rescale(values, told.scaling), 0, 1)
     values = video_processor.draw(values, told.overlay, None)
