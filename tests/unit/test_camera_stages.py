@@ -108,6 +108,24 @@ def test_demosaicing_keeps_a_constant_and_the_measured_values(method):
     np.testing.assert_allclose(again, mosaic.sample(frame[4:-4, 4:-4], spec), atol=step)
 
 
+def test_vng_follows_slopes_and_edges():
+    """A plane in the root of the light is filled in to rounding, and along an edge colours mix less than bilinearly."""
+    y, x = np.mgrid[:40, :48]
+    for slopes in [(0.006, 0.0), (0.0, 0.006), (0.003, -0.004)]:
+        root = 0.4 + slopes[0] * x + slopes[1] * y
+        white = np.repeat(np.square(root).astype(np.float32)[..., None], 3, axis=2)
+        found = mosaic.demosaic(mosaic.sample(white, Mosaic()), Mosaic(demosaicing="vng"))
+        gap = np.sqrt(found[4:-4, 4:-4]) - root[4:-4, 4:-4, None]
+        # Sums of codes are divided in whole numbers, each by less than one code.
+        assert np.abs(gap).max() < 2 / 255
+    edge = np.repeat(np.where(x > 22, 0.6, 0.1).astype(np.float32)[..., None], 3, axis=2)
+    tint = [
+        np.ptp(mosaic.demosaic(mosaic.sample(edge, Mosaic()), Mosaic(demosaicing=way))[4:-4, 4:-4], axis=2).mean()
+        for way in ("vng", "bilinear")
+    ]
+    assert tint[0] < 0.85 * tint[1]
+
+
 def test_demosaicing_of_an_edge_shows_false_colour():
     """What a mosaic does to a white edge: grey pixels become coloured; without one they do not."""
     edge = np.repeat((np.arange(32) > 15).astype(np.float32)[None, :], 32, axis=0)
