@@ -10,12 +10,15 @@ import simtest
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
 from simtest.errors import InputError
+from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
-from simtest.spec import load_camera, scene_from_dict
+from simtest.spec import Experiment, load_camera, scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.motion import Motion
 from simtest.spec.spec_model import validate
+from simtest.validation.cases import expand
+from simtest.validation.realisation import Realiser
 
 pytestmark = pytest.mark.render
 
@@ -230,6 +233,26 @@ def test_a_dataset_draws_velocities():
     assert 20 <= speeds[0][0] != speeds[1][0] <= 200
     assert speeds[0][1:] == [0.0, 0.0]
     np.testing.assert_array_equal(Maker(plan).make(1).images["image"], samples[1].images["image"])
+
+
+def test_an_experiment_sweeps_a_velocity():
+    """Frames and names of the settings differ, and the truth stays."""
+    group = {
+        "scene": "sphere",
+        "set": {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0,
+                "camera.motion": {"velocity_mm_s": [0.0, 0.0, 0.0], "exposure_s": 0.02, "steps": 4}},
+        "sweep": [{"camera.motion.velocity_mm_s.1": [0.0, 25.0]}],
+    }  # fmt: skip
+    experiment = validate(Experiment, {"name": "moving", "groups": [group]}, "experiment")
+    cases = expand(experiment)
+    assert [case.setting for case in cases] == ["sphere, velocity_mm_s.1=0.0", "sphere, velocity_mm_s.1=25.0"]
+    realiser = Realiser(None)
+    still, moved = (realiser.make(experiment, case, 0, load_estimators(["cone_axis"])) for case in cases)
+    assert not np.array_equal(still.frame, moved.frame)
+    for made in (still, moved):
+        (truth,) = made.truths
+        assert truth.bp_px == pytest.approx(still.truths[0].bp_px, abs=1e-9)
+        assert made.rows[0].swept["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
 
 
 @pytest.mark.parametrize(
