@@ -138,6 +138,23 @@ def test_a_plane_that_passes_by_is_box_filtered():
     assert np.abs(colours[:, half:-half] / boxed - 1).max() > 0.05
 
 
+def test_light_spreads_below_the_tissue_as_in_the_middle_of_the_exposure():
+    """The mean light is spread once, over the surface of the middle: near the mean of still frames that were spread."""
+    tissue = {"type": "tissue", "film": {"index": 1.36}, "colour": [0.85, 0.45, 0.4], "translucency": {}}
+    slow = {**SCREW, "velocity_mm_s": [20.0, -10.0, 30.0], "angular_velocity_deg_s": [10.0, 20.0, 40.0], "steps": 3}
+    times = slow["exposure_s"] * np.array([-1, 0, 1]) / 3
+    expected = np.mean([radiance(scene(on_axis(seen_from(time, slow)), reflectance=tissue)) for time in times], axis=0)
+    tissue_seen = expected > 0.02 * expected.max()
+
+    def errors(motion):
+        gap = np.abs(radiance(scene(motion=motion, reflectance=tissue)) - expected)
+        return np.percentile(gap[tissue_seen] / expected[tissue_seen], [50, 95])
+
+    moved, still = errors(slow), errors(None)
+    assert moved[0] < 5e-4 < 2e-3 < still[0]
+    assert moved[1] < 6e-3 < still[1]
+
+
 # What stays -----------------------------------------------------------------------------------------------------------
 
 
