@@ -17,6 +17,15 @@ _SAMPLING = {
 }
 
 
+def check_codec(coding: Coding | None) -> None:
+    """Raise `InputError` where the package of a coding is missing: before anything is rendered for it."""
+    if isinstance(coding, H264Coding):
+        try:
+            import av  # noqa: F401
+        except ImportError as error:
+            raise InputError('sensor.coding.type = "h264": needs the package av; install simtest[video]') from error
+
+
 def code(picture: Picture, coding: Coding) -> Picture:
     """Return a picture as it is after lossy coding."""
     return _jpeg(picture, coding) if isinstance(coding, JpegCoding) else _h264(picture, coding)
@@ -34,10 +43,9 @@ def _jpeg(picture: Picture, coding: JpegCoding) -> Picture:
 
 
 def _h264(picture: Picture, coding: H264Coding) -> Picture:
-    try:
-        import av
-    except ImportError as error:
-        raise InputError('sensor.coding.type = "h264": needs the package av; install simtest[video]') from error
+    check_codec(coding)
+    import av
+
     height, width = picture.shape[:2]
     # Chroma of half size needs even sides.
     even = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

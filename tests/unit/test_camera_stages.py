@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.errors import InputError
-from simtest.simulation import camera_chain, coding, mosaic, shot_noise, video_processor
+from simtest.simulation import camera_chain, coding, labelled_frame, mosaic, shot_noise, video_processor
 from simtest.spec.processing import (
     Box,
     Caption,
@@ -225,32 +225,6 @@ def test_scaling_by_half_averages_areas():
     np.testing.assert_allclose(found, halves.repeat(2, axis=0).repeat(2, axis=1), atol=1e-6)
 
 
-def overlaps(size, count):
-    """Return the matrix that averages `size` pixels to `count`, by how much of each the new ones cover."""
-    ends = np.arange(count + 1) * size / count
-    covered = np.minimum(ends[1:, None], np.arange(1, size + 1)) - np.maximum(ends[:-1, None], np.arange(size))
-    return np.maximum(covered, 0) * count / size
-
-
-def between(size, count):
-    """Return the matrix of linear interpolation from `size` pixels to `count`, about the pixels' centres."""
-    at = np.clip((np.arange(count) + 0.5) * size / count - 0.5, 0, size - 1)
-    return np.maximum(1 - np.abs(at[:, None] - np.arange(size)), 0)
-
-
-@pytest.mark.parametrize("factor", [0.5, 0.6, 2 / 3, 2.0])
-def test_scaling_equals_plain_matrices(factor):
-    """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
-    frame = picture((30, 48), smooth=0.7)
-    found = video_processor.rescale(frame, Scaling(factor=factor, method="linear"))
-    there, back = (overlaps, between) if factor < 1 else (between, overlaps)
-    expected = frame
-    for _ in range(2):
-        size = len(expected)
-        expected = (back(round(size * factor), size) @ there(size, round(size * factor)) @ expected).T
-    np.testing.assert_allclose(found, expected, atol=2e-6)
-
-
 # Graphics -------------------------------------------------------------------------------------------------------------
 
 
@@ -339,6 +313,11 @@ def test_a_missing_codec_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(InputError, match=r"needs the package av; install simtest\[video\]"):
         coding.code(np.zeros((8, 8), np.uint8), H264Coding())
+    # Before anything is rendered: there is no session to render with.
+    told = {"surface": {"type": "plane"}, "sensor": {"bits": 8, "coding": {"type": "h264"}}}
+    monkeypatch.setattr(labelled_frame, "Session", None)
+    with pytest.raises(InputError, match="needs the package av"):
+        labelled_frame.make_frame(scene_from_dict(told))
 
 
 def test_coding_needs_8_bits():

@@ -1,4 +1,4 @@
-"""What the camera chain leaves in a picture: shot noise, halos, blocks; each beside a picture without it."""
+"""What the camera chain leaves in a picture: blur, noise, halos, blocks; beside references and pictures without."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,23 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.calibration import Response
-from simtest.simulation import camera_chain, shot_noise
+from simtest.geometry import Camera
+from simtest.simulation import camera_chain, shot_noise, video_processor
+from simtest.spec.processing import Scaling
 from simtest.spec.sensor import Sensor
+
+# Point spread ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.6, 1.5, 4.0])
+def test_the_point_spread_is_scipys_gaussian(sigma):
+    radiance = np.random.default_rng(0).exponential(1.0, (50, 60, 3)).astype(np.float32)
+    found = camera_chain.collect(radiance, Sensor(point_spread_px=sigma), Camera(60, 50, 60.0, 60.0, 30.0, 25.0))
+    # OpenCV takes the Gaussian of floats out to 4 sigma, and mirrors the frame at its border.
+    radius = (round(sigma * 4 * 2 + 1) | 1) // 2
+    expected = ndimage.gaussian_filter(radiance.astype(float), (sigma, sigma, 0), radius=(radius, radius, 0))
+    np.testing.assert_allclose(found, expected, rtol=2e-6, atol=2e-6)
+
 
 # Shot noise -----------------------------------------------------------------------------------------------------------
 
@@ -103,6 +118,35 @@ def test_a_zero_is_found_in_few_steps(zero, power):
     assert len(asked) < 60
     assert camera_chain._zero_of(lambda x: 1.0 - x, 2.0, 3.0) == 2.0
     assert camera_chain._zero_of(lambda x: 9.0 - x, 2.0, 3.0) == 3.0
+
+
+# Scaling --------------------------------------------------------------------------------------------------------------
+
+
+def overlaps(size, count):
+    """Return the matrix that averages `size` pixels to `count`, by how much of each the new ones cover."""
+    ends = np.arange(count + 1) * size / count
+    covered = np.minimum(ends[1:, None], np.arange(1, size + 1)) - np.maximum(ends[:-1, None], np.arange(size))
+    return np.maximum(covered, 0) * count / size
+
+
+def between(size, count):
+    """Return the matrix of linear interpolation from `size` pixels to `count`, about the pixels' centres."""
+    at = np.clip((np.arange(count) + 0.5) * size / count - 0.5, 0, size - 1)
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(size)), 0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.6, 2 / 3, 2.0])
+def test_scaling_equals_plain_matrices(factor):
+    """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
+    frame = np.random.default_rng(0).uniform(0, 1, (30, 48)).astype(np.float32)
+    found = video_processor.rescale(frame, Scaling(factor=factor, method="linear"))
+    there, back = (overlaps, between) if factor < 1 else (between, overlaps)
+    expected = frame
+    for _ in range(2):
+        size = len(expected)
+        expected = (back(round(size * factor), size) @ there(size, round(size * factor)) @ expected).T
+    np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 # Halos and blocks -----------------------------------------------------------------------------------------------------
