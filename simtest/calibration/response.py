@@ -70,7 +70,7 @@ class Response:
     def encode_picture(self, light: Image) -> Image:
         """Return the values of a picture's light, float32, shape (H, W) or (H, W, C): those of `encode` to 3e-7.
 
-        It takes a tenth of the time: powers are those of OpenCV, in single precision.
+        It takes a third of the time of sRGB's curve: powers are those of OpenCV, in single precision.
         """
         if self.kind in ("linear", "table"):
             return self.encode(light).astype(np.float32)
