@@ -31,7 +31,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.engines import Engine
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.relief import Relief
 from simtest.validation.runner import Progress
 
@@ -179,7 +179,7 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     # decoding
     try:
         sample = decode(members, meta)
-        camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
+        camera = SceneCamera.model_validate(meta["scene"]["camera"]).model()
         highlights = meta["highlights"]
         relief = _relief(meta)
     except (ValueError, KeyError, TypeError) as error:

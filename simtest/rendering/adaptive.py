@@ -27,7 +27,8 @@ def applies(scene: Scene) -> bool:
     """Return whether the rule for smooth pixels is made for a scene.
 
     Left out: bounces, which are random; sources of finite size, whose penumbrae need many rays at each centre; relief
-    and the colour of tissue, which may be finer than a pixel.
+    and the colour of tissue, which may be finer than a pixel. Frames of a moving camera do not come here: each of their
+    steps takes so few samples that the rays through the centres would cost more than they save.
     """
     effort, lights = scene.render, scene.rig.lights
     direct = effort.path_depth == 2 and all(light.source is None for light in lights)

@@ -118,9 +118,16 @@ class Tracer:
     # One sample --------------------------------------------------------------------------------------------------
 
     def centres(
-        self, bounces: Bounces | None, radiance: bool, labels: Labelling | None, progress: Progress | None = None
+        self,
+        bounces: Bounces | None,
+        radiance: bool,
+        labels: Labelling | None,
+        progress: Progress | None = None,
+        sample: int = 0,
     ) -> tuple[list[Image], list[Image]]:
         """Trace the ray through each pixel's centre; `progress` is called after each launch.
+
+        `sample` counts the times that this is done for one frame: bounces draw other numbers each time.
 
         Returns
         -------
@@ -137,7 +144,7 @@ class Tracer:
             # Radiance and labels of one launch go into one kernel.
             drawer = self.light.drawer(None)
             draw = None if drawer is None else drawer.at(0)
-            parts = self._parts(hit, draw, bounces, count, block, 0) if radiance else []
+            parts = self._parts(hit, draw, bounces, count, block, sample) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
                 parts = parts + labels.trace(preliminary, hit, rays, self.sightlines.camera_from_model, self.relief)
@@ -205,17 +212,26 @@ class Tracer:
 
     # Several samples ---------------------------------------------------------------------------------------------
 
-    def mean(self, samples: int, seed: int, bounces: Bounces | None, progress: Progress | None = None) -> list[Image]:
+    def mean(
+        self,
+        samples: int,
+        seed: int,
+        bounces: Bounces | None,
+        progress: Progress | None = None,
+        own: range | None = None,
+    ) -> list[Image]:
         """Compute the channels, shape (H, W) each, of the mean radiance over the pixels' area.
 
         `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
+        `own` are the numbers of those that are traced, one after the other; default all.
         """
+        own = range(samples) if own is None else own
         height, width = self.sightlines.tiled_size
         camera = self.sightlines.camera
         # Trace: sums over the samples of each block of pixels.
         blocks = list(_blocks(height * width))
         lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
-        channels = self._means(lanes, samples, bounces, _share_of(progress, height * width * samples))
+        channels = self._means(lanes, samples, own, bounces, _share_of(progress, height * width * len(own)))
         # Arrange: from tiles to rows, without what lies beyond the frame.
         maps = untile(channels, (height, width))
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
@@ -227,18 +243,21 @@ class Tracer:
         """
         blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
                   for first, count in _blocks(len(pixels)))  # fmt: skip
-        return self._means(blocks, samples, None, tell)
+        return self._means(blocks, samples, range(samples), None, tell)
 
     def _means(
-        self, blocks: Iterable[tuple[Lanes, int]], samples: int, bounces: Bounces | None, tell: Tell | None
+        self, blocks: Iterable[tuple[Lanes, int]], samples: int, own: range, bounces: Bounces | None, tell: Tell | None
     ) -> Image:
-        """Compute the channels, shape (C, N), of the mean over the samples of blocks of lanes and their numbers."""
+        """Compute the channels, shape (C, N), of the mean over some samples of blocks of lanes and their numbers.
+
+        `own` are the samples' numbers, of `samples` in all.
+        """
         means: list[Image] = []
         traced = 0
         for block, (lanes, count) in enumerate(blocks):
             drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
-            for start, stop in self._runs(samples, count, bounces):
+            for start, stop in self._runs(own, count, bounces):
                 if bounces is None and self.sightlines.in_kernel:
                     parts = self._looped(lanes, drawer, start, stop)
                 else:
@@ -249,16 +268,16 @@ class Tracer:
                 if tell:
                     tell(traced)
             assert sums is not None
-            means.append((sums / samples).astype(np.float32))
+            means.append((sums / len(own)).astype(np.float32))
         return np.concatenate(means, axis=1)
 
-    def _runs(self, samples: int, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
-        """Split a pixel's samples into the runs of single launches."""
+    def _runs(self, own: range, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
+        """Split the numbers of a pixel's samples into the runs of single launches."""
         # Bounces draw new random numbers for each sample, other cameras unproject on the host: one sample a launch.
         looped = bounces is None and self.sightlines.in_kernel
         step = max(1, min(SUMMED, RAYS // count)) if looped else 1
-        for start in range(0, samples, step):
-            yield start, min(start + step, samples)
+        for start in range(own.start, own.stop, step):
+            yield start, min(start + step, own.stop)
 
     def _looped(self, lanes: Lanes, drawer: Drawer | None, start: int, stop: int) -> list[Any]:
         """Sum direct light over samples by a loop inside the kernel."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.spec.rig import Rig
+from simtest.spec.rig import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
 
@@ -41,14 +41,37 @@ def check_lights(scene: Scene, surface: SurfaceModel) -> None:
         )
 
 
+def check_motion(scene: Scene, surface: SurfaceModel) -> None:
+    """Raise `InputError` where the camera, or what must be in free space of its rig, enters the wall as it moves."""
+    motion = scene.camera.moving
+    if motion is None:
+        return
+    names, points = ["the camera"], [np.zeros((1, 3))]
+    positions = scene.rig.true_mm()
+    for i, light in enumerate(scene.rig.lights):
+        rim = np.zeros((0, 3)) if light.source is None else _rim_points(light, positions[i])
+        own = np.concatenate([positions[i : i + 1] if surface.solid else rim[:0], rim])
+        names += [f"rig.lights.{i}"] * len(own)
+        points.append(own)
+    # Camera and rig at each moment, in the camera frame of the middle.
+    poses, still = motion.poses(), np.concatenate(points)
+    moved = np.einsum("kij,nj->kni", poses[:, :3, :3], still) + poses[:, None, :3, 3]
+    clearances = _clearances(surface, moved.reshape(-1, 3)).reshape(moved.shape[:2])
+    moment, point = np.unravel_index(np.argmin(clearances), clearances.shape)
+    if not clearances[moment, point] > 0:
+        raise InputError(
+            f"scene {scene.name}: camera.motion: {motion.times_s[moment]:.3g} s from the middle of the exposure "
+            f"{names[point]} lies {-clearances[moment, point]:.3g} mm inside the wall; it must be in free space: make "
+            "velocity_mm_s, angular_velocity_deg_s or exposure_s smaller"
+        )
+
+
 def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
     """Raise `InputError` where the rim of a source, or what it encloses, touches tissue."""
     for i, light in enumerate(scene.rig.lights):
         if light.source is None:
             continue
-        # The rim about the centroid, and smaller copies of it: a fold may rise through a disc.
-        rim = light.source.rim() - light.source.centroid_mm
-        points = np.concatenate([share * rim for share in RIM_COPIES]) @ light.across + positions[i]
+        points = _rim_points(light, positions[i])
         clearances = _clearances(surface, points)
         worst = int(np.argmin(clearances))
         if not clearances[worst] > 0:
@@ -58,6 +81,16 @@ def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
                 f"{light.source.radius_mm:g} touches the {scene.surface.label}: at ({position}) mm its clearance is "
                 f"{clearances[worst]:.3g} mm, must be above 0; move it away or make it smaller"
             )
+
+
+def _rim_points(light: LightSpec, position: Array) -> Array:
+    """Return points of a source of finite size, shape (N, 3), camera frame, mm: its rim, and smaller copies of it.
+
+    A fold may rise through a disc.
+    """
+    assert light.source is not None
+    rim = light.source.rim() - light.source.centroid_mm
+    return np.asarray(np.concatenate([share * rim for share in RIM_COPIES]) @ light.across + position)
 
 
 def _clearances(surface: SurfaceModel, positions: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from simtest.rendering import adaptive, backend, block_truth, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
+from simtest.rendering.camera_motion import mean_over
 from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
@@ -22,12 +23,13 @@ from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
 from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.misfit_grid import MisfitGrid, trace_grid
-from simtest.rendering.placement_checks import check_camera, check_lights
+from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.shapes import make_shape
 from simtest.runtime.arrays import Array, Image
+from simtest.spec.motion import Motion
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.spec.translucency import Translucency
@@ -111,8 +113,12 @@ class Session:
         else:
             if scene.rig != self.scene.rig:
                 check_lights(scene, self.surface)
+            if (scene.rig, scene.camera.motion) != (self.scene.rig, self.scene.camera.motion):
+                check_motion(scene, self.surface)
+            if scene.rig != self.scene.rig:
                 self._forget_misfits()
-            if scene.camera != self._camera_spec:
+            # All truth is that of the middle of the exposure.
+            if scene.camera.still != self._camera_spec:
                 self._set_camera(scene)
             if scene.albedo != self.scene.albedo:
                 self._set_tissue(scene)
@@ -130,6 +136,7 @@ class Session:
         surface = make_surface(scene.surface, scene.film_level)
         check_camera(scene, surface)
         check_lights(scene, surface)
+        check_motion(scene, surface)
         self._shape = surface.shape()
         self._relief = None if surface.relief is None else ReliefKernel(self.mi, surface.relief)
         self.surface: SurfaceModel = surface
@@ -146,7 +153,7 @@ class Session:
             self._pattern = make_pattern(self.surface, scene.albedo)
 
     def _set_camera(self, scene: Scene) -> None:
-        self._camera_spec, self.camera = scene.camera, scene.camera.model()
+        self._camera_spec, self.camera = scene.camera.still, scene.camera.model()
         self.sightlines = Sightlines(self.mi, self.camera, self.surface.model_from_camera)
         self._forget()
 
@@ -191,10 +198,20 @@ class Session:
         if "to_model" in self._shape.parameters:
             matrix = self._shape.parameters["to_model"]
             _set(parameters, "surface.to_world", self.mi.AffineTransform4f(matrix.tolist()))
-        # Lights, in the model frame.
-        lights = self.scene.rig.lights
-        positions = self.to_model(self.scene.rig.true_mm())
-        rotation = self.surface.model_from_camera[:3, :3]
+        # Material: the whole and its base alone.
+        for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
+            _set(parameters, f"bsdf.{name}", value)
+            if built.base is not None:
+                built.base_parameters[name] = value
+        self._place_lights(built, self.surface.model_from_camera)
+        if built.base is not None:
+            built.base_parameters.update()
+        self._apply_tissue(built)
+
+    def _place_lights(self, built: _Built, model_from_camera: Array) -> None:
+        """Write the lights of the rig at a pose of the camera into the Mitsuba scene and the kernels."""
+        lights, rotation = self.scene.rig.lights, model_from_camera[:3, :3]
+        positions = self.scene.rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
         axes = np.array([light.axis for light in lights]) @ rotation.T
         poses = [
             emission.LightPose(position, axis, light.across @ rotation.T)
@@ -202,16 +219,8 @@ class Session:
         ]
         for i, light in enumerate(lights):
             for name, value in emission.emitter_values(self.mi, light, poses[i]).items():
-                _set(parameters, f"light_{i}.{name}", value)
-        # Material: the whole and its base alone.
-        for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
-            _set(parameters, f"bsdf.{name}", value)
-            if built.base is not None:
-                built.base_parameters[name] = value
-        parameters.update()
-        if built.base is not None:
-            built.base_parameters.update()
-        self._apply_tissue(built)
+                _set(built.parameters, f"light_{i}.{name}", value)
+        built.parameters.update()
         self._light = DirectLight(self.mi, self.scene.rig, poses)
 
     def _apply_tissue(self, built: _Built) -> None:
@@ -234,7 +243,7 @@ class Session:
         """Render the frame; `progress` is called after each launch, and what it raises stops the frame only.
 
         With one sample a pixel the radiance is that on the ray through each pixel's centre, with more the mean over the
-        pixel's area. The same scene and seed give the same bytes.
+        pixel's area; where the camera moves the mean over the exposure. The same scene and seed give the same bytes.
         """
         return self._render(None, progress)[0]
 
@@ -268,7 +277,10 @@ class Session:
         bounces = None
         if effort.path_depth > 2:
             bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
-        if effort.samples_per_pixel == 1:
+        if (motion := self.scene.camera.moving) is not None:
+            parts = self._mean_over(motion, bounces, progress)
+            channels = tracer.centres(None, False, labels)[1] if labels else []
+        elif effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         elif adaptive.applies(self.scene):
             parts, self._centre = self._adaptive(tracer).render(progress)
@@ -280,6 +292,20 @@ class Session:
         if self.scene.translucency is not None:
             radiance = self._translucent(radiance, channels, self.scene.translucency)
         return radiance, channels
+
+    def _mean_over(self, motion: Motion, bounces: Bounces | None, progress: Progress | None) -> list[Image]:
+        """Render the mean over an exposure; camera and lights stand at its middle again afterwards."""
+        middle = self.surface.model_from_camera
+
+        def at(middle_from_moment: Array) -> Tracer:
+            pose = middle @ middle_from_moment
+            self._place_lights(self._built, pose)
+            return self._tracer(Sightlines(self.mi, self.camera, pose))
+
+        try:
+            return mean_over(motion, self.scene.render, at, bounces, progress)
+        finally:
+            self._place_lights(self._built, middle)
 
     def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
         built, mesh = self._built, self._shape.mesh
@@ -299,11 +325,12 @@ class Session:
         diffuse = spread(radiance.diffuse, labels.depth, labels.normal_base, self.camera, spec)
         return replace(radiance, diffuse=diffuse)
 
-    def _tracer(self) -> Tracer:
-        built = self._built
+    def _tracer(self, sightlines: Sightlines | None = None) -> Tracer:
+        """Return what traces the scene, by default from the camera's own pose."""
+        built, sightlines = self._built, sightlines or self.sightlines
         material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
         refinement = Refinement(self.mi, self._shape)
-        return Tracer(self.mi, built.scene, self.sightlines, self._light, material, refinement, self._relief)
+        return Tracer(self.mi, built.scene, sightlines, self._light, material, refinement, self._relief)
 
     def _centre_hits(self) -> list[Image]:
         """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""

@@ -5,7 +5,9 @@
 """
 
 import math
+from collections.abc import Callable
 
+import cv2
 import numpy as np
 
 from simtest.calibration import srgb_encode
@@ -14,6 +16,7 @@ from simtest.geometry import Camera, smooth
 from simtest.runtime.arrays import Image, Mask, Picture
 from simtest.simulation import mosaic, video_processor
 from simtest.simulation.coding import code
+from simtest.simulation.shot_noise import poisson
 from simtest.spec.sensor import Sensor
 
 MAX_COUNT = 1e15
@@ -22,6 +25,12 @@ MAX_COUNT = 1e15
 
 METERED = 20_000
 """Pixels by which the automatic exposure measures a frame, evenly spread over it."""
+
+CLOSE, TINY = 1e-7, 1e-30
+"""Error of the automatic exposure's full scale, as a share of it, and a mean that stands for 0."""
+
+LEVELS = (np.arange(256) / 255).astype(np.float32)
+"""Values of a picture of 8 bits."""
 
 
 def collect(radiance: Image, sensor: Sensor, camera: Camera) -> Image:
@@ -75,7 +84,7 @@ def capture(
         light = light if sensor.mosaic is None else mosaic.sample(light, sensor.mosaic)
     # Electrons: shot and read noise.
     if sensor.full_well is not None:
-        light = _electrons(expose(light, full_scale, 0.0, None), sensor.full_well, sensor.read_noise, rng)
+        light = _electrons(expose(light, full_scale, 0.0, None), sensor, rng)
         full_scale = 1.0
     # White noise, then the sensor's values.
     frame = expose(light, full_scale, sensor.noise_sigma, rng)
@@ -92,19 +101,18 @@ def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
 
     `seen`, shape (H, W), are the pixels inside the camera's view mask, default all.
     """
-    values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0) if sensor.clips else frame)
     if sensor.is_processed:
-        values = np.asarray(_processed(values.astype(np.float32), sensor, seen), dtype=float)
+        return _recorded(_processed(frame, sensor, seen), sensor)
+    values = sensor.response.model().encode(np.clip(frame, 0.0, 1.0) if sensor.clips else frame)
     if sensor.bits is not None:
         largest = 2**sensor.bits - 1
         values = np.rint(values * largest) / largest
-    if sensor.coding is not None:
-        values = code(np.rint(values * 255).astype(np.uint8), sensor.coding) / 255
     return values.astype(np.float32)
 
 
-def _processed(picture: Image, sensor: Sensor, seen: Mask | None) -> Image:
-    """Sharpen, scale and draw, in this order."""
+def _processed(frame: Image, sensor: Sensor, seen: Mask | None) -> Image:
+    """Clip a linear frame, apply the response, sharpen, scale and draw, in this order."""
+    picture = sensor.response.model().encode_picture(np.clip(frame, 0.0, 1.0) if sensor.clips else frame)
     if sensor.sharpening is not None:
         picture = video_processor.sharpen(picture, sensor.sharpening)
         picture = np.clip(picture, 0.0, 1.0) if sensor.clips else picture
@@ -114,10 +122,32 @@ def _processed(picture: Image, sensor: Sensor, seen: Mask | None) -> Image:
     return picture if sensor.overlay is None else video_processor.draw(picture, sensor.overlay, seen)
 
 
-def _electrons(frame: Image, full_well: float, read_noise: float, rng: np.random.Generator | None) -> Image:
+def _recorded(picture: Image, sensor: Sensor) -> Image:
+    """Quantise a processed picture and code it."""
+    if sensor.bits is None:
+        return picture
+    if sensor.coding is None:
+        largest = 2**sensor.bits - 1
+        return np.asarray(np.rint(picture * np.float64(largest)) / largest, dtype=np.float32)
+    coded = code(np.rint(picture * np.float32(255)).astype(np.uint8), sensor.coding)
+    return np.asarray(cv2.LUT(coded, LEVELS))
+
+
+def _electrons(frame: Image, sensor: Sensor, rng: np.random.Generator | None) -> Image:
     """Count electrons, Poisson about the light's mean, and add the normal noise of the readout; share of full scale."""
+    full_well, read_noise = sensor.full_well, sensor.read_noise
+    assert full_well is not None
     if rng is None:
         raise ValueError("shot noise needs a generator")
+    if sensor.is_processed:
+        # A picture to look at, in single precision; plain frames, of which errors are measured, keep NumPy's numbers.
+        levels = poisson(np.maximum(frame, 0) * np.float32(full_well), rng)
+        levels *= np.float32(1 / full_well)
+        if read_noise > 0:
+            noise = rng.standard_normal(levels.shape, dtype=np.float32)
+            noise *= np.float32(read_noise / full_well)
+            levels += noise
+        return levels
     # Shot noise: beyond `MAX_COUNT` the mean stands for itself.
     mean = np.maximum(frame.astype(float), 0.0) * full_well
     counts = np.where(mean > MAX_COUNT, mean, rng.poisson(np.minimum(mean, MAX_COUNT)))
@@ -137,8 +167,11 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
     ValueError
         If noise is asked for without a generator.
     """
-    # In double precision: a small full scale is 0 in single precision.
-    frame = (radiance / np.float64(full_scale)).astype(np.float32) if full_scale > 0 else np.zeros_like(radiance)
+    if full_scale == 1:
+        frame = radiance
+    else:
+        # In double precision: a small full scale is 0 in single precision.
+        frame = (radiance / np.float64(full_scale)).astype(np.float32) if full_scale > 0 else np.zeros_like(radiance)
     if noise_sigma > 0:
         if rng is None:
             raise ValueError("noise needs a generator")
@@ -157,14 +190,34 @@ def full_scale_of_average(light: Image, average: float, sensor: Sensor) -> float
     values = light.ravel()[:: max(1, light.size // METERED)]
 
     def excess(log_scale: float) -> float:
-        return float(response.encode(np.clip(values / math.exp(log_scale), 0.0, 1.0)).mean()) - average
+        levels = response.encode_picture(np.clip(values / np.float64(math.exp(log_scale)), 0, 1).astype(np.float32))
+        # In logarithms both are nearly linear: few steps lead to the zero.
+        return math.log(max(float(levels.mean(dtype=np.float64)), TINY) / average)
 
     # Between the brightest pixel and a tiny share of it the mean falls steadily with the full scale.
-    low, high = math.log(peak * 1e-6), math.log(peak * 1e3)
-    for _ in range(60):
+    return math.exp(_zero_of(excess, math.log(peak * 1e-6), math.log(peak * 1e3)))
+
+
+def _zero_of(falling: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a falling function is 0, to `CLOSE`, by Ridders' method; an end, where it is 0 at neither side."""
+    at_low, at_high = falling(low), falling(high)
+    if at_low <= 0 or at_high >= 0:
+        return low if at_low <= 0 else high
+    last = math.inf
+    while high - low > CLOSE:
         middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return math.exp((low + high) / 2)
+        at_middle = falling(middle)
+        # Through both ends and the middle goes an exponential times a straight line; its zero lies in the bracket.
+        root = math.sqrt(at_middle**2 - at_low * at_high)
+        found = middle + (middle - low) * at_middle / root if root > 0 else middle
+        if abs(found - last) < CLOSE:
+            return found
+        last, value = found, falling(found)
+        # The narrowest bracket of the four values.
+        points = sorted([(low, at_low), (middle, at_middle), (found, value), (high, at_high)])
+        low, at_low = max(point for point in points if point[1] > 0)
+        high, at_high = min(point for point in points if point[1] <= 0)
+    return (low + high) / 2
 
 
 def to_uint8(frame: Image) -> Picture:

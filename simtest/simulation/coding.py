@@ -17,6 +17,15 @@ _SAMPLING = {
 }
 
 
+def check_codec(coding: Coding | None) -> None:
+    """Raise `InputError` where the package of a coding is missing: before anything is rendered for it."""
+    if isinstance(coding, H264Coding):
+        try:
+            import av  # noqa: F401
+        except ImportError as error:
+            raise InputError('sensor.coding.type = "h264": needs the package av; install simtest[video]') from error
+
+
 def code(picture: Picture, coding: Coding) -> Picture:
     """Return a picture as it is after lossy coding."""
     return _jpeg(picture, coding) if isinstance(coding, JpegCoding) else _h264(picture, coding)
@@ -25,19 +34,18 @@ def code(picture: Picture, coding: Coding) -> Picture:
 def _jpeg(picture: Picture, coding: JpegCoding) -> Picture:
     options = [cv2.IMWRITE_JPEG_QUALITY, coding.quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, _SAMPLING[coding.chroma]]
     # OpenCV wants blue first.
-    values = picture if picture.ndim == 2 else picture[..., ::-1]
+    values = np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     for _ in range(coding.generations):
         ok, data = cv2.imencode(".jpg", values, options)
         assert ok
         values = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
-    return np.ascontiguousarray(values if values.ndim == 2 else values[..., ::-1])
+    return np.asarray(values if values.ndim == 2 else cv2.cvtColor(values, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def _h264(picture: Picture, coding: H264Coding) -> Picture:
-    try:
-        import av
-    except ImportError as error:
-        raise InputError('sensor.coding.type = "h264": needs the package av; install simtest[video]') from error
+    check_codec(coding)
+    import av
+
     height, width = picture.shape[:2]
     # Chroma of half size needs even sides.
     even = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

@@ -45,6 +45,11 @@ FIELDS = {
     "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
 }
 
+MOTION_FIELD = (
+    "scene.camera.motion: frame.png, radiance.exr and the radiance's parts are the mean over the exposure; labels, "
+    "highlights, lights and poses are those of its middle"
+)
+
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where more is known.
@@ -83,7 +88,7 @@ def _calibration_file(scene: Scene) -> str:
     """Return the calibration file of frame.png, as `simtest reconstruct --camera` reads it."""
     sensor = scene.sensor
     # Only what the scene says is known (`sensor.*_known`).
-    stated: dict[str, dict[str, Json]] = {"camera": scene.camera.model_dump(exclude_none=True)}
+    stated: dict[str, dict[str, Json]] = {"camera": scene.camera.still.model_dump(exclude_none=True)}
     if not sensor.encodes:
         stated["response"] = {"type": "srgb"}
     else:
@@ -147,6 +152,8 @@ def _description(frame: LabelledFrame) -> Json:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")
         described["encoding"] = {"response": response, "bits": sensor.bits, "png_bits": _png_bits(sensor)}
+    if scene.camera.moving is not None:
+        fields["motion"] = MOTION_FIELD
     # The lights' true positions where the scene's keys do not show them: a preset's, and those that were drawn.
     if rig.preset is not None or rig.is_drawn:
         described["lights_mm"] = rig.true_mm().tolist()

@@ -7,6 +7,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.runtime.arrays import Image
+from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.simulation.visible_highlights import VisibleHighlight
@@ -59,10 +60,11 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
     Raises
     ------
     InputError
-        If no pixel sees the surface.
+        If no pixel sees the surface, or a package for the coding is missing.
     BackendError
         If the rendering backend cannot be used.
     """
+    check_codec(scene.sensor.coding)
     session = Session(scene, variant, labelled=True)
     # The frame's labels are not used, but the truth starts from their hits.
     radiance = session.frame(progress).radiance

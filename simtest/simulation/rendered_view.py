@@ -13,6 +13,7 @@ from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
+from simtest.simulation.coding import check_codec
 from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
@@ -76,6 +77,7 @@ class RenderedView:
 
 def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
     """Move a session to a scene, render it, unless its radiance is given, and judge its highlights."""
+    check_codec(scene.sensor.coding)
     session.update(scene)
     if radiance is None:
         radiance = session.radiance()

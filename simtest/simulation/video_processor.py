@@ -22,7 +22,7 @@ _FONT, _CAPITAL_PX = cv2.FONT_HERSHEY_SIMPLEX, 20.0
 
 def luma(picture: Image) -> Image:
     """Return the luma of an encoded picture, shape (H, W)."""
-    return picture if picture.ndim == 2 else np.asarray(picture @ LUMA)
+    return picture if picture.ndim == 2 else np.asarray(cv2.transform(picture, LUMA[None]))
 
 
 # Colour ---------------------------------------------------------------------------------------------------------------
@@ -39,11 +39,10 @@ def develop(frame: Image, colour: ColourProcessing, clips: bool) -> Image:
 
     With `clips` values end at 1 before and behind the gains, so that what fills the wells becomes white, not magenta.
     """
-    gains = colour.gains.astype(np.float32)
+    balanced = _mix(np.clip(frame, 0.0, 1.0) if clips else frame, np.diag(colour.gains))
     if clips:
-        frame = np.minimum(np.clip(frame, 0.0, 1.0) * gains, np.float32(1))
-        return _mix(frame, np.array(colour.matrix))
-    return _mix(np.asarray(frame * gains), np.array(colour.matrix))
+        np.minimum(balanced, np.float32(1), out=balanced)
+    return _mix(balanced, np.array(colour.matrix))
 
 
 def _mix(frame: Image, matrix: Array) -> Image:
@@ -59,7 +58,7 @@ def sharpen(picture: Image, sharpening: Sharpening) -> Image:
     value = luma(picture)
     smooth = cv2.GaussianBlur(value, (0, 0), sharpening.radius_px, borderType=cv2.BORDER_REFLECT_101)
     change = np.float32(sharpening.amount) * (value - smooth)
-    return np.asarray(picture + (change if picture.ndim == 2 else change[..., None]))
+    return np.asarray(cv2.add(picture, change if picture.ndim == 2 else cv2.merge([change] * 3)))
 
 
 def rescale(picture: Image, scaling: Scaling) -> Image:
@@ -78,8 +77,7 @@ def rescale(picture: Image, scaling: Scaling) -> Image:
 
 def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
     """Return an encoded picture with what the processor draws: black outside `seen`, then boxes, then captions."""
-    drawn = picture.copy() if seen is None else np.where(seen if picture.ndim == 2 else seen[..., None], picture, 0.0)
-    drawn = np.asarray(drawn, dtype=np.float32)
+    drawn = picture.copy() if seen is None else np.asarray(cv2.copyTo(picture, seen.astype(np.uint8)))
     height, width = drawn.shape[:2]
     for box in overlay.boxes:
         left, top = round(box.x * width), round(box.y * height)
@@ -94,7 +92,7 @@ def draw(picture: Image, overlay: Overlay, seen: Mask | None) -> Image:
 
 def _paint(colour: tuple[float, float, float], picture: Image) -> Image:
     values = np.array(colour, dtype=np.float32)
-    return values if picture.ndim == 3 else luma(values)
+    return values if picture.ndim == 3 else np.asarray(values @ LUMA)
 
 
 def _cover(caption: Caption, size: tuple[int, int]) -> Image:

@@ -11,6 +11,7 @@ from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.resources import shown
 from simtest.spec.camera_tables import camera_toml
+from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 
@@ -116,6 +117,22 @@ class CameraSpec(Spec):
             told = self.view_mask
             mask = ViewMask(*_centre(told.cx, told.cy, middle), told.radius, told.corner, told.half_height)
         return Camera(self.width, self.height, self.fx, self.fy, cx, cy, self.skew, lens, mask)
+
+
+class SceneCamera(CameraSpec):
+    """The camera of a scene: that of a camera file, and how it moves."""
+
+    motion: Motion | None = Field(None, description="during the exposure; default none")
+
+    @property
+    def moving(self) -> Motion | None:
+        """The motion, where it moves the camera at all."""
+        return self.motion if self.motion is not None and self.motion.moves else None
+
+    @property
+    def still(self) -> "SceneCamera":
+        """The same camera without its motion."""
+        return self if self.motion is None else self.model_copy(update={"motion": None})
 
 
 def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
@@ -67,7 +67,7 @@ class Scene(Spec):
     surface: Surface
     reflectance: Reflectance = PhongReflectance()
     rig: Rig = Rig()
-    camera: CameraSpec = CameraSpec()
+    camera: SceneCamera = SceneCamera()
     sensor: Sensor = Sensor()
     render: Effort = Effort()
     known: KnownSpec = KnownSpec()

@@ -215,9 +215,14 @@ def _combinations(tables: tuple[Mapping[str, tuple[Json, ...]], ...]) -> list[di
 
 
 def _short(path: str, among: Iterable[str]) -> str:
-    """Return the last part of a key path, or all of it where that is not unique."""
-    last = path.rsplit(".", 1)[-1]
-    return last if sum(key.rsplit(".", 1)[-1] == last for key in among) == 1 else path
+    """Return the last part of a key path, an index with its list, or all of it where that is not unique."""
+    last = _last(path)
+    return last if sum(_last(key) == last for key in among) == 1 else path
+
+
+def _last(path: str) -> str:
+    parts = path.split(".")
+    return ".".join(parts[-2:] if parts[-1].isdecimal() else parts[-1:])
 
 
 def _set_options(values: Mapping[str, Json]) -> str:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.errors import InputError
-from simtest.simulation import camera_chain, coding, mosaic, video_processor
+from simtest.simulation import camera_chain, coding, labelled_frame, mosaic, shot_noise, video_processor
 from simtest.spec.processing import (
     Box,
     Caption,
@@ -106,6 +106,24 @@ def test_demosaicing_keeps_a_constant_and_the_measured_values(method):
     found = mosaic.demosaic(mosaic.sample(frame, spec), spec)[4:-4, 4:-4]
     again = mosaic.sample(found, spec)
     np.testing.assert_allclose(again, mosaic.sample(frame[4:-4, 4:-4], spec), atol=step)
+
+
+def test_vng_follows_slopes_and_edges():
+    """A plane in the root of the light is filled in to rounding, and along an edge colours mix less than bilinearly."""
+    y, x = np.mgrid[:40, :48]
+    for slopes in [(0.006, 0.0), (0.0, 0.006), (0.003, -0.004)]:
+        root = 0.4 + slopes[0] * x + slopes[1] * y
+        white = np.repeat(np.square(root).astype(np.float32)[..., None], 3, axis=2)
+        found = mosaic.demosaic(mosaic.sample(white, Mosaic()), Mosaic(demosaicing="vng"))
+        gap = np.sqrt(found[4:-4, 4:-4]) - root[4:-4, 4:-4, None]
+        # Sums of codes are divided in whole numbers, each by less than one code.
+        assert np.abs(gap).max() < 2 / 255
+    edge = np.repeat(np.where(x > 22, 0.6, 0.1).astype(np.float32)[..., None], 3, axis=2)
+    tint = [
+        np.ptp(mosaic.demosaic(mosaic.sample(edge, Mosaic()), Mosaic(demosaicing=way))[4:-4, 4:-4], axis=2).mean()
+        for way in ("vng", "bilinear")
+    ]
+    assert tint[0] < 0.85 * tint[1]
 
 
 def test_demosaicing_of_an_edge_shows_false_colour():
@@ -295,6 +313,11 @@ def test_a_missing_codec_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(InputError, match=r"needs the package av; install simtest\[video\]"):
         coding.code(np.zeros((8, 8), np.uint8), H264Coding())
+    # Before anything is rendered: there is no session to render with.
+    told = {"surface": {"type": "plane"}, "sensor": {"bits": 8, "coding": {"type": "h264"}}}
+    monkeypatch.setattr(labelled_frame, "Session", None)
+    with pytest.raises(InputError, match="needs the package av"):
+        labelled_frame.make_frame(scene_from_dict(told))
 
 
 def test_coding_needs_8_bits():
@@ -339,11 +362,11 @@ def test_stages_come_in_physical_order():
     rng = np.random.default_rng(7)
     own = video_processor.as_seen_by_sensor(light / np.float32(2), told.colour)
     plane = mosaic.sample(own, told.mosaic)
-    electrons = rng.poisson(plane.astype(float) * 4000) + 3.0 * rng.standard_normal(plane.shape)
-    plane = (electrons / 4000).astype(np.float32)
+    share = shot_noise.poisson(plane * np.float32(4000), rng) * np.float32(1 / 4000)
+    plane = share + np.float32(3.0 / 4000) * rng.standard_normal(plane.shape, dtype=np.float32)
     plane = plane + np.float32(0.005) * rng.standard_normal(plane.shape, dtype=np.float32)
     linear = video_processor.develop(mosaic.demosaic(plane, told.mosaic), told.colour, True)
-    values = told.response.model().encode(np.clip(linear, 0, 1)).astype(np.float32)
+    values = told.response.model().encode_picture(np.clip(linear, 0, 1))
     values = np.clip(video_processor.sharpen(values, told.sharpening), 0, 1)
     values = np.clip(video_processor.rescale(values, told.scaling), 0, 1)
     values = video_processor.draw(values, told.overlay, None)

@@ -18,7 +18,7 @@ from simtest.dataset.reader import read_samples
 from simtest.dataset.sample import Sample
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.sensor import Sensor
 
 SIDE = 32
@@ -103,7 +103,7 @@ def read_crops(folder: str | Path, split: str) -> Crops:
 def _crops(sample: Sample) -> Iterator[_Crop]:
     """Yield the crops of a sample: one for each detection that matches a true highlight."""
     meta = sample.meta
-    camera = CameraSpec.model_validate(meta["scene"]["camera"]).model()
+    camera = SceneCamera.model_validate(meta["scene"]["camera"]).model()
     sensor = Sensor.model_validate(meta["scene"]["sensor"])
     # As simtest.dataset.maker writes it: what the sensor itself encoded, or else sRGB.
     decode = sensor.response.model().decode if sensor.encodes else srgb_decode
