@@ -24,6 +24,7 @@ Public names are loaded at first use; importing the package loads neither the re
 from typing import TYPE_CHECKING, Any
 
 from simtest import _renamed
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.api import LabelledFrame, export, render, validate
@@ -53,7 +54,7 @@ _HOMES = {
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
     ),
 }  # fmt: skip
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_named, _names = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "BackendError",
@@ -91,14 +92,8 @@ def __getattr__(name: str) -> Any:
         from simtest.runtime.provenance import version
 
         return version()
-    if name not in _HOME:
-        raise AttributeError(f"module 'simtest' has no attribute {name!r}")
-    import importlib
-
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+    return _named(name)
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*_names(), "__version__"]

@@ -6,26 +6,22 @@ describe to Mitsuba; `rays`, `integrate`, `direct` and `indirect` trace its radi
 bisects light and camera). `frames` defines the records; `mitsuba_export` writes a scene for Mitsuba.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.rendering.frames import Frame, HighlightPoint, Labels, Radiance, TruthMaps
     from simtest.rendering.integrate import Progress
     from simtest.rendering.session import Session
 
-_HOME = {
-    **dict.fromkeys(("Frame", "HighlightPoint", "Labels", "Radiance", "TruthMaps"), "simtest.rendering.frames"),
-    "Progress": "simtest.rendering.integrate",
-    "Session": "simtest.rendering.session",
+_HOMES = {
+    "simtest.rendering.frames": ("Frame", "HighlightPoint", "Labels", "Radiance", "TruthMaps"),
+    "simtest.rendering.integrate": ("Progress",),
+    "simtest.rendering.session": ("Session",),
 }
 
 __all__ = ["Frame", "HighlightPoint", "Labels", "Progress", "Radiance", "Session", "TruthMaps"]
 
-
-def __getattr__(name: str) -> Any:
-    """Load a name at first use: who asks for the backend alone needs no renderer."""
-    import importlib
-
-    if name in _HOME:
-        return getattr(importlib.import_module(_HOME[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# Who asks for the backend alone needs no renderer.
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

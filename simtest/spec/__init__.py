@@ -7,7 +7,9 @@ scenes are rendered; `calibration_file` and `camera_spec` read cameras, with `ca
 Names are loaded at first use: a command needs few of the models, and making one takes milliseconds.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.spec.calibration_file import CalibrationSpec, load_calibration
@@ -47,7 +49,6 @@ _HOMES = {
     ),
     "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AnatomySurface",
@@ -85,16 +86,4 @@ __all__ = [
     "scene_from_dict",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
-
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
