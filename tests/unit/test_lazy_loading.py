@@ -7,7 +7,9 @@ import sys
 import pytest
 
 import simtest
+from simtest import Camera, load_calibration, save_camera
 from simtest.runtime.lazy_names import lazy_names
+from simtest.spec import CalibrationSpec
 
 PACKAGES = ("simtest", "simtest.calibration", "simtest.detection", "simtest.estimators", "simtest.geometry",
             "simtest.reconstruction", "simtest.rendering", "simtest.spec", "simtest.surfaces")  # fmt: skip
@@ -89,6 +91,19 @@ def test_a_finished_run_is_recognised_without_what_made_it(tmp_path):
     results = tmp_path / "run" / "results.parquet"
     results.write_bytes(results.read_bytes()[:-1])
     assert {"polars", "cv2", "mitsuba"} <= loaded(code, *arguments)
+
+
+def test_a_camera_alone_loads_no_models_of_sensor_and_lobe(tmp_path):
+    camera = Camera.from_fov(60.0, 120, 90)
+    save_camera(camera, tmp_path / "camera.toml")
+    (tmp_path / "calibration.toml").write_text((tmp_path / "camera.toml").read_text() + "[sensor]\nbits = 8\n")
+    code = "import sys; from simtest.spec import load_calibration; load_calibration(sys.argv[1])"
+    models = {"simtest.spec.sensor", "simtest.spec.reflectance", "numpy.random", "cv2"}
+    assert not loaded(code, tmp_path / "camera.toml") & models
+    # Negative control, and the same calibration by both ways.
+    assert "simtest.spec.sensor" in loaded(code, tmp_path / "calibration.toml")
+    assert load_calibration(tmp_path / "camera.toml") == CalibrationSpec(camera={}).calibration(camera)
+    assert load_calibration(tmp_path / "calibration.toml").noise.bits == 8
 
 
 def test_a_page_needs_neither_scipy_nor_pillow_s_other_formats(tmp_path):
