@@ -43,7 +43,7 @@ if TYPE_CHECKING:
         save_camera,
     )
 
-_load = lazy_names(__name__, {
+_HOMES = {
     "simtest.api": ("LabelledFrame", "export", "render", "validate"),
     "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
@@ -53,7 +53,8 @@ _load = lazy_names(__name__, {
     "simtest.spec": (
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
     ),
-})  # fmt: skip
+}  # fmt: skip
+_named, _names = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "BackendError",
@@ -91,8 +92,8 @@ def __getattr__(name: str) -> Any:
         from simtest.runtime.provenance import version
 
         return version()
-    return _load(name)
+    return _named(name)
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*_names(), "__version__"]

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
-__getattr__ = lazy_names(
-    __name__, {"simtest.simulation.labelled_frame": ("LabelledFrame",), "simtest.reconstruction": ("reconstruct",)}
-)
+_HOMES = {"simtest.simulation.labelled_frame": ("LabelledFrame",), "simtest.reconstruction": ("reconstruct",)}
+__getattr__, _ = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "Extras",

@@ -4,14 +4,42 @@
 holds what is known of lights, distance and lobe, with its uncertainty.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from simtest.calibration.calibration import Calibration, CorrectedFrame
-from simtest.calibration.frame import Frame
-from simtest.calibration.noise_estimate import estimate_noise
-from simtest.calibration.noise_model import NoiseModel
-from simtest.calibration.priors import NO_PRIORS, Distribution, LogUniform, Normal, Priors, Uniform, exactly
-from simtest.calibration.response import Response, srgb_decode, srgb_encode
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.calibration.calibration import Calibration, CorrectedFrame
+    from simtest.calibration.frame import Frame
+    from simtest.calibration.noise_estimate import estimate_noise
+    from simtest.calibration.noise_model import NoiseModel
+    from simtest.calibration.priors import NO_PRIORS, Distribution, LogUniform, Normal, Priors, Uniform, exactly
+    from simtest.calibration.response import Response, srgb_decode, srgb_encode
+
+_HOMES = {
+    "simtest.calibration.calibration": (
+        "Calibration",
+        "CorrectedFrame",
+    ),
+    "simtest.calibration.frame": ("Frame",),
+    "simtest.calibration.noise_estimate": ("estimate_noise",),
+    "simtest.calibration.noise_model": ("NoiseModel",),
+    "simtest.calibration.priors": (
+        "NO_PRIORS",
+        "Distribution",
+        "LogUniform",
+        "Normal",
+        "Priors",
+        "Uniform",
+        "exactly",
+    ),
+    "simtest.calibration.response": (
+        "Response",
+        "srgb_decode",
+        "srgb_encode",
+    ),
+}
+_named, __dir__ = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "NO_PRIORS",
@@ -34,7 +62,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name != "Known":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return _named(name)
     import warnings
 
     warnings.warn(
@@ -50,7 +78,9 @@ def _known(
     distance_mm: float | None = None,
     distance_sd_mm: float = 0.0,
     lobe_curvature: float | None = None,
-) -> Priors:
+) -> "Priors":
     """Return the priors of bare numbers, as `Known` took them."""
+    from simtest.calibration.priors import Normal, Priors, exactly
+
     distance = None if distance_mm is None else Normal(distance_mm, distance_sd_mm)
     return Priors(lights_mm, distance, None if lobe_curvature is None else exactly(lobe_curvature))

@@ -49,4 +49,14 @@ def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask
     if not response.size:
         return 0.0
     # robust spread
-    return float(MAD_TO_SIGMA * np.median(np.abs(response)) / 6.0)
+    return float(MAD_TO_SIGMA * _median(np.abs(response)) / 6.0)
+
+
+def _median(values: npt.NDArray[np.float32]) -> np.float32:
+    """Return the median of values, shape (n,), as `np.median` does, which loads `numpy.ma` first."""
+    if np.isnan(values.max()):
+        return np.float32(np.nan)
+    middle = len(values) // 2
+    if len(values) % 2:
+        return np.float32(np.partition(values, middle)[middle])
+    return np.float32(np.mean(np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1]))

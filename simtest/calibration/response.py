@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -97,6 +96,8 @@ class Response:
         """Return the light of a picture of at most 16 bits, shape (H, W) or (H, W, C), in [0, 1]."""
         if self.kind == "linear":
             return values
+        import cv2
+
         # A table of all 16-bit values is faster than the curve at each pixel, and exact for pictures of 8 and 16 bits.
         table = self.decode(np.linspace(0, 1, _LEVELS)).astype(np.float32)
         return np.asarray(table[cv2.multiply(values, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)])

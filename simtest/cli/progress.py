@@ -3,6 +3,10 @@
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 
 @contextmanager
@@ -38,24 +42,21 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
     text that ends in "written". A single step shows no bar. What comes after all steps of a bar, such as the steps of
     a page, has a bar of its own below.
     """
-    from rich import progress as rich
-    from rich.console import Console
-
-    columns = (
-        rich.SpinnerColumn(finished_text=" "), rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(),
-        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
-    )  # fmt: skip
-    bar = rich.Progress(*columns, console=Console(stderr=True))
-    task = bar.add_task("starting", total=None)
+    bar: Progress | None = None
+    task: TaskID | None = None
     with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
-            nonlocal task
+            nonlocal bar, task
             check()
-            if done == total and not bar.live.is_started:
-                return
-            # Not before the first step: bad input is reported in one line, without a bar.
-            bar.start()
+            if bar is None:
+                if done == total:
+                    return
+                # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
+                bar = _bar()
+                task = bar.add_task("starting", total=None)
+                bar.start()
+            assert task is not None
             if done < total and bar.tasks[-1].finished:
                 bar.update(task, description="done")
                 task = bar.add_task(what, total=total)
@@ -65,5 +66,17 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
         try:
             yield move
         finally:
-            if bar.live.is_started:
+            if bar is not None:
                 bar.stop()
+
+
+def _bar() -> "Progress":
+    """Return a bar on the error stream."""
+    from rich import progress as rich
+    from rich.console import Console
+
+    columns = (
+        rich.SpinnerColumn(finished_text=" "), rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(),
+        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+    )  # fmt: skip
+    return rich.Progress(*columns, console=Console(stderr=True))

@@ -101,7 +101,8 @@ def _print_tables(record: "PictureRecord") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    # Without the names of emojis, which take as long to load as the table to print.
+    console = Console(emoji=False)
     # Narrower, normals would be cut off.
     console.width = max(console.width, TABLE_WIDTH)
     if record.specularities:

@@ -5,10 +5,22 @@ takes peaks of the mean of the channels; `colour` (with `light_split`, `blobs` a
 colour.
 """
 
-from simtest.calibration import estimate_noise
-from simtest.detection.detector import Detection, Detector, load_detector
-from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
-from simtest.detection.shape import PeakShape, flat_pixels, peak_shape
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.calibration import estimate_noise
+    from simtest.detection.detector import Detection, Detector, load_detector
+    from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
+    from simtest.detection.shape import PeakShape, flat_pixels, peak_shape
+
+_HOMES = {
+    "simtest.calibration": ("estimate_noise",),
+    "simtest.detection.detector": ("Detection", "Detector", "load_detector"),
+    "simtest.detection.regions": ("Component", "Region", "contrast", "detect", "half_height_component"),
+    "simtest.detection.shape": ("PeakShape", "flat_pixels", "peak_shape"),
+}
 
 __all__ = [
     "Component",
@@ -24,3 +36,5 @@ __all__ = [
     "load_detector",
     "peak_shape",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

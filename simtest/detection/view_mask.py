@@ -8,7 +8,6 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
-from simtest.runtime.seeds import from_integer
 
 WORKING_PX = 480
 """Longer side of the picture in which the border is searched."""
@@ -128,6 +127,9 @@ def _border(inside: Mask) -> Array:
 
 def _circle(points: Array, tolerance: float) -> tuple[float, float, float] | None:
     """Fit a circle to the share of points that lie on one; return centre and radius, or None."""
+    # Imported here: few pictures have a round view, and NumPy's generators are loaded with it.
+    from simtest.runtime.seeds import from_integer
+
     rng = from_integer(0)
     # candidates: circles through three points
     a, b, c = points[rng.integers(0, len(points), (3, TRIPLES))]

@@ -5,16 +5,34 @@ a file of its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bi
 `isophote_fit` (ellipses) and `isophote_family` (the isophotes of one highlight together, extrapolated to its peak).
 """
 
-from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.protocol import (
-    AnyEstimator,
-    BatchEstimator,
-    Estimate,
-    EstimatedCurvature,
-    Estimator,
-    FrameEstimator,
-)
-from simtest.estimators.registry import load_estimators
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.estimators.isophote_fit import FittedIsophote
+    from simtest.estimators.protocol import (
+        AnyEstimator,
+        BatchEstimator,
+        Estimate,
+        EstimatedCurvature,
+        Estimator,
+        FrameEstimator,
+    )
+    from simtest.estimators.registry import load_estimators
+
+_HOMES = {
+    "simtest.estimators.isophote_fit": ("FittedIsophote",),
+    "simtest.estimators.protocol": (
+        "AnyEstimator",
+        "BatchEstimator",
+        "Estimate",
+        "EstimatedCurvature",
+        "Estimator",
+        "FrameEstimator",
+    ),
+    "simtest.estimators.registry": ("load_estimators",),
+}
 
 __all__ = [
     "AnyEstimator",
@@ -26,3 +44,5 @@ __all__ = [
     "FrameEstimator",
     "load_estimators",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

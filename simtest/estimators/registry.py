@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError
+from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.entry_points import EntryPointGroup
-
-ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,32 @@ fitted to them (`ellipse_fit`, `arc_fit`), the cones of their sightlines (`conic
 may be (`circle_from_cone`, `pose_region`).
 """
 
-from simtest.geometry.arc_fit import FittedArc, fit_arc
-from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
-from simtest.geometry.conics import Ellipse, cone_of_conic, cone_rays, ellipse_of_conic
-from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
-from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
-from simtest.geometry.gaussian_smoothing import smooth
-from simtest.geometry.patch import Patch
-from simtest.runtime.arrays import Array, Image, Index, Mask
+from typing import TYPE_CHECKING
+
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.geometry.arc_fit import FittedArc, fit_arc
+    from simtest.geometry.camera import Camera, ViewMask
+    from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
+    from simtest.geometry.conics import Ellipse, cone_of_conic, cone_rays, ellipse_of_conic
+    from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
+    from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
+    from simtest.geometry.gaussian_smoothing import smooth
+    from simtest.geometry.patch import Patch
+    from simtest.runtime.arrays import Array, Image, Index, Mask
+
+_HOMES = {
+    "simtest.geometry.arc_fit": ("FittedArc", "fit_arc"),
+    "simtest.geometry.camera": ("Camera", "ViewMask"),
+    "simtest.geometry.circle_from_cone": ("CirclePose", "CirclePoses", "circle_pose", "circle_poses", "cone_axes"),
+    "simtest.geometry.conics": ("Ellipse", "cone_of_conic", "cone_rays", "ellipse_of_conic"),
+    "simtest.geometry.distortion": ("BrownConrady", "Distortion", "KannalaBrandt"),
+    "simtest.geometry.ellipse_fit": ("FittedConic", "fit_ellipse", "fit_ellipses"),
+    "simtest.geometry.gaussian_smoothing": ("smooth",),
+    "simtest.geometry.patch": ("Patch",),
+    "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
+}
 
 __all__ = [
     "Array",
@@ -42,3 +59,5 @@ __all__ = [
     "fit_ellipses",
     "smooth",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -126,8 +126,10 @@ def png(picture: Pixels) -> bytes:
 
 def data_address(picture: Pixels, height: int | None = None) -> str:
     """Return a picture, RGB, as ``data:image/avif;base64,...``, made smaller where it is higher than px."""
-    from PIL import Image
+    # The module of the format, or Pillow loads those of all formats to find it.
+    from PIL import AvifImagePlugin, Image
 
+    assert AvifImagePlugin.SUPPORTED
     if height is not None and picture.shape[0] > height:
         share = height / picture.shape[0]
         picture = np.asarray(cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), np.uint8)

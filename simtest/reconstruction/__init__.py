@@ -5,12 +5,35 @@ records of them, which output_files, overlay, constraints and result_page write.
 sequence for a folder or a video, with tracking.
 """
 
-from simtest.reconstruction.pipeline import (
-    DEFAULT_ESTIMATORS,
-    Specularity,
-    detect_in_picture,
-    reconstruct,
-    reconstruct_colour,
-)
+from typing import TYPE_CHECKING
 
-__all__ = ["DEFAULT_ESTIMATORS", "Specularity", "detect_in_picture", "reconstruct", "reconstruct_colour"]
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.reconstruction.pipeline import (
+        DEFAULT_ESTIMATORS,
+        Specularity,
+        detect_in_picture,
+        reconstruct,
+        reconstruct_colour,
+    )
+
+_HOMES = {
+    "simtest.reconstruction.pipeline": (
+        "DEFAULT_ESTIMATORS",
+        "Specularity",
+        "detect_in_picture",
+        "reconstruct",
+        "reconstruct_colour",
+    ),
+}
+
+__all__ = [
+    "DEFAULT_ESTIMATORS",
+    "Specularity",
+    "detect_in_picture",
+    "reconstruct",
+    "reconstruct_colour",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
+from simtest.geometry import student_t
 from simtest.pages.axes import Axis
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
@@ -113,13 +114,12 @@ def _aggregate(rows: pl.DataFrame, ask: Ask, is_scattered: bool) -> pl.DataFrame
 
 def _interval(table: pl.DataFrame) -> tuple[Array, Array]:
     """95 % t interval of the mean; its lower end is not drawn below the least value seen."""
-    from scipy.special import stdtrit
-
     n = table["n"].to_numpy().astype(float)
+    factor = np.array([student_t.quantile(0.975, max(count - 1, 1)) for count in table["n"].to_list()])
     std = table["std"].cast(pl.Float64).to_numpy()
     y, least = table["y"].cast(pl.Float64).to_numpy(), table["least"].cast(pl.Float64).to_numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
-        half = np.where(n > 1, stdtrit(np.maximum(n - 1, 1), 0.975) * std / np.sqrt(n), np.nan)
+        half = np.where(n > 1, factor * std / np.sqrt(n), np.nan)
     return np.maximum(y - half, least), y + half
 
 

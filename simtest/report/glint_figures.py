@@ -6,6 +6,7 @@ from itertools import cycle
 import numpy as np
 import polars as pl
 
+from simtest.geometry import student_t
 from simtest.pages.axes import Axis, finite, log_range
 from simtest.pages.chart import Bars, Chart, Mark, Panel
 from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, Symbol, number, symbols
@@ -161,15 +162,13 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
 
 def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     """Describe the axis ratio of the pooled clouds over the base's curvature, along its principal directions."""
-    from scipy.special import stdtrit
-
     rows = clouds.filter(pl.col("cloud_glints_law").is_not_null() & pl.col("cloud_cov_11").is_not_null())
     groups = rows.with_columns(at=pl.col(KD).round(2)).group_by("label", "at", maintain_order=True)
     points: dict[str, list[tuple[float, float, float]]] = {}
     measured = []
     for (label, at), part in groups:
         ratio, error = pooled_ratio(part)
-        half = error * float(stdtrit(max(part.height - 1, 1), 0.975))
+        half = error * student_t.quantile(0.975, max(part.height - 1, 1))
         points.setdefault(str(label), []).append((float(at), ratio, half))
         spread = f" ± {number(error, 2)}" if np.isfinite(error) else ""
         measured.append(

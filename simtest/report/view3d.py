@@ -69,8 +69,10 @@ def view_3d(run: Run, colours: Mapping[str, str]) -> View3D | None:
 
     Returns None where no item has a surface.
     """
-    usable = [item for item in run.gallery if np.isfinite(item.position).all(axis=-1).sum() >= 16]
-    return _build(max(usable, key=_interest), colours) if usable else None
+    ranked = sorted(run.gallery, key=_interest, reverse=True)
+    usable = (item for item in ranked if np.isfinite(item.position).all(axis=-1).sum() >= 16)
+    chosen = next(usable, None)
+    return None if chosen is None else _build(chosen, colours)
 
 
 def _interest(item: GalleryItem) -> tuple[int, float]:

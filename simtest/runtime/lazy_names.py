@@ -1,29 +1,32 @@
-"""Names of a package that are loaded at first use."""
+"""Names of a package that are imported at first use: loading the package loads none of its modules."""
 
-import importlib
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 
-def lazy_names(package: str, homes: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """Return a package's ``__getattr__``.
+def lazy_names(
+    package: str, homes: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package whose names live in other modules.
 
     Parameters
     ----------
     package : str
-        Its ``__name__``.
+        Full name of the package, for the error of an unknown name.
     homes : mapping
-        Names that the package offers, by the module that defines them.
+        Full name of a module, and the names that it defines.
     """
     home = {name: module for module, names in homes.items() for name in names}
 
-    def load(name: str) -> Any:
+    def lookup(name: str) -> Any:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        import importlib
+        import sys
+
         value = getattr(importlib.import_module(home[name]), name)
-        # Found without this function from now on.
+        # Found by itself from now on.
         setattr(sys.modules[package], name, value)
         return value
 
-    return load
+    return lookup, lambda: sorted(home)

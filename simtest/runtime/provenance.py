@@ -34,9 +34,13 @@ def version() -> str:
 def commit() -> str | None:
     """Return the commit of simtest's checkout, with "+" if files are changed; None outside a checkout."""
     try:
-        head = _git("rev-parse", "HEAD")
-        return head + ("+" if _git("status", "--porcelain") else "")
-    except (OSError, subprocess.SubprocessError):
+        # One call for both: lines of the branch begin with #, and any other line is a change.
+        told = _git("status", "--porcelain=v2", "--branch").splitlines()
+        head = next(line for line in told if line.startswith("# branch.oid ")).split()[2]
+        if head == "(initial)":
+            return None
+        return head + ("+" if any(not line.startswith("#") for line in told) else "")
+    except (OSError, subprocess.SubprocessError, StopIteration):
         return None
 
 

@@ -1,7 +1,8 @@
 """What to simulate: frozen, validated models read from TOML, and their JSON schema.
 
 `scene` gathers surface, reflectance, rig, camera and sensor; `experiment`, `dataset_recipe` and `profile` say which
-scenes are rendered; `calibration_file` and `camera_spec` read cameras, with `camera_formats` for files of others.
+scenes are rendered; `calibration_file` (with `calibration_spec`) and `camera_spec` read cameras, with `camera_formats`
+for files of others.
 `spec_model` is the base of all models, `toml_files` reads and writes TOML.
 
 Names are loaded at first use: a command needs few of the models, and making one takes milliseconds.
@@ -12,7 +13,8 @@ from typing import TYPE_CHECKING
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from simtest.spec.calibration_file import CalibrationSpec, load_calibration
+    from simtest.spec.calibration_file import load_calibration
+    from simtest.spec.calibration_spec import CalibrationSpec
     from simtest.spec.camera_spec import CameraSpec, load_camera, save_camera
     from simtest.spec.camera_tables import camera_table, camera_toml, describe_camera
     from simtest.spec.dataset_recipe import Dataset, load_dataset
@@ -30,28 +32,26 @@ if TYPE_CHECKING:
     )
     from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "simtest.spec.calibration_file": ("CalibrationSpec", "load_calibration"),
-        "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
-        "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
-        "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
-        "simtest.spec.experiment": ("Experiment", "Group", "Uniform", "load_experiment"),
-        "simtest.spec.profile": ("Profile", "ProfileEntry", "experiments_of", "load_profile"),
-        "simtest.spec.rig": ("Emission", "LightSpec", "Rig"),
-        "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
-        "simtest.spec.surface": (
-            "AnatomySurface",
-            "CylinderSurface",
-            "PlaneSurface",
-            "QuadricSurface",
-            "SphereSurface",
-            "Surface",
-        ),
-        "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
-    },
-)
+_HOMES = {
+    "simtest.spec.calibration_file": ("load_calibration",),
+    "simtest.spec.calibration_spec": ("CalibrationSpec",),
+    "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
+    "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
+    "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
+    "simtest.spec.experiment": ("Experiment", "Group", "Uniform", "load_experiment"),
+    "simtest.spec.profile": ("Profile", "ProfileEntry", "experiments_of", "load_profile"),
+    "simtest.spec.rig": ("Emission", "LightSpec", "Rig"),
+    "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
+    "simtest.spec.surface": (
+        "AnatomySurface",
+        "CylinderSurface",
+        "PlaneSurface",
+        "QuadricSurface",
+        "SphereSurface",
+        "Surface",
+    ),
+    "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
+}
 
 __all__ = [
     "AnatomySurface",
@@ -89,6 +89,4 @@ __all__ = [
     "scene_from_dict",
 ]
 
-
-def __dir__() -> list[str]:
-    return list(__all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

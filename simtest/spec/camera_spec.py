@@ -19,7 +19,7 @@ Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface"})
-"""Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_file` reads them."""
+"""Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
 
 OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
 MATLAB_SUFFIX = ".mat"

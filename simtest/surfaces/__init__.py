@@ -6,7 +6,27 @@ user's mesh, read by `mesh_file`, repaired by `repair`, refined by `subdivision`
 `centreline` place cameras.
 """
 
-from simtest.surfaces.factory import forget_meshes, make_surface
-from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh
+from typing import TYPE_CHECKING
 
-__all__ = ["RayHits", "Shape", "SurfaceModel", "SurfacePoints", "TriangleMesh", "forget_meshes", "make_surface"]
+from simtest.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from simtest.surfaces.factory import forget_meshes, make_surface
+    from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh
+
+_HOMES = {
+    "simtest.surfaces.factory": ("forget_meshes", "make_surface"),
+    "simtest.surfaces.model": ("RayHits", "Shape", "SurfaceModel", "SurfacePoints", "TriangleMesh"),
+}
+
+__all__ = [
+    "RayHits",
+    "Shape",
+    "SurfaceModel",
+    "SurfacePoints",
+    "TriangleMesh",
+    "forget_meshes",
+    "make_surface",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -1,11 +1,12 @@
 """Expands an experiment into cases: one scene each, in a fixed order, under the name that its seeds depend on."""
 
 import itertools
+import json
 import math
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
 from simtest.runtime.files import Json
@@ -15,7 +16,9 @@ from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, appl
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
-from simtest.validation.results_table import Value
+
+if TYPE_CHECKING:
+    from simtest.validation.results_table import Value
 
 RELIEF_SEED = "surface.relief.seed"
 
@@ -58,7 +61,7 @@ class Case:
     label: str
     setting: str
     part: int
-    swept: Mapping[str, Value]
+    swept: "Mapping[str, Value]"
     data: Tables
     where: str
     random: Mapping[str, Uniform]
@@ -77,7 +80,7 @@ class Case:
         """Return the setting of the published protocol; raise `InputError` where a value does not fit."""
         return paper_from_dict(self.data, self.where)
 
-    def paper_columns(self) -> dict[str, Value]:
+    def paper_columns(self) -> "dict[str, Value]":
         """Return every parameter of the published protocol by key path, swept or not: columns of the rows."""
         return {f"paper.{name}": value for name, value in self.paper_setting().model_dump().items()}
 
@@ -152,6 +155,7 @@ def expand(experiment: Experiment) -> list[Case]:
     """
     cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
     names: set[str] = set()
+    recipes: set[str] = set()
     for case in cases:
         if case.name in names:
             raise InputError(
@@ -159,12 +163,15 @@ def expand(experiment: Experiment) -> list[Case]:
                 "give the groups different labels, and each value of a sweep once"
             )
         names.add(case.name)
-        _check(case, experiment)
+        _check(case, experiment, recipes)
     return cases
 
 
-def _check(case: Case, experiment: Experiment) -> None:
-    """Raise `InputError` if a scene of a case is malformed; drawn ranges are tried at both ends."""
+def _check(case: Case, experiment: Experiment, recipes: set[str]) -> None:
+    """Raise `InputError` if a scene of a case is malformed; drawn ranges are tried at both ends.
+
+    A recipe whose file and values are among `recipes` has been read before; one that is read is added.
+    """
     # Published protocol: nothing is rendered.
     if case.is_paper:
         case.paper_setting()
@@ -181,7 +188,10 @@ def _check(case: Case, experiment: Experiment) -> None:
         scene_from_dict(apply_settings(case.data, values, case.where), case.where)
     # An anatomy's recipe is read only when its mesh is made: check it here.
     if isinstance(first.surface, AnatomySurface) and (file := first.surface.file()).suffix == ".toml":
-        load_recipe(file, first.surface.recipe_values)
+        described = json.dumps([str(file), first.surface.recipe_values], sort_keys=True, default=repr)
+        if described not in recipes:
+            load_recipe(file, first.surface.recipe_values)
+            recipes.add(described)
 
 
 def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
@@ -230,7 +240,7 @@ def _set_options(values: Mapping[str, Json]) -> str:
     return " ".join(f"--set {shlex.quote(f'{key}={_toml(value)}')}" for key, value in values.items())
 
 
-def _plain(value: Json) -> Value:
+def _plain(value: Json) -> "Value":
     """Return a swept value as it stands in a column: numbers and text as they are, a table by its type."""
     if isinstance(value, dict):
         return str(value.get("type", _toml(value)))
@@ -242,7 +252,7 @@ def _toml(value: Json) -> str:
     return value if isinstance(value, str) else toml_value(value)
 
 
-def swept_example(cases: list[Case]) -> dict[str, Value]:
+def swept_example(cases: list[Case]) -> "dict[str, Value]":
     """Return an example value for each swept, pooled or drawn parameter: the columns that results gain."""
     example: dict[str, Value] = {}
     for case in cases:

@@ -8,17 +8,16 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import polars as pl
 
 from simtest.errors import InputError
-from simtest.estimators import load_estimators
-from simtest.estimators.registry import ESTIMATORS
+from simtest.estimators.installed import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -28,12 +27,14 @@ from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
 from simtest.validation.cases import Case, expand, swept_example
-from simtest.validation.statistics import summarise
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from simtest.validation.execution import Part
 
 GALLERY_ITEMS = 18
+RESULTS = "results.parquet"
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
 
@@ -49,15 +50,22 @@ class Run:
     ----------
     folder : Path
         Holds results.parquet, summary.json and gallery/.
-    results : polars.DataFrame
-        All rows.
     resumed : int
         Cases that an earlier, interrupted run had finished.
+    made : polars.DataFrame, optional
+        All rows, where they are at hand.
     """
 
     folder: Path
-    results: pl.DataFrame
     resumed: int
+    made: "pl.DataFrame | None" = None
+
+    @cached_property
+    def results(self) -> "pl.DataFrame":
+        """All rows; read at first use, since nobody asks for those of a run whose page is up to date."""
+        import polars as pl
+
+        return pl.read_parquet(self.folder / RESULTS) if self.made is None else self.made
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,8 @@ class RunRecord:
         How the run was called.
     inputs : dict
         SHA-256 by input file.
+    results : str
+        SHA-256 of results.parquet.
     """
 
     variant: str
@@ -89,6 +99,7 @@ class RunRecord:
     duration_s: float
     command: str
     inputs: dict[str, str]
+    results: str = ""
 
     def to_json(self) -> Json:
         """Return the record with the environment that the run was made in."""
@@ -125,9 +136,9 @@ def run_experiment(
     return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
 
 
-def _is_coloured(experiment: Experiment) -> bool:
-    """Return whether a scene of an experiment has the colour of tissue."""
-    return any("albedo" in case.data.get("reflectance", {}) for case in expand(experiment))
+def _is_coloured(cases: Sequence[Case]) -> bool:
+    """Return whether a scene has the colour of tissue."""
+    return any("albedo" in case.data.get("reflectance", {}) for case in cases)
 
 
 def run_experiments(
@@ -143,13 +154,21 @@ def run_experiments(
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # The variant is chosen here: a worker on another machine may have another environment.
-    variant = backend.requested_variant(variant, coloured=any(_is_coloured(one) for one, _ in wanted))
-    # Check: everything that may be refused is refused before a folder is touched.
-    jobs = [_job(experiment, folder, variant) for experiment, folder in wanted]
+    expanded = [expand(experiment) for experiment, _ in wanted]
+    variant = backend.requested_variant(variant, coloured=any(map(_is_coloured, expanded)))
+    jobs = [
+        _Job(experiment, folder, cases, _fingerprint(experiment, cases, variant))
+        for (experiment, folder), cases in zip(wanted, expanded, strict=True)
+    ]
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
-    # Run what is not finished.
     left = [job for job in jobs if job.folder not in finished]
+    # Check: everything that may be refused is refused before a folder is touched.
+    _check_estimators(left)
+    for job in jobs:
+        _check_folder(job.folder)
+    # Run what is not finished.
     for job in left:
+        _warn_of_another(job)
         _prepare(job.folder, job.digest)
     resumed = _work(left, variant, engine or make_engine(), progress)
     # Write results and summaries.
@@ -183,29 +202,32 @@ class _Job:
         return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
 
 
-def _job(experiment: Experiment, folder: Path, variant: str) -> _Job:
-    cases = expand(experiment)
-    # Loaded in the workers; here to refuse unknown names.
-    load_estimators(experiment.estimators)
-    digest = _fingerprint(experiment, cases, variant)
-    _check_folder(folder)
-    return _Job(experiment, folder, cases, digest)
+def _check_estimators(jobs: Sequence[_Job]) -> None:
+    """Raise `InputError` for unknown estimators. The workers load them; a finished run names none that is unknown."""
+    if jobs:
+        from simtest.estimators.registry import load_estimators
+    for job in jobs:
+        load_estimators(job.experiment.estimators)
 
 
 def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
     """Join the parts of an experiment, and write its results and summary."""
+    import polars as pl
+
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
-    summary = _summary(job.experiment, results, record)
-    write_atomically(folder / "results.parquet", results.write_parquet)
-    write_json(folder / "summary.json", summary)
+    write_atomically(folder / RESULTS, results.write_parquet)
+    record = replace(record, results=provenance.file_hash(folder / RESULTS))
+    write_json(folder / "summary.json", _summary(job.experiment, results, record))
     # The parts go last: until the summary stands, a run that is stopped can go on.
     _remove(parts)
-    return Run(folder, results, resumed)
+    return Run(folder, resumed, results)
 
 
-def _summary(experiment: Experiment, results: pl.DataFrame, record: RunRecord) -> Json:
+def _summary(experiment: Experiment, results: "pl.DataFrame", record: RunRecord) -> Json:
     """Return the content of summary.json."""
+    from simtest.validation.statistics import summarise
+
     settings: dict[str, Json] = {
         setting: {estimator: figures.to_json() for estimator, figures in by_estimator.items()}
         for setting, by_estimator in summarise(results).items()
@@ -219,7 +241,9 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     """Run the cases that are not done yet; return how many of each folder were done before."""
     if not jobs:
         return {}
-    # Imported here: finished runs need no renderer.
+    # Imported here: finished runs need no renderer, and nobody reads their rows.
+    import polars as pl
+
     from simtest.validation.execution import forget, make_rows, parts_of
 
     total = sum(case.realisations for job in jobs for case in job.cases)
@@ -314,18 +338,35 @@ def _hash(content: Json) -> str:
 
 
 def _finished(folder: Path, digest: str, cases: int) -> Run | None:
-    """Return the finished run that a folder holds, if it is the same; warn if another one will be replaced."""
+    """Return the finished run that a folder holds, if it is the same and its results are as they were written."""
+    record = _record_in(folder)
+    if record is None or record["fingerprint"] != digest:
+        return None
+    try:
+        whole = provenance.file_hash(folder / RESULTS) == record.get("results")
+    except OSError:
+        return None
+    return Run(folder, cases) if whole else None
+
+
+def _warn_of_another(job: _Job) -> None:
+    """Warn if the folder holds the finished run of something else, which will be replaced."""
+    record = _record_in(job.folder)
+    if record is not None and record["fingerprint"] != job.digest:
+        what = "holds another run, or one of another version of simtest"
+        warnings.warn(f"{job.folder}: {what}; it is replaced", stacklevel=4)
+
+
+def _record_in(folder: Path) -> dict[str, Any] | None:
+    """Return how the finished run in a folder was made; None where there is none."""
     if (folder / PARTS).is_dir():
         # Beside the parts of a stopped run anything may be incomplete.
         return None
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        if summary["run"]["fingerprint"] == digest:
-            return Run(folder, pl.read_parquet(folder / "results.parquet"), cases)
-    except (OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError):
+        record = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+        return dict(record) if "fingerprint" in record else None
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    warnings.warn(f"{folder}: holds another run, or one of another version of simtest; it is replaced", stacklevel=5)
-    return None
 
 
 def _prepare(folder: Path, digest: str) -> None:

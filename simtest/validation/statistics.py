@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.geometry import chi_squared, student_t
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
 
@@ -76,8 +77,6 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
 
 def figures(rows: pl.DataFrame) -> Figures:
     """Compute the figures of the rows of one setting and estimator."""
-    from scipy.special import chdtri
-
     # Of the true highlights: answered, failed, missed.
     true = rows.filter(pl.col("true_id").is_not_null())
     answered = true.filter(pl.col("status") == "ok")
@@ -104,7 +103,7 @@ def figures(rows: pl.DataFrame) -> Figures:
         max_deg=_or_none(np.max, errors),
         mean_penalised_deg=_or_none(np.mean, penalised),
         ci95_deg=mean_interval(errors),
-        coverage95=float(np.mean(distances <= chdtri(2, 1 - CONFIDENCE))) if len(distances) else None,
+        coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
     )
 
 
@@ -128,8 +127,5 @@ def student_interval(values: Array) -> Interval:
     """Compute Student's 95 % interval of the mean, such as of paired differences; None with fewer than two values."""
     if len(values) < 2:
         return None, None
-    # scipy.stats gives the same numbers, and takes over a second to load.
-    from scipy.special import stdtrit
-
-    half = stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(len(values))
+    half = student_t.quantile((1 + CONFIDENCE) / 2, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
     return float(np.mean(values) - half), float(np.mean(values) + half)

@@ -1,5 +1,7 @@
 """`photometric`: derivatives, the Cramer-Rao bound in the published protocol, and curved surfaces in renders."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -41,9 +43,19 @@ def test_derivatives_are_those_of_finite_differences(model):
         np.testing.assert_allclose(J[:, k], numeric, atol=1e-6 * np.abs(J[:, k]).max())
 
 
+@cache
+def pipeline_of(setting):
+    return Pipeline(setting)
+
+
+@cache
+def answer(setting, number):
+    """The answer to one realisation; realisations of the default setting serve two tests."""
+    return photometric_plane.estimate(pipeline_of(setting).patch(from_integer(number)), setting.camera)
+
+
 def answers(setting, count):
-    pipeline = Pipeline(setting)
-    return [photometric_plane.estimate(pipeline.patch(from_integer(number)), setting.camera) for number in range(count)]
+    return [answer(setting, number) for number in range(count)]
 
 
 @pytest.mark.parametrize("values", [{}, {"sigma": 0.01}, {"sigma": 0.1}, {"theta_deg": 30.0}, {"theta_deg": 75.0}])

@@ -12,6 +12,7 @@ from scipy.io import savemat
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, ViewMask, load_camera, save_camera
 from simtest.spec import scene_from_dict
+from simtest.spec.camera_formats import plain_yaml
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 
 PINHOLE = Camera(640, 480, 500.1, 430.3, 331.2, 225.7)
@@ -316,7 +317,11 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE)
+SLOW = {"huge row"}
+"""Told on a smaller scale by the test after this one."""
+
+
+@pytest.mark.parametrize("case", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in HOSTILE])
 def test_hostile_yaml_is_one_line(tmp_path, case):
     text, fragment = HOSTILE[case]
     with pytest.raises(InputError) as caught:
@@ -325,6 +330,14 @@ def test_hostile_yaml_is_one_line(tmp_path, case):
     assert message.startswith(f"{tmp_path / 'c.yaml'}: ")
     assert fragment in message
     assert "\n" not in message
+
+
+def test_values_are_counted_up_to_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(plain_yaml, "MAX_VALUES", 100)
+    # Beside the list's values there are the map, the key and the list itself.
+    for count, said in ((97, "image_width: missing"), (98, "too many values; at most 100 are allowed")):
+        with pytest.raises(InputError, match=said):
+            read(tmp_path, f"a: [{', '.join('1' * count)}]")
 
 
 @settings(max_examples=300, deadline=2000, derandomize=True)

@@ -91,7 +91,8 @@ import simtest
 from simtest.calibration import Calibration, Frame, Priors
 from simtest.detection import load_detector
 from simtest.detection.detector import DETECTORS
-from simtest.estimators.registry import ESTIMATORS, load_estimators
+from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.registry import load_estimators
 
 camera = simtest.Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
 x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)

@@ -8,6 +8,7 @@ import signal
 import sys
 from dataclasses import replace
 from datetime import timedelta
+from functools import cache
 from pathlib import Path
 
 import polars as pl
@@ -71,10 +72,16 @@ def reports(tmp_path):
     return Reports(tmp_path / "reports")
 
 
+@cache
+def sample():
+    """Return a run of the samples; runs and their tables do not change."""
+    return make_run()
+
+
 @pytest.fixture
 def measured(monkeypatch):
     """Have runs that are measured in no time; return the list whose first one is next."""
-    runs = [make_run() for _ in range(10)]
+    runs = [sample()] * 10
 
     def measure_run(profile, folder, run_id, *_, **__):
         return with_record(runs.pop(0), id=run_id, profile=profile.name)
@@ -389,8 +396,14 @@ def figure_of(kind, name):
     return pl.DataFrame([{"kind": kind, "experiment": name, "value": 1.0, "passed": True}], schema=FIGURES)
 
 
+@pytest.fixture(scope="module")
+def finished():
+    """Experiments that are run, by their description: many nights below run the same."""
+    return {}
+
+
 @pytest.fixture
-def parts(monkeypatch):
+def parts(monkeypatch, finished):
     """Have a run whose parts but the experiments do nothing; return the order in which they are asked."""
     told, experiments = [], measure.run_experiments
 
@@ -399,7 +412,10 @@ def parts(monkeypatch):
 
     def work(*arguments):
         told.append("experiments")
-        return experiments(*arguments)
+        described = tuple(experiment.model_dump_json() for experiment, _ in arguments[0])
+        if described not in finished:
+            finished[described] = experiments(*arguments)
+        return finished[described]
 
     monkeypatch.setattr(measure, "run_canaries", tells("canaries", figure_of("canary", "pose")))
     monkeypatch.setattr(measure, "ladder_figures", tells("ladder", figure_of("ladder", "error ladder")))

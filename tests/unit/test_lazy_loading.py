@@ -1,0 +1,117 @@
+"""What commands load: packages load their modules at first use, and a finished run none of what made it."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+import simtest
+from simtest import Camera, load_calibration, save_camera
+from simtest.runtime.lazy_names import lazy_names
+from simtest.spec import CalibrationSpec
+
+PACKAGES = ("simtest", "simtest.calibration", "simtest.detection", "simtest.estimators", "simtest.geometry",
+            "simtest.reconstruction", "simtest.rendering", "simtest.spec", "simtest.surfaces")  # fmt: skip
+
+EXPERIMENT = """
+realisations = 1
+estimators = ["brightest_point"]
+[[groups]]
+scene = "sphere"
+[groups.set]
+"camera.width" = 64
+"camera.height" = 48
+"camera.fx" = 48.0
+"camera.fy" = 48.0
+"""
+
+
+def loaded(code, *arguments, folder=None):
+    """Names of the modules that are loaded once a child process has run `code`."""
+    script = f"{code}\nimport sys; print('LOADED', *sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", script, *map(str, arguments)], cwd=folder, capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.split("LOADED ")[1].split())
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_is_found_once(package):
+    module = importlib.import_module(package)
+    for name in module.__all__:
+        assert getattr(module, name) is getattr(module, name)
+        # The second time without the lookup.
+        assert name in vars(module)
+    assert set(module.__all__) <= set(dir(module))
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
+        module.nothing  # noqa: B018
+
+
+def test_a_name_comes_from_the_module_that_is_stated():
+    look_up, names = lazy_names("simtest.runtime.lazy_names", {"fractions": ("Fraction",), "decimal": ("Decimal",)})
+    assert names() == ["Decimal", "Fraction"]
+    assert look_up("Fraction").__module__ == "fractions"
+    with pytest.raises(AttributeError, match="'Ratio'"):
+        look_up("Ratio")
+
+
+def test_a_name_loads_its_own_module_alone():
+    modules = loaded("from simtest.geometry import Camera, Array\nfrom simtest.calibration import Response")
+    assert "simtest.geometry.camera" in modules
+    assert not modules & {"cv2", "skimage", "simtest.geometry.patch", "simtest.calibration.frame", "scipy", "pydantic"}
+    # Negative control: the names that need them load them.
+    assert {"cv2", "skimage"} <= loaded("from simtest.geometry import Patch")
+
+
+@pytest.mark.render
+def test_a_finished_run_is_recognised_without_what_made_it(tmp_path):
+    (tmp_path / "small.toml").write_text(EXPERIMENT)
+    page = simtest.validate(tmp_path / "small.toml", tmp_path / "run")
+    before = page.stat().st_mtime_ns
+    code = (
+        "import contextlib, sys\nsys.argv = ['simtest', 'validate', *sys.argv[1:]]\n"
+        "from simtest.cli.main import main\nwith contextlib.suppress(SystemExit): main()"
+    )
+    slow = {
+        "polars",
+        "cv2",
+        "skimage",
+        "scipy",
+        "mitsuba",
+        "jinja2",
+        "rich.progress",
+        "PIL",
+        "simtest.surfaces.factory",
+    }
+    arguments = (tmp_path / "small.toml", "--out", tmp_path / "run")
+    assert not loaded(code, *arguments) & slow
+    assert page.stat().st_mtime_ns == before
+    # Negative control: results that are not as they were written are made again.
+    results = tmp_path / "run" / "results.parquet"
+    results.write_bytes(results.read_bytes()[:-1])
+    assert {"polars", "cv2", "mitsuba"} <= loaded(code, *arguments)
+
+
+def test_a_camera_alone_loads_no_models_of_sensor_and_lobe(tmp_path):
+    camera = Camera.from_fov(60.0, 120, 90)
+    save_camera(camera, tmp_path / "camera.toml")
+    (tmp_path / "calibration.toml").write_text((tmp_path / "camera.toml").read_text() + "[sensor]\nbits = 8\n")
+    code = "import sys; from simtest.spec import load_calibration; load_calibration(sys.argv[1])"
+    models = {"simtest.spec.sensor", "simtest.spec.reflectance", "numpy.random", "cv2"}
+    assert not loaded(code, tmp_path / "camera.toml") & models
+    # Negative control, and the same calibration by both ways.
+    assert "simtest.spec.sensor" in loaded(code, tmp_path / "calibration.toml")
+    assert load_calibration(tmp_path / "camera.toml") == CalibrationSpec(camera={}).calibration(camera)
+    assert load_calibration(tmp_path / "calibration.toml").noise.bits == 8
+
+
+def test_a_page_needs_neither_scipy_nor_pillow_s_other_formats(tmp_path):
+    code = (
+        "import numpy as np\nfrom simtest.pages.pixels import data_address\n"
+        "from simtest.report.page import draw_page\nfrom simtest.validation.statistics import mean_interval\n"
+        "data_address(np.zeros((8, 8, 3), np.uint8))\nassert mean_interval(np.arange(5.0))[1] > 2"
+    )
+    modules = loaded(code)
+    assert "PIL.AvifImagePlugin" in modules
+    assert not modules & {"scipy", "scipy.special", "PIL.PdfImagePlugin", "PIL.WebPImagePlugin"}
