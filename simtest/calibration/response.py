@@ -73,6 +73,8 @@ class Response:
         """
         if self.kind in ("linear", "table"):
             return self.encode(light).astype(np.float32)
+        import cv2
+
         x = np.clip(light, np.float32(0), np.float32(1))
         if self.kind == "gamma":
             return np.asarray(cv2.pow(x, 1 / self.gamma), dtype=np.float32).reshape(x.shape)
