@@ -52,32 +52,36 @@ class Statistic:
         For files and for readers.
     columns : tuple of str
         Keys of what `measure` returns; the distance of the statistic is the mean of theirs.
-    unit : str
-        Of the columns, for axes.
+    axes : tuple of str
+        What each column's axis says: quantity and unit.
     """
 
     name: str
     title: str
     columns: tuple[str, ...]
-    unit: str
+    axes: tuple[str, ...]
 
+
+_MOMENTS = ("l_mean", "l_sd", "a_mean", "a_sd", "b_mean", "b_sd")
+_MOMENT_AXES = tuple(f"{what} of {channel} (CIELAB)" for channel in ("L*", "a*", "b*") for what in ("mean", "spread"))
 
 STATISTICS = (
     Statistic(
-        "count", "Number of highlights", ("per_frame", "per_megapixel"), "in a frame; in a megapixel of the view"
+        "count", "Number of highlights", ("per_frame", "per_megapixel"),
+        ("highlights in a frame", "highlights in a megapixel of the view"),
     ),
-    Statistic("radius", "Radius of highlights", ("radius",), "share of the frame's width"),
-    Statistic("axis_ratio", "Axis ratio of highlights", ("axis_ratio",), ""),
-    Statistic("clipped", "Highlights that are clipped", ("clipped",), "share of a frame's highlights"),
-    Statistic("area", "Area of highlights", ("area",), "share of the view"),
-    Statistic("clustering", "Distance to the nearest highlight", ("clustering",), "radii of the highlight"),
-    Statistic("halo", "Depth of halos", ("halo",), "luma of the surroundings less that of the halo"),
-    Statistic("colour", "Colour of the tissue", ("l_mean", "l_sd", "a_mean", "a_sd", "b_mean", "b_sd"), "CIELAB"),
-    Statistic("falloff", "Brightness against image radius", ("falloff",), "log of linear light, border less centre"),
-    Statistic("spectrum", "Slope of the power spectrum, 4 to 64 px", ("spectrum",), "log power over log frequency"),
-    Statistic("vessels", "Contrast of vessels", ("vessels",), "log of green over red"),
-    Statistic("noise", "Noise at mid grey", ("noise",), "luma"),
-)
+    Statistic("radius", "Radius of highlights", ("radius",), ("radius (share of the frame's width)",)),
+    Statistic("axis_ratio", "Axis ratio of highlights", ("axis_ratio",), ("minor over major axis",)),
+    Statistic("clipped", "Clipped highlights", ("clipped",), ("share of a frame's highlights",)),
+    Statistic("area", "Area of highlights", ("area",), ("share of the view",)),
+    Statistic("clustering", "Nearest highlight", ("clustering",), ("distance (radii of the highlight)",)),
+    Statistic("halo", "Depth of halos", ("halo",), ("luma of the surroundings less the halo's",)),
+    Statistic("colour", "Colour of the tissue", _MOMENTS, _MOMENT_AXES),
+    Statistic("falloff", "Brightness over image radius", ("falloff",), ("log of linear light, corner less centre",)),
+    Statistic("spectrum", "Slope of the power spectrum", ("spectrum",), ("log power over log frequency, 4 to 64 px",)),
+    Statistic("vessels", "Contrast of vessels", ("vessels",), ("log of green over red",)),
+    Statistic("noise", "Noise at mid grey", ("noise",), ("standard deviation of the luma",)),
+)  # fmt: skip
 
 COLUMNS = tuple(column for statistic in STATISTICS for column in statistic.columns)
 
@@ -191,12 +195,12 @@ def _halos(bright: Mask, luma: Image, seen: Mask) -> Array:
 
 def _tissue(picture: Image, linear: Image, luma: Image, tissue: Mask) -> dict[str, Array]:
     """Measure the tissue's colour, how its brightness falls towards the border, and its vessels."""
-    names = ("l_mean", "l_sd", "a_mean", "a_sd", "b_mean", "b_sd", "falloff", "vessels")
+    names = (*_MOMENTS, "falloff", "vessels")
     if np.count_nonzero(tissue) < LEAST_SIDE**2:
         return {name: np.empty(0) for name in names}
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2Lab)[tissue]
     moments = np.stack([lab.mean(axis=0), lab.std(axis=0)], axis=1).ravel()
-    values = dict(zip(names[:6], moments[:, None], strict=True))
+    values = dict(zip(_MOMENTS, moments[:, None], strict=True))
     return values | {"falloff": _falloff(linear, tissue), "vessels": _vessels(linear, tissue)}
 
 
