@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from simtest.reconstruction.image_io import Source, is_sequence, open_source, re
 from simtest.runtime.arrays import AnyArray, Image
 from simtest.runtime.resources import shown
 from simtest.spec.scene import Scene, load_scene
+
+if TYPE_CHECKING:
+    from simtest.rendering import Session
 
 Item = TypeVar("Item")
 
@@ -114,9 +117,14 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
         raise InputError(f"--surface {shown(surfaces[0])}: only of a dataset, and {shown(against)} is none")
     if path.exists() and path.suffix != ".toml":
         return open_frames([path])[:count]
-    base = load_scene(against)
+    return rendered_frames(load_scene(against), count)
+
+
+def rendered_frames(base: Scene, count: int) -> list[NamedFrame]:
+    """Return frames of a scene that are rendered when they are read, each a scene of its own (see `varied`)."""
+    held = _Rendered(base)
     names = [f"{base.name} {i}" for i in range(count)]
-    return [NamedFrame(name, name, partial(_rendered, base, i)) for i, name in enumerate(names)]
+    return [NamedFrame(name, name, partial(held.read, i)) for i, name in enumerate(names)]
 
 
 def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame]:
@@ -162,12 +170,23 @@ def varied(scene: Scene, number: int) -> Scene:
     return Scene.model_validate(keys)
 
 
-def _rendered(base: Scene, number: int) -> Image:
-    # Imported here: sets of files need no renderer.
-    from simtest.simulation.camera_chain import to_uint8
-    from simtest.simulation.labelled_frame import make_frame
+class _Rendered:
+    """Frames of a scene, rendered one after the other in one session."""
 
-    scene = varied(base, number)
-    made = make_frame(scene)
-    values = np.clip(made.image, 0, 1) if scene.sensor.encodes else to_uint8(made.image).astype(np.float32) / 255
-    return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)
+    def __init__(self, base: Scene) -> None:
+        self.base = base
+        self.session: Session | None = None
+
+    def read(self, number: int) -> Image:
+        """Return the scene as seen the `number`-th time."""
+        # Imported here: sets of files need no renderer.
+        from simtest.dataset.maker import colour_variant
+        from simtest.rendering import Session
+        from simtest.simulation.camera_chain import to_uint8
+        from simtest.simulation.rendered_view import render_picture
+
+        scene = varied(self.base, number)
+        self.session = self.session or Session(scene, colour_variant())
+        made = render_picture(self.session, scene)
+        values = np.clip(made, 0, 1) if scene.sensor.encodes else to_uint8(made).astype(np.float32) / 255
+        return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)
