@@ -21,7 +21,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from simtest.calibration import Calibration, Frame, Response
@@ -37,7 +36,7 @@ CROP_PX, SHIFT_PX, CROPS = 64, 8, 24
 """Side of a crop, greatest shift of its centre from the highlight, and crops of a frame at most."""
 
 JPEG_QUALITY = 75
-RIDGE = 1.0
+RIDGE, NEWTON_STEPS = 1.0, 50
 SPLITS, RESAMPLES = 10, 2000
 COLOURS = 9
 """Of the features, the first so many are of colour."""
@@ -168,8 +167,7 @@ def patterns(luma: Image) -> Array:
 
 def separation(real: Scenes, generated: Scenes, first: int = 0) -> tuple[float, float, float]:
     """Return the AUC of two sets by the features from `first` on, with its interval over scenes."""
-    sides = [[rows[:, first:] for rows in side.values()] for side in (real, generated)]
-    areas = np.array([[_pair(sides, i, j) for j in range(len(sides[1]))] for i in range(len(sides[0]))])
+    areas = _areas(real, generated, first)
     rng = from_integer(1)
     drawn = [areas[np.ix_(*(rng.integers(n, size=n) for n in areas.shape))].mean() for _ in range(RESAMPLES)]
     low, high = np.quantile(drawn, [0.025, 0.975])
@@ -182,8 +180,14 @@ def control(scenes: Scenes, first: int = 0) -> tuple[float, float, float]:
     for _ in range(SPLITS):
         order = [names[i] for i in rng.permutation(len(names))]
         halves = [{name: scenes[name] for name in order[k::2]} for k in (0, 1)]
-        found.append(separation(halves[0], halves[1], first)[0])
+        found.append(float(_areas(halves[0], halves[1], first).mean()))
     return float(np.mean(found)), min(found), max(found)
+
+
+def _areas(real: Scenes, generated: Scenes, first: int) -> Array:
+    """Return the AUC of each pair of a real and a generated scene that is left out, shape (real, generated)."""
+    sides = [[rows[:, first:] for rows in side.values()] for side in (real, generated)]
+    return np.array([[_pair(sides, i, j) for j in range(len(sides[1]))] for i in range(len(sides[0]))])
 
 
 def _pair(sides: list[list[Array]], i: int, j: int) -> float:
@@ -202,17 +206,27 @@ def _pair(sides: list[list[Array]], i: int, j: int) -> float:
 
 
 def fitted(rows: Array, labels: Array, weights: Array) -> Array:
-    """Return the coefficients of a logistic regression with a ridge, without its constant."""
+    """Return the coefficients of a logistic regression with a ridge, without its constant, by Newton's method."""
+    inputs = np.column_stack([rows, np.ones(len(rows))])
+    ridge = np.append(np.full(rows.shape[1], RIDGE), 0.0)
     signs = 2 * labels - 1
 
-    def loss(theta: Array) -> tuple[float, Array]:
-        margin = signs * (rows @ theta[:-1] + theta[-1])
-        slope = -weights * signs * expit(-margin)
-        value = float(weights @ np.logaddexp(0, -margin)) + 0.5 * RIDGE * float(theta[:-1] @ theta[:-1])
-        return value, np.append(rows.T @ slope + RIDGE * theta[:-1], slope.sum())
+    def loss(theta: Array) -> float:
+        return float(weights @ np.logaddexp(0, -signs * (inputs @ theta)) + 0.5 * ridge @ theta**2)
 
-    done = minimize(loss, np.zeros(rows.shape[1] + 1), jac=True, method="L-BFGS-B", options={"maxiter": 200})
-    return np.asarray(done.x[:-1])
+    theta = np.zeros(len(ridge))
+    for _ in range(NEWTON_STEPS):
+        chance = expit(inputs @ theta)
+        slope = inputs.T @ (weights * (chance - labels)) + ridge * theta
+        curvature = (inputs.T * (weights * chance * (1 - chance))) @ inputs + np.diag(ridge + 1e-9)
+        step, share = np.linalg.solve(curvature, slope), 1.0
+        # The loss is convex: a shorter step along the descent lowers it.
+        while share > 1e-6 and loss(theta - share * step) > loss(theta):
+            share /= 2
+        theta = theta - share * step
+        if np.abs(share * step).max() < 1e-8:
+            break
+    return theta[:-1]
 
 
 def auc(low: Array, high: Array) -> float:
