@@ -28,6 +28,7 @@ from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
 from simtest.spec.surface import AnatomySurface
 from simtest.validation.cases import Case, expand, swept_example
+from simtest.validation.realism import realism_of
 from simtest.validation.statistics import summarise
 
 if TYPE_CHECKING:
@@ -196,7 +197,7 @@ def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
     """Join the parts of an experiment, and write its results and summary."""
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
-    summary = _summary(job.experiment, results, record)
+    summary = _summary(job, results, record)
     write_atomically(folder / "results.parquet", results.write_parquet)
     write_json(folder / "summary.json", summary)
     # The parts go last: until the summary stands, a run that is stopped can go on.
@@ -204,14 +205,20 @@ def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
     return Run(folder, results, resumed)
 
 
-def _summary(experiment: Experiment, results: pl.DataFrame, record: RunRecord) -> Json:
+def _summary(job: _Job, results: pl.DataFrame, record: RunRecord) -> Json:
     """Return the content of summary.json."""
+    experiment = job.experiment
     settings: dict[str, Json] = {
         setting: {estimator: figures.to_json() for estimator, figures in by_estimator.items()}
         for setting, by_estimator in summarise(results).items()
     }
     title = experiment.title or experiment.name
-    content: Json = {"title": title, "description": experiment.description, "settings": settings}
+    content: Json = {
+        "title": title,
+        "description": experiment.description,
+        "realism": realism_of(job.cases),
+        "settings": settings,
+    }
     return {"run": record.to_json(), "experiments": {experiment.name: content}}
 
 
