@@ -1,5 +1,7 @@
 """`simtest realism`."""
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,9 +22,13 @@ def realism(
     count: Annotated[
         int, Parameter(help="Generated frames that are taken or rendered, at most.", converter=whole_number)
     ] = 40,
+    surfaces: Annotated[
+        list[str] | None,
+        Parameter(name="--surface", negative="", help="Take samples of this surface alone; may be repeated."),
+    ] = None,
     seed: Seed = None,
 ) -> None:
-    """Measure how far generated frames are from real ones, statistic by statistic.
+    """Measure how far generated frames are from real ones, statistic by statistic; write a page and JSON.
 
     Parameters
     ----------
@@ -31,27 +37,38 @@ def realism(
         ends in .film; any other picture is a scene of its own.
     """
     from simtest.cli.progress import progress_bar
-    from simtest.realism.comparison import compare, write_comparison
+    from simtest.realism.comparison import compare
     from simtest.realism.frame_sets import open_frames, open_generated
+    from simtest.realism.page import write_comparison
+    from simtest.runtime.files import refuse_file
 
-    real, generated = open_frames(frames), open_generated(against, count)
-    with progress_bar("writing") as progress:
-        found = compare(real, generated, progress, seed or 0)
-    path = write_comparison(found, out)
+    refuse_file(out)
+    real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
+    command = shlex.join(["simtest", *sys.argv[1:]])
+    try:
+        with progress_bar("compared") as progress:
+            found = compare(real, generated, progress, seed or 0)
+            page = write_comparison(found, out, against, command, progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("an earlier page stays; the same command begins anew") from None
     _print_table(found)
-    print(path)
+    print(page)
 
 
 def _print_table(found: "Comparison") -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from simtest.realism.distance import distance_text
+
     table = Table("statistic", "distance", "95 % interval", "scenes, real / generated", "verdict")
     for d in found.distances:
-        interval = f"{d.interval[0]:.2f} to {d.interval[1]:.2f}"
-        table.add_row(d.statistic.title, f"{d.distance:.2f}", interval, f"{d.n_real} / {d.n_generated}", d.verdict)
+        interval = f"{distance_text(d.interval[0])} to {distance_text(d.interval[1])}"
+        table.add_row(
+            d.statistic.title, distance_text(d.distance), interval, f"{d.n_real} / {d.n_generated}", d.verdict
+        )
     console = Console(width=125)
     console.print(table)
-    for name, reason in found.left_out.items():
-        console.print(f"left out: {name}: {reason}", highlight=False)
+    for frame in found.left_out:
+        console.print(f"left out: {frame.frame}: {frame.reason}", highlight=False, markup=False)
     console.print(found.verdict, highlight=False)

@@ -54,7 +54,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     # samples, evenly over the dataset, and the shards that hold them
     wanted = set(index["index"].gather_every(max(1, index.height // count)).head(count).to_list())
     names = index.filter(pl.col("index").is_in(list(wanted)))["shard"].unique().to_list()
-    shown = (sample for sample in read_samples(folder, shards=sorted(names)) if sample.index in wanted)
+    shown = read_samples(folder, shards=sorted(names), indices=wanted)
     environment = Environment(
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=True, trim_blocks=True
     )

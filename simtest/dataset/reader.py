@@ -1,6 +1,6 @@
 """Reads datasets as NumPy records."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -56,15 +56,16 @@ def read_samples(
     split: str | None = None,
     fields: Sequence[str] | None = None,
     shards: Sequence[str] | None = None,
+    indices: Collection[int] | None = None,
 ) -> Iterator[Sample]:
-    """Read a dataset as `read` does, but as typed samples."""
+    """Read a dataset as `read` does, but as typed samples; of all samples, or of those with given indices."""
     folder = Path(folder)
     wanted = list(BY_NAME) if fields is None else list(fields)
     for name in wanted:
         if name not in BY_NAME:
             raise InputError(f"field {shown(name)}: unknown; allowed: {', '.join(BY_NAME)}")
     names = list(shards) if shards is not None else shard_names(folder, split)
-    return _read_shards(folder, names, wanted, required=fields is not None)
+    return _read_shards(folder, names, wanted, indices, required=fields is not None)
 
 
 def open_manifest(folder: Path) -> Manifest:
@@ -86,11 +87,15 @@ def shard_names(folder: Path, split: str | None = None) -> list[str]:
     return [name for name in sorted(manifest.shards) if split in (None, name.rpartition("-")[0])]
 
 
-def _read_shards(folder: Path, names: list[str], fields: list[str], required: bool) -> Iterator[Sample]:
+def _read_shards(
+    folder: Path, names: list[str], fields: list[str], indices: Collection[int] | None, required: bool
+) -> Iterator[Sample]:
     for name in names:
         try:
             with (folder / name).open("rb") as file:
                 for stored in samples(file, check=False):
+                    if indices is not None and stored.meta["index"] not in indices:
+                        continue
                     sample = Sample(stored.meta, {})
                     for field in (BY_NAME[n] for n in fields):
                         image = _image(file, stored, field, sample.images)

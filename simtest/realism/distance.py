@@ -15,6 +15,8 @@ from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Stat
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 
+VERDICTS = ("near", "between", "far", "too few scenes")
+
 LEAST_SCENES = 5
 """Fewer scenes on a side carry no verdict."""
 
@@ -22,6 +24,9 @@ NEAR = 1.5
 """A distance up to here is near; one is far where it is larger and its interval lies above 1."""
 
 RESAMPLES, LEVEL = 400, 0.95
+
+BLOCK_VALUES = 2_000_000
+"""Values of drawn scenes that are held at a time."""
 
 Scenes = Mapping[str, Measured]
 """Measured values by scene: those of all its frames, one after the other."""
@@ -115,8 +120,15 @@ def _column_distance(real: list[Array], generated: list[Array], rng: np.random.G
         same = gap(own.mean(axis=0), other.mean(axis=0)) <= 0
         return (0.0, np.zeros(RESAMPLES)) if same else (np.inf, np.full(RESAMPLES, np.inf))
     value = float(gap(own.mean(axis=0), other.mean(axis=0))) / spread
-    drawn = [side[rng.integers(len(side), size=(RESAMPLES, len(side)))].mean(axis=1) for side in (own, other)]
-    return value, gap(*drawn) / spread
+    return value, gap(*(_resampled(side, rng) for side in (own, other))) / spread
+
+
+def _resampled(scenes: Array, rng: np.random.Generator) -> Array:
+    """Return the mean of as many scenes drawn again, RESAMPLES times: shape (RESAMPLES, grid)."""
+    drawn = rng.integers(len(scenes), size=(RESAMPLES, len(scenes)))
+    # In blocks: all of them at once would not fit into memory.
+    blocks = np.array_split(drawn, max(1, scenes.size * RESAMPLES // BLOCK_VALUES))
+    return np.concatenate([scenes[rows].mean(axis=1) for rows in blocks])
 
 
 def _grid(values: list[Array]) -> Array:
@@ -125,6 +137,19 @@ def _grid(values: list[Array]) -> Array:
     if len(every) > 2000:
         every = np.unique(np.quantile(every, np.linspace(0, 1, 2000)))
     return every if len(every) > 1 else np.array([every[0], every[0] + 1.0])
+
+
+def distance_text(value: float) -> str:
+    """Write a distance with two decimals; NaN becomes a dash, infinity its sign."""
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"
+
+
+def mean_distribution(scenes: Scenes, column: str, at: Array) -> Array:
+    """Return the distribution function of a column at values, each scene with the same weight; NaN without a scene."""
+    held = [values[column] for values in scenes.values() if len(values[column])]
+    if not held:
+        return np.full(len(at), np.nan)
+    return np.asarray(np.mean([np.searchsorted(np.sort(v), at, side="right") / len(v) for v in held], axis=0))
 
 
 def _steps(values: Array, grid: Array) -> Array:

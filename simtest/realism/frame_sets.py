@@ -1,19 +1,22 @@
 """Sets of frames with their scenes: picture files, folders, films, datasets, and scenes that are rendered for it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from simtest.dataset.reader import open_manifest, read_samples
+from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
-from simtest.reconstruction.image_io import is_sequence, open_source, read_picture
-from simtest.runtime.arrays import AnyArray, Image, Picture
+from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
+from simtest.runtime.arrays import AnyArray, Image
 from simtest.runtime.resources import shown
 from simtest.spec.scene import Scene, load_scene
+
+if TYPE_CHECKING:
+    from simtest.rendering import Session
 
 Item = TypeVar("Item")
 
@@ -33,7 +36,7 @@ class NamedFrame:
     read: Callable[[], Image]
 
 
-def open_frames(paths: list[Path]) -> list[NamedFrame]:
+def open_frames(paths: Sequence[Path]) -> list[NamedFrame]:
     """Open picture files, each a scene; films, each a scene; and folders of pictures, each picture a scene.
 
     Pictures of one film lie in a folder whose name ends in ``.film``: it is one scene.
@@ -52,65 +55,104 @@ def open_frames(paths: list[Path]) -> list[NamedFrame]:
             continue
         source = open_source(path)
         if source.is_video:
-            frames += _film(path)
+            film = _Film(source)
+            frames += [NamedFrame(str(path), f"{path.name}#{index}", partial(film.read, index))
+                       for index in _spread(range(source.count))]  # fmt: skip
         else:
             one = path.suffix == ".film"
-            kept = _spread(list(source.files)) if one else source.files
+            kept = _spread(source.files) if one else source.files
             frames += [NamedFrame(str(path if one else file), file.name, partial(read_picture, file))
                        for file in kept]  # fmt: skip
     return frames
 
 
-def _film(path: Path) -> Iterator[NamedFrame]:
-    """Yield frames of a film, decoded now; a film that ends early yields those it has."""
-    count = open_source(path).count
-    wanted = set(_spread(list(range(count))))
-    for frame in open_source(path).frames():
-        if frame.index in wanted:
-            # Read now: a film is read in its order.
-            yield NamedFrame(str(path), frame.name, partial(_as_values, _as_bytes(frame.read())))
+class _Film:
+    """A film whose frames are asked for in their order: each is decoded when it is asked for."""
 
+    def __init__(self, source: Source) -> None:
+        self.source, self.left, self.held = source, source.frames(), 0
 
-def _as_bytes(values: Image) -> Picture:
-    return np.asarray(np.rint(values * 255), dtype=np.uint8)
+    def read(self, index: int) -> Image:
+        """Return a frame; raise `InputError` where the film ends before it."""
+        if index < self.held:
+            # A second reading starts at the beginning.
+            self.left, self.held = self.source.frames(), 0
+        for frame in self.left:
+            self.held = frame.index + 1
+            if frame.index == index:
+                return frame.read()
+        path, count = self.source.path, self.source.count
+        raise InputError(f"{shown(path)}: ends after {self.held} of the {count} frames that it announces")
 
 
 def _as_values(picture: AnyArray) -> Image:
     return np.asarray(picture.astype(np.float32) / np.float32(255))
 
 
-def _spread(items: list[Item]) -> list[Item]:
+def _spread(items: Sequence[Item]) -> Sequence[Item]:
     """Return at most `FILM_FRAMES` items, evenly spread."""
     if len(items) <= FILM_FRAMES:
         return items
     return [items[int(i)] for i in np.linspace(0, len(items) - 1, FILM_FRAMES)]
 
 
-def open_generated(against: str, count: int) -> list[NamedFrame]:
+def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> list[NamedFrame]:
     """Open the generated side: a dataset's folder, a folder or film of frames, or a scene to be rendered.
 
-    Of a dataset at most `count` samples are taken, in their order; its anatomies are the scenes. A scene is rendered
-    `count` times, from another viewpoint and with another seed of relief, pattern and noise each time; each frame
-    counts as a scene.
+    Of a dataset at most `count` samples are taken, of as many anatomies as possible; its anatomies are the scenes.
+    `surfaces` names those that are taken, by default all. A scene is rendered `count` times, from another viewpoint
+    and with another seed of relief, pattern and noise each time; each frame counts as a scene.
+
+    Raises
+    ------
+    InputError
+        If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
+    if count < 1:
+        raise InputError(f"--count {count}: must be at least 1")
     path = Path(against)
     if path.is_dir() and (path / "manifest.json").is_file():
-        open_manifest(path)
-        return [*_dataset(path, count)]
+        return _dataset(path, count, surfaces)
+    if surfaces:
+        raise InputError(f"--surface {shown(surfaces[0])}: only of a dataset, and {shown(against)} is none")
     if path.exists() and path.suffix != ".toml":
         return open_frames([path])[:count]
-    base = load_scene(against)
+    return rendered_frames(load_scene(against), count)
+
+
+def rendered_frames(base: Scene, count: int) -> list[NamedFrame]:
+    """Return frames of a scene that are rendered when they are read, each a scene of its own (see `varied`)."""
+    held = _Rendered(base)
     names = [f"{base.name} {i}" for i in range(count)]
-    return [NamedFrame(name, name, partial(_rendered, base, i)) for i, name in enumerate(names)]
+    return [NamedFrame(name, name, partial(held.read, i)) for i, name in enumerate(names)]
 
 
-def _dataset(path: Path, count: int) -> Iterator[NamedFrame]:
-    for number, sample in enumerate(read_samples(path, fields=["image"])):
-        if number == count:
-            return
-        anatomy = sample.meta["anatomy"]
-        scene = f"{anatomy['family']} {anatomy['number']}"
-        yield NamedFrame(scene, sample.key, partial(_as_values, sample.images["image"]))
+def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame]:
+    # Imported here: pictures need no tables.
+    import polars as pl
+
+    from simtest.dataset.index import SAMPLES
+
+    names = shard_names(path)
+    index = pl.read_parquet(path / SAMPLES).filter(pl.col("shard").is_in(names))
+    held = index["surface"].unique(maintain_order=True).to_list()
+    for name in surfaces:
+        if name not in held:
+            raise InputError(f"--surface {shown(name)}: {shown(path)} has none; it has {', '.join(held)}")
+    if surfaces:
+        index = index.filter(pl.col("surface").is_in(list(surfaces)))
+    # The first sample of each anatomy, then the second of each, ...: neighbours show one anatomy.
+    turn = pl.int_range(pl.len()).over("family", "anatomy")
+    taken = index.sort("index").sort(turn, maintain_order=True).head(count).sort("index")
+    rows = taken.select("surface", "family", "anatomy", "key", "shard", "index").iter_rows()
+    return [NamedFrame(f"{surface} {family}.{anatomy}", key, partial(_sample, path, shard, number))
+            for surface, family, anatomy, key, shard, number in rows]  # fmt: skip
+
+
+def _sample(path: Path, shard: str, index: int) -> Image:
+    for sample in read_samples(path, fields=["image"], shards=[shard], indices={index}):
+        return _as_values(sample.images["image"])
+    raise InputError(f"{shown(path / shard)}: has no sample {index}; simtest dataset verify --repair mends it")
 
 
 def varied(scene: Scene, number: int) -> Scene:
@@ -128,12 +170,23 @@ def varied(scene: Scene, number: int) -> Scene:
     return Scene.model_validate(keys)
 
 
-def _rendered(base: Scene, number: int) -> Image:
-    # Imported here: sets of files need no renderer.
-    from simtest.simulation.camera_chain import to_uint8
-    from simtest.simulation.labelled_frame import make_frame
+class _Rendered:
+    """Frames of a scene, rendered one after the other in one session."""
 
-    scene = varied(base, number)
-    made = make_frame(scene)
-    values = np.clip(made.image, 0, 1) if scene.sensor.encodes else to_uint8(made.image).astype(np.float32) / 255
-    return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)
+    def __init__(self, base: Scene) -> None:
+        self.base = base
+        self.session: Session | None = None
+
+    def read(self, number: int) -> Image:
+        """Return the scene as seen the `number`-th time."""
+        # Imported here: sets of files need no renderer.
+        from simtest.dataset.maker import colour_variant
+        from simtest.rendering import Session
+        from simtest.simulation.camera_chain import to_uint8
+        from simtest.simulation.rendered_view import render_picture
+
+        scene = varied(self.base, number)
+        self.session = self.session or Session(scene, colour_variant())
+        made = render_picture(self.session, scene)
+        values = np.clip(made, 0, 1) if scene.sensor.encodes else to_uint8(made).astype(np.float32) / 255
+        return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)

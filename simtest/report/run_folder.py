@@ -152,11 +152,19 @@ class EstimatorFigures(BaseModel):
     coverage95: float | None = Field(None, title="coverage 95\u00a0%")
 
 
+class SceneRealism(BaseModel):
+    """For which realism some scenes of an experiment stand; `scenes` are the labels of their curves."""
+
+    scenes: tuple[str, ...] = ()
+    sentence: Text = ""
+
+
 class ExperimentSummary(BaseModel):
     """An experiment of summary.json: figures by setting and estimator."""
 
     title: Text = ""
     description: Text = ""
+    realism: Annotated[tuple[SceneRealism, ...], BeforeValidator(_listed)] = ()
     settings: dict[str, dict[str, EstimatorFigures | None] | None] | None = None
 
     @property

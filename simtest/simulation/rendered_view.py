@@ -90,6 +90,22 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration)
 
 
+def render_picture(session: Session, scene: Scene) -> Image:
+    """Move a session to a scene and return the sensor's frame: that of `render_view`, without its highlights.
+
+    They are searched only where they set the exposure.
+    """
+    session.update(scene)
+    radiance, exposure = session.radiance(), scene.sensor.exposure
+    light = collect(radiance.total, scene.sensor, session.camera)
+    mean, seen = _mean(light), session.camera.seen
+    if exposure.full_scale is exposure.average is exposure.percentile is None:
+        full_scale = _judged(session, radiance, light)[1]
+    else:
+        full_scale = _full_scale(scene, mean, [], [], seen)
+    return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
+
+
 def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
 

@@ -41,9 +41,10 @@ def test_distance_is_the_wasserstein_distance_over_the_left_out_scenes():
 def test_two_halves_of_one_set_are_told_apart_on_nothing():
     """Negative control over 12 statistics and 10 seeds; a shift by two spreads is told on all."""
     for seed in range(10):
-        near = distances(scenes(12, seed=seed), scenes(12, seed=100 + seed))
+        real, same, other = (scenes(12, shift, seed + more, 12) for shift, more in ((0, 0), (0, 100), (2.5, 100)))
+        near = distances(real, same)
         assert not [d for d in near if d.verdict == "far"]
-        far = distances(scenes(12, seed=seed), scenes(12, shift=2.5, seed=100 + seed))
+        far = distances(real, other)
         assert all(d.verdict == "far" for d in far)
 
 
@@ -112,7 +113,11 @@ def test_the_command_says_too_few_scenes(tmp_path, capsys):
     assert "left out: no.png" in printed
     written = json.loads((out / "realism.json").read_text())
     assert {row["verdict"] for row in written["statistics"]} == {"too few scenes"}
-    assert set(written["left_out"]) == {"grey.png", "no.png"}
+    assert [(frame["side"], frame["frame"]) for frame in written["left_out"]] == [
+        ("real", "grey.png"),
+        ("real", "no.png"),
+    ]
+    assert "too few scenes: 4 real and 6 generated" in (out / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -137,7 +142,7 @@ def test_a_set_without_frames_to_measure_is_refused(tmp_path):
         raise InputError("x.png: no picture")
 
     frames = [NamedFrame("a", "x.png", read)]
-    with pytest.raises(InputError, match=r"no frame of a set can be measured \(x.png: no picture\)"):
+    with pytest.raises(InputError, match=r"no real frame can be measured \(x.png: no picture\)"):
         compare(frames, frames)
 
 

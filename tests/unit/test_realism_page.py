@@ -1,0 +1,209 @@
+"""The page of a comparison: what it says of sets that tell everything, little or nothing; and in a real browser."""
+
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from simtest.cli.realism import realism
+from simtest.errors import InputError
+from simtest.pages.chart_png import draw
+from simtest.realism.charts import distance_chart, distribution_charts
+from simtest.realism.comparison import Comparison, SetOfFrames, compare
+from simtest.realism.distance import distances, mean_distribution
+from simtest.realism.frame_sets import NamedFrame, _Film, open_frames
+from simtest.realism.frame_statistics import COLUMNS
+from simtest.realism.page import write_comparison
+from simtest.reconstruction.image_io import Source, open_source
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
+)
+
+
+def frame(seed, spots=4, size=(96, 128)):
+    """Return a frame of tissue with white spots, sRGB values in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    made = np.clip(np.float32([160, 90, 70]) + 6 * rng.standard_normal((*size, 3)), 0, 255).astype(np.uint8)
+    for x, y in rng.integers(20, 76, size=(spots, 2)):
+        cv2.circle(made, (int(x), int(y)), 3, (255, 255, 255), -1)
+    return made.astype(np.float32) / 255
+
+
+def frames(count, first=0, **more):
+    return [NamedFrame(f"scene {i}", f"{i}.png", lambda i=i: frame(i, **more)) for i in range(first, first + count)]
+
+
+def scenes(count, seed, shift=0.0):
+    rng = np.random.default_rng(seed)
+    return {f"{i}": {name: shift + 0.3 * rng.standard_normal() + rng.standard_normal(9) for name in COLUMNS}
+            for i in range(count)}  # fmt: skip
+
+
+def of_scenes(real, generated):
+    """Return a comparison of measured values, without pictures."""
+    sides = (SetOfFrames(side, len(side), 0, []) for side in (real, generated))
+    return Comparison(*sides, distances(real, generated), [])
+
+
+def test_what_is_drawn_is_what_the_distance_compares():
+    real, generated = scenes(6, 1), scenes(8, 2, shift=1.0)
+    chart = next(c for c in distribution_charts(of_scenes(real, generated)) if c.key == "column_radius")
+    curves = {mark.name: mark for mark in chart.panels[0].marks}
+    assert set(curves) == {"real", "generated"}
+    assert curves["real"].line != curves["generated"].line
+    # The area between both lines is the Wasserstein distance, each scene with the same weight.
+    x = np.linspace(-8, 8, 20001)
+    area = np.abs(mean_distribution(real, "radius", x) - mean_distribution(generated, "radius", x)).sum() * (
+        x[1] - x[0]
+    )
+    pooled = [np.concatenate([s["radius"] for s in side.values()]) for side in (real, generated)]
+    assert area == pytest.approx(stats.wasserstein_distance(*pooled), rel=2e-3)
+    at = np.searchsorted(x, curves["real"].x)
+    assert mean_distribution(real, "radius", x)[at] == pytest.approx(curves["real"].y, abs=0.02)
+
+
+def test_every_verdict_has_its_own_symbol_and_every_statistic_its_row():
+    real, generated = scenes(8, 1), scenes(8, 2)
+    for values in generated.values():
+        values["radius"] = values["radius"] + 5
+        values["noise"] = np.empty(0)
+    chart = distance_chart(of_scenes(real, generated))
+    assert [text for _, text in chart.panels[0].y.named][1] == "Radius of highlights"
+    told = {mark.hover[0].splitlines()[0]: mark.symbol for mark in chart.panels[0].marks if mark.symbol}
+    shown = {line.partition(": ")[2]: symbol for line, symbol in told.items()}
+    assert {"near", "far"} <= set(shown)
+    assert len({symbol.text for symbol in shown.values()}) == len(shown)
+    assert "too few scenes" in {key.name for key in chart.keys}
+    assert draw([chart])[0].std() > 5
+
+
+def test_page_holds_verdict_numbers_frames_and_reasons(tmp_path):
+    def broken():
+        raise InputError("x.png: no <picture>")
+
+    real = [*frames(6), NamedFrame("x", "x.png", broken)]
+    found = compare(real, frames(6, first=20, spots=0))
+    assert found.generated.without_highlights == 6
+    page = write_comparison(found, tmp_path / "out", "made/plain", "simtest realism ...")
+    html = page.read_text(encoding="utf-8")
+    assert found.verdict in html
+    assert "real: 6 scenes, 6 frames;" in html.lower()
+    assert "6 without a highlight" in html
+    assert "no &lt;picture&gt;" in html
+    # Each statistic that no frame tells is a stated gap.
+    written = json.loads((tmp_path / "out" / "realism.json").read_text())
+    rows = {row["statistic"]: row for row in written["statistics"]}
+    assert rows["radius"]["verdict"] == "too few scenes"
+    assert rows["radius"]["distance"] is None
+    assert rows["colour"]["verdict"] == "near"
+    assert rows["colour"]["median_inside_real_quartiles"].keys() == {
+        "l_mean",
+        "l_sd",
+        "a_mean",
+        "a_sd",
+        "b_mean",
+        "b_sd",
+    }
+    assert written["sets"]["generated"] == {"scenes": 6, "frames": 6, "without_highlights": 6}
+    assert html.count("data:image/avif") == 12
+    assert {file.name for file in (tmp_path / "out" / "figures").iterdir()} == {
+        "strip.png", "distances.png", "distributions.png"
+    }  # fmt: skip
+
+
+def test_one_frame_on_each_side_is_a_stated_gap(tmp_path):
+    found = compare(frames(1), frames(1, first=5))
+    assert found.verdict == "too few scenes: 1 real and 1 generated; a verdict needs 5 of each"
+    html = write_comparison(found, tmp_path, "plain").read_text(encoding="utf-8")
+    assert html.count("too few scenes") >= 24
+    assert json.loads((tmp_path / "realism.json").read_text())["verdict"] == found.verdict
+
+
+def test_stopping_leaves_the_earlier_page(tmp_path):
+    found = compare(frames(1), frames(1, first=5))
+    write_comparison(found, tmp_path, "plain")
+    before = (tmp_path / "index.html").read_bytes(), (tmp_path / "realism.json").read_bytes()
+
+    def stop(done, total, what):
+        if done == total - 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_comparison(dataclasses.replace(found, left_out=[]), tmp_path, "other", progress=stop)
+    assert before == ((tmp_path / "index.html").read_bytes(), (tmp_path / "realism.json").read_bytes())
+    assert not list(tmp_path.rglob("*.part*"))
+
+
+def test_progress_tells_every_frame():
+    told = []
+    compare(frames(2), frames(3), lambda done, total, what: told.append((done, total)))
+    assert told == [(i, 6) for i in range(7)]
+
+
+def film(path, count, size=(128, 96)):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, size)
+    for i in range(count):
+        writer.write((frame(i) * 255).astype(np.uint8)[..., ::-1])
+    writer.release()
+    return path
+
+
+def test_a_film_is_one_scene_of_twenty_frames(tmp_path):
+    opened = open_frames([film(tmp_path / "one.avi", 45)])
+    assert {f.scene for f in opened} == {str(tmp_path / "one.avi")}
+    assert [int(f.name.partition("#")[2]) for f in opened] == [int(i) for i in np.linspace(0, 44, 20)]
+    # Each is the frame that its name says, also when it is read again.
+    for f in (opened[3], opened[10], opened[3]):
+        wanted = frame(int(f.name.partition("#")[2]))
+        assert np.abs(f.read() - wanted).mean() < 0.02
+
+
+def test_a_film_that_ends_early_is_measured_as_far_as_it_goes(tmp_path):
+    source = open_source(film(tmp_path / "one.avi", 8))
+    longer = _Film(Source(source.path, 40))
+    short = [NamedFrame("one", f"one.avi#{i}", lambda i=i: longer.read(i)) for i in (0, 5, 20, 39)]
+    found = compare(short, frames(1))
+    assert found.real.frames == 2
+    assert [f.reason.partition(": ")[2] for f in found.left_out] == [
+        "ends after 8 of the 40 frames that it announces"
+    ] * 2
+
+
+@pytest.mark.parametrize(
+    ("against", "more", "words"),
+    [
+        ("plane", {"surfaces": ["colon"]}, "--surface colon: only of a dataset, and plane is none"),
+        ("plane", {"count": 0}, "--count 0: must be at least 1"),
+    ],
+)
+def test_bad_options_are_one_line(tmp_path, against, more, words):
+    cv2.imwrite(str(tmp_path / "0.png"), (frame(0) * 255).astype(np.uint8))
+    with pytest.raises(InputError, match=words):
+        realism([tmp_path / "0.png"], against=against, out=tmp_path / "out", **more)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this system")
+def test_page_in_a_browser(tmp_path):
+    """No complaint, nothing asked of the network, no sideways scrolling on a desktop and on a phone."""
+    driver = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
+    page = write_comparison(compare(frames(5), frames(5, first=9)), tmp_path, "plain")
+    with driver.sync_playwright() as run:
+        browser = run.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        for width in (1280, 400):
+            tab, heard = browser.new_page(viewport={"width": width, "height": 900}), []
+            tab.on("console", lambda said, heard=heard: heard.append(said.text))
+            tab.on("pageerror", lambda error, heard=heard: heard.append(str(error)))
+            tab.on("request", lambda request, heard=heard: heard.append(request.url))
+            tab.goto(page.as_uri())
+            tab.wait_for_selector("[data-chart=distances] .main-svg", timeout=60_000)
+            tab.locator("[data-chart=column_noise]").scroll_into_view_if_needed()
+            tab.wait_for_selector("[data-chart=column_noise] .main-svg", timeout=60_000)
+            assert tab.evaluate("document.documentElement.scrollWidth") == width
+            assert [text for text in heard if not text.startswith(("file:", "data:", "blob:"))] == []
+        browser.close()
