@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering import (
-    adaptive,
-    backend,
-    block_truth,
-    emission,
-    found_highlights,
-    glints,
-    phong,
-    tissue,
-)
+from simtest.rendering import adaptive, backend, block_truth, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
 from simtest.rendering.direct import DirectLight, Material

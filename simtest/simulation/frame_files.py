@@ -45,6 +45,14 @@ FIELDS = {
     "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
 }
 
+INSTRUMENT_FIELDS = {
+    "instrument": "1 + the index in the scene's instruments of what is seen, 0 where none is; where one is, depth_mm, "
+    "position_mm and all normals are its own, curvature and directions NaN, pool false",
+    "visible_highlights.instrument": "frame.json: index of the instrument on which the spot lies; such a one is no "
+    "highlight of the surface",
+}
+"""Further fields of a scene with instruments."""
+
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where more is known.
@@ -115,6 +123,7 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
     truth, radiance = frame.truth, frame.radiance
+    of_instruments = {} if truth.instrument is None else {"instrument": truth.instrument}
     return {
         "depth_mm": truth.depth.astype(np.float32),
         "position_mm": truth.position.astype(np.float32),
@@ -131,6 +140,7 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "radiance_indirect": radiance.indirect,
         "pool": truth.pool,
         "mask": truth.mask,
+        **of_instruments,
     }
 
 
@@ -142,7 +152,7 @@ def _description(frame: LabelledFrame) -> Json:
         "camera": cast(Json, describe_camera(frame.camera)),
         "full_scale": frame.full_scale,
     }
-    fields: dict[str, Json] = {**FIELDS}
+    fields: dict[str, Json] = {**FIELDS, **(INSTRUMENT_FIELDS if scene.shown_instruments else {})}
     if sensor.encodes:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")
