@@ -136,10 +136,9 @@ class TruthMaps:
         Where the liquid film fills a valley.
     mask : ndarray of bool, shape (H, W)
         Where there is a surface.
-    instrument : ndarray of uint8, shape (H, W), or None
+    instrument : ndarray of uint8, shape (H, W)
         1 + the index of the instrument that is seen, 0 where none is. Where one is, depth, position and normals are its
-        own, also those of the base, curvatures and directions are NaN, and there is no pool. None in a scene without
-        instruments.
+        own, also those of the base, curvatures and directions are NaN, and there is no pool.
     """
 
     depth: Array
@@ -156,7 +155,7 @@ class TruthMaps:
     k_max_base: Array
     pool: Mask
     mask: Mask
-    instrument: npt.NDArray[np.uint8] | None = None
+    instrument: npt.NDArray[np.uint8]
 
     @property
     def larger_curvature(self) -> Array:

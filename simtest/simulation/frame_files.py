@@ -123,7 +123,7 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
     truth, radiance = frame.truth, frame.radiance
-    of_instruments = {} if truth.instrument is None else {"instrument": truth.instrument}
+    of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
     return {
         "depth_mm": truth.depth.astype(np.float32),
         "position_mm": truth.position.astype(np.float32),

@@ -15,7 +15,7 @@ from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, appl
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
-from simtest.validation.results_table import Value
+from simtest.validation.results_table import ON_INSTRUMENT, Value
 
 RELIEF_SEED = "surface.relief.seed"
 
@@ -246,4 +246,6 @@ def swept_example(cases: list[Case]) -> dict[str, Value]:
         if case.is_paper:
             example |= {key: value for key, value in case.paper_columns().items() if key not in example}
             example["bound_deg"] = 0.0
+        if case.data.get("instruments"):
+            example[ON_INSTRUMENT] = False
     return example
