@@ -126,15 +126,15 @@ class InstrumentKernel:
         return nearest, found
 
     def blocked(self, ray: Any, active: Any) -> Any:
-        """Return which rays, mitsuba.Ray3f of unit directions, meet a cone before their end."""
+        """Return which rays, mitsuba.Ray3f of unit directions, meet a cone before their end; in single precision."""
         import drjit as dr
 
         mi = self.mi
-        origin, direction, end = mi.Vector3d(ray.o), mi.Vector3d(ray.d), mi.Float64(ray.maxt)
+        origin, direction = mi.Vector3f(ray.o), mi.Vector3f(ray.d)
 
         def step(part: Any, hidden: Any) -> tuple[Any, Any]:
             for root, valid in self._roots(part, origin, direction, active):
-                hidden |= valid & (root > 0) & (root < end)
+                hidden |= valid & (root > 0) & (root < ray.maxt)
             return part + 1, hidden
 
         _, hidden = dr.while_loop(
@@ -146,7 +146,7 @@ class InstrumentKernel:
         """Yield where rays enter each ball, and both roots of the cone between their tangents; and whether they do."""
         import drjit as dr
 
-        start, axis, h, r1, r2, sine, cosine = self._shape(part, active)
+        start, axis, h, r1, r2, sine, cosine = self._shape(part, active, type(o))
         o = o - start
         y, v = dr.dot(o, axis), dr.dot(d, axis)
         # Across the axis, so that a long shaft costs no digits.
@@ -170,10 +170,11 @@ class InstrumentKernel:
             along = cosine * (y + v * root) - sine * x
             yield root, active & (inside > 0) & (x > 0) & (along > 0) & (along < cosine * h)
 
-    def _shape(self, part: Any, active: Any) -> tuple[Any, ...]:
-        """Return start, axis, length, radii, sine and cosine of round cones."""
-        n = [self._number(part * PER_PART + k, active) for k in range(PER_PART - 1)]
-        return self.mi.Vector3d(*n[:3]), self.mi.Vector3d(*n[3:6]), *n[6:]
+    def _shape(self, part: Any, active: Any, vector: Any) -> tuple[Any, ...]:
+        """Return start, axis, length, radii, sine and cosine of round cones, in the precision of a type of vectors."""
+        real = self.mi.Float if vector is self.mi.Vector3f else self.mi.Float64
+        n = [real(self._number(part * PER_PART + k, active)) for k in range(PER_PART - 1)]
+        return vector(*n[:3]), vector(*n[3:6]), *n[6:]
 
     def _number(self, index: Any, active: Any) -> Any:
         import drjit as dr
@@ -184,7 +185,7 @@ class InstrumentKernel:
         """Return the unit normals, mitsuba.Vector3d, at points of round cones."""
         import drjit as dr
 
-        start, axis, h, _, _, sine, cosine = self._shape(part, active)
+        start, axis, h, _, _, sine, cosine = self._shape(part, active, self.mi.Vector3d)
         o = position - start
         y = dr.dot(o, axis)
         q = o - axis * y

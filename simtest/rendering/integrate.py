@@ -124,7 +124,13 @@ class Tracer:
         ahead, metal = self.instruments.hit(rays)
         in_front = ahead.base.t < hit.base.t
         tissue = self.light.radiance(blockers, self.material, hit, draw, albedo)
-        metallic = self.light.radiance(blockers, metal, ahead, draw)
+
+        def shine(specular: Any, diffuse: Any) -> tuple[Any, Any]:
+            return self.light.radiance(blockers, metal, ahead, draw)
+
+        # A branch, since few pixels see metal.
+        dark = self.mi.Spectrum(0), self.mi.Spectrum(0)
+        metallic = dr.if_stmt(dark, in_front, shine, lambda specular, diffuse: (specular, diffuse))
         seen = [dr.select(in_front, 0, channel) for part in tissue for channel in part]
         return seen + [dr.select(in_front, channel, 0) for part in metallic for channel in part]
 

@@ -55,14 +55,14 @@ class Instrument(Spec):
         description="of a grasper: turn of the jaws about the shaft, deg; default 0, where they open across the "
         "optical axis",
     )
-    alpha: float = Field(0.2, ge=0.02, le=1, description="GGX roughness of the metal")
+    alpha: float = Field(0.15, ge=0.02, le=1, description="GGX roughness of the metal")
     metal: tuple[Share, Share, Share] = Field(
         (0.62, 0.59, 0.56), description="reflectance of the metal at normal incidence, linear RGB"
     )
     diffuse: Share = Field(
-        0.15, description="share of a matt base that is blended in, as scratches and wear scatter light"
+        0.1, description="share of a matt base that is blended in: scratches, and the tissue that the metal mirrors"
     )
-    colour: tuple[Share, Share, Share] = Field((0.6, 0.6, 0.6), description="linear RGB albedo of the matt base")
+    colour: tuple[Share, Share, Share] = Field((0.6, 0.52, 0.5), description="linear RGB albedo of the matt base")
 
     @model_validator(mode="after")
     def _one_way(self) -> "Instrument":

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import simtest
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.simulation.labelled_frame import make_frame
@@ -337,6 +338,12 @@ def test_bad_instrument_is_one_line_with_its_key(key, value, words):
         described({**SHAFT, key: value})
     assert "\n" not in str(caught.value)
     assert "instruments.0" in str(caught.value)
+
+
+def test_export_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"instruments\.0\.present = True: cannot be exported; .* must be false"):
+        simtest.export(described(SHAFT), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_bounces_are_refused():
