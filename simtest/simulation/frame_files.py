@@ -37,6 +37,7 @@ FIELDS = {
     "pool": "where the liquid film fills a valley of the relief",
     "radiance_specular, radiance_diffuse, radiance_indirect": "parts of the radiance: direct off lobe, base; bounced",
     "mask": "where there is a surface",
+    "world_from_camera": "frame.json: the camera's pose, 4 x 4, mm; the world is the surface's own frame",
     "highlights": "frame.json: points where the fine normal bisects light and camera, camera frame, mm; radius_px by "
     "the surface's shape and the lobe alone, cloud an index in clouds, why_not the first condition of an isolated one "
     "that fails",
@@ -151,6 +152,7 @@ def _description(frame: LabelledFrame) -> Json:
         "scene": scene.model_dump(mode="json"),
         "camera": cast(Json, describe_camera(frame.camera)),
         "full_scale": frame.full_scale,
+        "world_from_camera": frame.world_from_camera.tolist(),
     }
     fields: dict[str, Json] = {**FIELDS, **(INSTRUMENT_FIELDS if scene.shown_instruments else {})}
     if sensor.encodes:

@@ -1,5 +1,7 @@
 """Instruments against plain NumPy: rays' closed forms, shadows, the metal's radiance, labels, hidden highlights."""
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 import simtest
 from simtest.errors import InputError
 from simtest.rendering import Session
+from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec.instrument import Instrument
 from simtest.spec.scene import scene_from_dict
@@ -268,6 +271,22 @@ def test_frame_names_why_a_hidden_highlight_does_not_count_and_whose_a_spot_is(s
     plain = make_frame(described())
     assert [spot.instrument for spot in plain.visible_highlights] == [None]
     assert "instrument" not in plain.visible_highlights[0].to_json()
+
+
+def test_files_hold_the_map_and_the_pose_and_none_of_it_without_instruments(tmp_path):
+    write_frame(make_frame(described(SHAFT)), tmp_path / "with")
+    write_frame(make_frame(described()), tmp_path / "without")
+    arrays = [np.load(tmp_path / name / "truth.npz") for name in ("with", "without")]
+    assert set(arrays[0]) - set(arrays[1]) == {"instrument"}
+    assert arrays[0]["instrument"].any()
+    assert arrays[0]["mask"][arrays[0]["instrument"] > 0].all()
+    told = [json.loads((tmp_path / name / "frame.json").read_text(encoding="utf-8")) for name in ("with", "without")]
+    assert "instrument" in told[0]["fields"]
+    assert "instrument" not in json.dumps(told[1])
+    # The plane z = 0 of the world is what the camera sees.
+    pose = np.array(told[1]["world_from_camera"])
+    points = arrays[1]["position_mm"].reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+    assert np.abs(points[:, 2]).max() < 1e-4
 
 
 # Sessions ------------------------------------------------------------------------------------------------------------
