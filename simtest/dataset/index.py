@@ -9,11 +9,12 @@ from typing import Any, get_args, get_type_hints
 
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.metadata import EstimateMeta, SampleMeta
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import samples
 from simtest.runtime.files import write_atomically
-from simtest.validation.results_table import ON_INSTRUMENT, SCHEMA
+from simtest.validation.results_table import SCHEMA
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
 TABLES = (SAMPLES, HIGHLIGHTS, ESTIMATES)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
 from simtest.runtime.resources import find, shown
@@ -15,7 +16,7 @@ from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, appl
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_recipe
-from simtest.validation.results_table import ON_INSTRUMENT, Value
+from simtest.validation.results_table import Value
 
 RELIEF_SEED = "surface.relief.seed"
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
@@ -18,7 +18,7 @@ from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.results_table import FINE, ON_INSTRUMENT, ResultRow
+from simtest.validation.results_table import FINE, ResultRow
 from simtest.validation.rough_truth import RoughTruth
 
 MISSED = "missed"

@@ -11,9 +11,6 @@ Value = bool | int | float | str | None
 FINE = "fine"
 """Target of an estimate that states the fine surface's normal, with the relief."""
 
-ON_INSTRUMENT = "on_instrument"
-"""Column of runs with instruments, beside the swept parameters: whether a detection shows one, and nothing true."""
-
 SCHEMA: dict[str, pl.DataType] = {
     "experiment": pl.String(), "label": pl.String(), "surface": pl.String(), "reflectance": pl.String(),
     "setting": pl.String(), "realisation": pl.Int64(), "specularity": pl.Int64(), "true_id": pl.Int64(),

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
-from simtest.validation.results_table import ON_INSTRUMENT
 
 Interval = tuple[float | None, float | None]
 
