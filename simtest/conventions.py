@@ -65,3 +65,6 @@ SPECULAR_MIN_AREA_PX = 12
 
 EDGES_PER_HALF_WIDTH = 2.0
 """Edges needed in a half-width: with two, the triangles cost less than 0.05 deg and 1 % (docs/meshes.md)."""
+
+ON_INSTRUMENT = "on_instrument"
+"""Column of results of scenes with instruments: whether a detection shows one, and no true highlight."""

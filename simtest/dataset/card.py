@@ -6,7 +6,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import BASE_FIELDS, FIELDS
+from simtest.dataset.fields import BASE_FIELDS, FIELDS, INSTRUMENT
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
@@ -31,6 +31,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         counts[shard.split][0] += len(shard.indices)
         counts[shard.split][1] += 1
     left_out = [*(() if dataset.radiance else ("radiance",)), *(() if plan.has_relief else BASE_FIELDS)]
+    left_out += [] if plan.has_instruments else [INSTRUMENT]
     environment = Environment(
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
         lstrip_blocks=True,
@@ -41,6 +42,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         counts=counts,
         fields=[field for field in FIELDS if field.name not in left_out],
         has_relief=plan.has_relief,
+        has_instruments=plan.has_instruments,
         draws=list(_draws(plan)),
         tables=(SAMPLES, HIGHLIGHTS, ESTIMATES),
         meshes=sorted({path.name for path in spec_files(dataset) if path.suffix != ".toml"}),

@@ -262,6 +262,10 @@ FIELDS = (
     Field("instance", "instance.png", "(H, W)", "uint8", "1",
           "0, or 1 + the place in the list highlights of the isolated highlight whose region at half height this is",
           "8-bit PNG", _encode_picture, _decode_picture),
+    Field("instrument", "instrument.png", "(H, W)", "uint8", "1",
+          "0, or 1 + the index in the scene's instruments of the metal instrument that is seen: depth and normals "
+          "are its own there, curvature is NaN; stored where the scene lists instruments, elsewhere it is 0 everywhere",
+          "8-bit PNG", _encode_picture, _decode_picture),
     Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
           "linear radiance before lens and noise, share of full scale; only in datasets that keep it",
           "NPY", _encode_half, _decode_half),
@@ -274,8 +278,18 @@ BY_SUFFIX = {field.suffix: field for field in FIELDS}
 FINE_OF = {"normal_base": "normal", "curvature_base": "curvature"}
 """Field of the fine surface that each field of the base equals where there is no relief."""
 
+INSTRUMENT = "instrument"
+"""Field that is stored where the scene lists instruments alone, present or not."""
+
 BASE_FIELDS = (*FINE_OF, "pool")
 """Fields that are stored where there is a relief alone."""
+
+
+def no_instrument(meta: SampleMeta) -> AnyArray | None:
+    """Return the field `INSTRUMENT` of a sample whose scene lists none, which does not store it; else None."""
+    if meta["scene"].get("instruments"):
+        return None
+    return np.zeros((meta["camera"]["height"], meta["camera"]["width"]), dtype=np.uint8)
 
 
 def smooth_base(name: str, fine: AnyArray | None, meta: SampleMeta) -> AnyArray | None:

@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.metadata import EstimateMeta, SampleMeta
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard import samples
@@ -52,6 +53,7 @@ class SampleRow:
     n_isolated: int
     n_detections: int
     drawn: str
+    instrument_share: float | None
 
     @classmethod
     def of(cls, meta: SampleMeta, shard: str, offset: int, size: int) -> "SampleRow":
@@ -63,6 +65,7 @@ class SampleRow:
             anatomy["family"], anatomy["surface"], anatomy["number"], anatomy["seed"], meta["attempt"],
             camera["width"], camera["height"], meta["full_scale"], meta["depth_scale_mm"],
             len(highlights), isolated, len(meta["detections"]), json.dumps(meta["drawn"], sort_keys=True),
+            meta.get("instrument_share"),
         )  # fmt: skip
 
 
@@ -121,10 +124,15 @@ def make_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
             rows.append(SampleRow.of(meta, shard.name, offset, size))
             highlights += HighlightRow.of(meta)
             estimates += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
+    of_samples, of_estimates = _schema(SampleRow), dict(_ESTIMATE_SCHEMA)
+    if plan.has_instruments:
+        of_estimates[ON_INSTRUMENT] = pl.Boolean()
+    else:
+        del of_samples["instrument_share"]
     return {
-        SAMPLES: _table(map(vars, rows), _schema(SampleRow)),
+        SAMPLES: _table(map(vars, rows), of_samples),
         HIGHLIGHTS: _table(map(vars, highlights), _schema(HighlightRow)),
-        ESTIMATES: _table(estimates, _ESTIMATE_SCHEMA),
+        ESTIMATES: _table(estimates, of_estimates),
     }
 
 

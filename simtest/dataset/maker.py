@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import depth_scale_mm
+from simtest.dataset.fields import INSTRUMENT, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
@@ -24,7 +24,7 @@ from simtest.simulation.rendered_view import RenderedView, render_view, shows_is
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
-from simtest.validation.matching import match
+from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
 from simtest.validation.rough_truth import rough_truth
@@ -72,6 +72,7 @@ class Maker:
             },
             "drawn": drawn.values,
             "camera": describe_camera(scene.camera.model()),
+            "world_from_camera": session.surface.model_from_camera.tolist(),
             "lights_mm": scene.rig.true_mm().tolist(),
             "full_scale": seen.full_scale,
             "scene": scene.model_dump(mode="json"),
@@ -81,6 +82,8 @@ class Maker:
             "estimates": self._estimates(index, session, seen, specularities),
             "depth_scale_mm": depth_scale_mm(images["depth"]),
         }
+        if scene.instruments:
+            meta["instrument_share"] = float(np.mean(images[INSTRUMENT] > 0))
         if seen.is_rough:
             spots = [spot.to_json() for spot in seen.visible_highlights]
             meta["clouds"] = cast("list[dict[str, JsonValue]]", [cloud_json(centre) for centre in seen.clouds])
@@ -131,14 +134,16 @@ class Maker:
         if seen.is_rough:
             found = match(specularities, [spot.peak_px for spot in seen.visible_highlights])
             rough = rough_truth(session, seen, counted, found)
+        matched = match(specularities, [truth.bp_px for truth in truths])
         made = rows(
             session,
             common,
             specularities,
             truths,
-            match(specularities, [truth.bp_px for truth in truths]),
+            matched,
             list(self._estimators),
             rough=rough,
+            on_instrument=on_instruments(specularities, matched, seen),
         )
         estimates = []
         for row in made:
@@ -168,6 +173,8 @@ class Maker:
             away = np.sum(base * seen.position, axis=-1, keepdims=True) >= 0
             normal, base = (np.where(away, seen.geometric_normal, own) for own in (normal, base))
         truth = {"depth": seen.depth, "normal": normal, "curvature": np.stack([seen.k_min, seen.k_max], axis=-1)}
+        if drawn.scene.instruments:
+            truth[INSTRUMENT] = seen.instrument
         if drawn.scene.surface.relief is None:
             # The base is the fine surface: it is not stored twice.
             return truth

@@ -68,6 +68,7 @@ class SampleMeta(TypedDict):
     anatomy: AnatomyMeta
     drawn: dict[str, JsonValue]
     camera: CameraDescription
+    world_from_camera: NotRequired[list[list[float]]]  # 4 x 4, mm; older datasets lack it
     lights_mm: list[list[float]]
     full_scale: float
     scene: dict[str, JsonValue]
@@ -78,6 +79,7 @@ class SampleMeta(TypedDict):
     detections: list[DetectionMeta]
     estimates: list[EstimateMeta]
     depth_scale_mm: float
+    instrument_share: NotRequired[float]  # of the pixels, on an instrument; where the scene lists instruments
     sha256: NotRequired[dict[str, str]]
 
 

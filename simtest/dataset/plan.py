@@ -126,6 +126,13 @@ class Plan:
         is_drawn = any(key.startswith("surface.relief") for key in (*drawn, *self.dataset.per_sample))
         return is_drawn or any(scene.surface.relief is not None for scene in scenes)
 
+    @cached_property
+    def has_instruments(self) -> bool:
+        """Whether some scenes list instruments, so that their samples hold a map of them."""
+        drawn = (key for family in self.dataset.families for key in (*family.per_anatomy, *family.per_sample))
+        is_drawn = any(key.split(".")[0] == "instruments" for key in (*drawn, *self.dataset.per_sample))
+        return is_drawn or any(base.get("instruments") for base in self._bases)
+
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")
         base = apply_settings(read_toml(path), family.set, f"families.{number}.set")

@@ -93,6 +93,8 @@ def _card(sample: Sample) -> Card:
     base = []
     if has_relief(meta):
         base = [("normal of the base, without the relief", _data_url(_normal_colours(images["normal_base"])))]
+    if meta.get("instrument_share"):
+        base.append(("instruments, by number", _data_url(_instrument_colours(images["instrument"]))))
     drawn = ", ".join(f"{key} = {_short(value)}" for key, value in sorted(meta["drawn"].items()))
     return Card(
         f"{meta['index']}: {meta['anatomy']['surface']}, {meta['split']}",
@@ -125,6 +127,11 @@ def _outlined(image: AnyArray, instance: AnyArray) -> AnyArray:
 def _normal_colours(normal: AnyArray) -> AnyArray:
     colours = np.rint(127.5 * (1 + normal * np.array([1, -1, -1])))
     return np.nan_to_num(colours, nan=0.0).astype(np.uint8)
+
+
+def _instrument_colours(instrument: AnyArray) -> AnyArray:
+    # Grey steps, none is black.
+    return np.repeat(np.where(instrument > 0, 255 - 24 * (instrument - 1), 0).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _depth_colours(depth: AnyArray) -> AnyArray:

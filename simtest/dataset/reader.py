@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from simtest.dataset.fields import BASE_FIELDS, BY_NAME, FINE_OF, Field, smooth_base
+from simtest.dataset.fields import BASE_FIELDS, BY_NAME, FINE_OF, INSTRUMENT, Field, no_instrument, smooth_base
 from simtest.dataset.manifest import Manifest, ManifestError, read_manifest
 from simtest.dataset.sample import Sample
 from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
@@ -40,7 +40,7 @@ def read(
     dict
         Array by field name (units and frames in the card), and ``meta``: the sample's metadata. Where there is no
         relief, ``normal_base`` and ``curvature_base`` are the arrays ``normal`` and ``curvature``, and ``pool`` is
-        false.
+        false. Where the scene lists no instruments, ``instrument`` is 0.
 
     Raises
     ------
@@ -116,6 +116,8 @@ def _image(file: IO[bytes], stored: StoredSample, field: Field, read_before: dic
     """Decode a field; None where the sample has none. `read_before` holds the sample's other fields, by name."""
     if field.suffix in stored.members:
         return field.decode(read_member(file, stored, field.suffix), stored.meta)
+    if field.name == INSTRUMENT:
+        return no_instrument(stored.meta)
     if field.name not in BASE_FIELDS:
         return None
     # On a smooth surface the base is the fine surface.

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS
+from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT
 from simtest.dataset.index import TABLES, make_tables
 from simtest.dataset.manifest import (
     NAME,
@@ -44,7 +44,7 @@ MAX_DEPTH_ERROR = 0.05
 MAX_SLOPES = 4.0
 """The median angle between fine normals and those of the base is 1.2 slopes of the relief, and far below this many."""
 
-REQUIRED = tuple(field.name for field in FIELDS if field.name not in ("radiance", *BASE_FIELDS))
+REQUIRED = tuple(field.name for field in FIELDS if field.name not in ("radiance", INSTRUMENT, *BASE_FIELDS))
 """Images of every sample; with a relief also those of the base."""
 
 
@@ -182,10 +182,13 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
         camera = SceneCamera.model_validate(meta["scene"]["camera"]).model()
         highlights = meta["highlights"]
         relief = _relief(meta)
+        instruments = meta["scene"].get("instruments") or []
+        listed = len(instruments) if isinstance(instruments, list) else 0
     except (ValueError, KeyError, TypeError) as error:
         yield f"cannot be decoded ({error})"
         return
     required = REQUIRED if relief is None else (*REQUIRED, *BASE_FIELDS)
+    required += (INSTRUMENT,) if listed else ()
     if lacking := [name for name in required if name not in sample.images]:
         yield f"has no {', '.join(lacking)}"
         return
@@ -197,6 +200,8 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
             return
     # depth, normals and curvatures
     yield from _surface(sample, camera, relief)
+    if listed and sample.images[INSTRUMENT].max() > listed:
+        yield f"{INSTRUMENT} names instrument {int(sample.images[INSTRUMENT].max())} of {listed}"
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]
     if instance.max() > len(highlights):

@@ -27,12 +27,13 @@ def applies(scene: Scene) -> bool:
     """Return whether the rule for smooth pixels is made for a scene.
 
     Left out: bounces, which are random; sources of finite size, whose penumbrae need many rays at each centre; relief
-    and the colour of tissue, which may be finer than a pixel. Frames of a moving camera do not come here: each of their
-    steps takes so few samples that the rays through the centres would cost more than they save.
+    and the colour of tissue, which may be finer than a pixel; instruments, whose edges and shadows no label shows.
+    Frames of a moving camera do not come here: each of their steps takes so few samples that the rays through the
+    centres would cost more than they save.
     """
     effort, lights = scene.render, scene.rig.lights
     direct = effort.path_depth == 2 and all(light.source is None for light in lights)
-    plain = scene.surface.relief is None and scene.albedo is None
+    plain = scene.surface.relief is None and scene.albedo is None and not scene.shown_instruments
     enough = effort.adaptive and effort.samples_per_pixel >= LEAST_SAMPLES
     return enough and direct and plain and len(lights) <= MOST_LIGHTS
 

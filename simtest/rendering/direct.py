@@ -1,9 +1,9 @@
 """Direct light in closed form: intensity over squared distance times f cos(theta), of the lobe and of the base."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from simtest.rendering import emission
 from simtest.rendering.albedo import AlbedoKernel
@@ -11,6 +11,19 @@ from simtest.rendering.hits import Hit
 from simtest.rendering.light_points import DRAWN, Draw, Drawer, point
 from simtest.rendering.rays import Lanes
 from simtest.spec.rig import Rig, is_at_camera
+
+
+class Reflecting(Protocol):
+    """What direct light is reflected by: `Material`, or the metal of instruments."""
+
+    def painted(self, albedo: Any) -> AbstractContextManager[None]:
+        """Let the base have an albedo, mitsuba.Spectrum; None: its own."""
+
+    def albedo_of(self, hit: Hit) -> Any:
+        """Compute the albedo at a hit, once for all its lights; None: the base's own."""
+
+    def towards(self, mi: Any, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
+        """Compute f cos(theta) of the lobe and of the base towards a direction of the model frame."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +117,7 @@ class DirectLight:
         return Drawer(self.mi, lanes, samples) if any(kind.source != "point" for kind in self.kinds) else None
 
     def radiance(
-        self, scene: Any, material: Material, hit: Hit, draw: Draw | None, albedo: Any = None
+        self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None, albedo: Any = None
     ) -> tuple[Any, Any]:
         """Compute the radiance off the lobe and the base, mitsuba.Spectrum, at surface points, with shadow rays.
 
@@ -114,7 +127,7 @@ class DirectLight:
         with material.painted(material.albedo_of(hit) if albedo is None else albedo):
             return self._of_lights(scene, material, hit, draw)
 
-    def _of_lights(self, scene: Any, material: Material, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
+    def _of_lights(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
         specular, diffuse = self.mi.Spectrum(0), self.mi.Spectrum(0)
         for i, kind in enumerate(self.kinds):
             if kind.source == "point":
@@ -128,7 +141,7 @@ class DirectLight:
             diffuse += base
         return specular, diffuse
 
-    def _from(self, i: int, scene: Any | None, material: Material, hit: Hit, position: Any) -> tuple[Any, Any]:
+    def _from(self, i: int, scene: Any | None, material: Reflecting, hit: Hit, position: Any) -> tuple[Any, Any]:
         """Compute the radiance by the light of an index from a position; shadow rays only if there is a scene."""
         import drjit as dr
 
@@ -144,7 +157,7 @@ class DirectLight:
         lobe, base = material.towards(mi, hit, direction, active)
         return dr.select(active, arriving * lobe, 0), dr.select(active, arriving * base, 0)
 
-    def _fixed(self, i: int, scene: Any, material: Material, hit: Hit, draw: Draw) -> tuple[Any, Any]:
+    def _fixed(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: Draw) -> tuple[Any, Any]:
         """Compute the mean radiance over the fixed points of a source, with a shadow ray to each.
 
         Fewer rays would leave steps in penumbrae, since all pixels have the same points.
@@ -162,7 +175,7 @@ class DirectLight:
         _, specular, diffuse = dr.while_loop(start, lambda number, *_: number < end, step)
         return specular / draw.total, diffuse / draw.total
 
-    def _drawn(self, i: int, scene: Any, material: Material, hit: Hit, draw: Draw) -> tuple[Any, Any]:
+    def _drawn(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: Draw) -> tuple[Any, Any]:
         """Compute the mean radiance over a sample's points of a source, with one shadow ray to one of them.
 
         The point is chosen in proportion to the radiance that it causes. Then the whole is without bias, and without

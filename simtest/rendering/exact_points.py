@@ -123,7 +123,8 @@ def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tu
     maps = {"depth": points.distance, "shading_normal": shading, "geometric_normal": geometric}
     maps |= {name: getattr(points, name) for name in _OF_POINTS}
     images = {name: values.reshape(*size, *values.shape[1:]) for name, values in maps.items()}
-    return TruthMaps(**images, pool=points.pool.reshape(size), mask=points.valid.reshape(size))
+    none = np.zeros(size, dtype=np.uint8)
+    return TruthMaps(**images, pool=points.pool.reshape(size), mask=points.valid.reshape(size), instrument=none)
 
 
 def _columns(values: Array) -> Any:

@@ -65,7 +65,8 @@ class Labels:
     pool : ndarray of bool, shape (H, W)
         Where the liquid film fills a valley.
     instance : ndarray of int32, shape (H, W)
-        Number of the surface, from 0; -1 where there is none.
+        Number of the surface, from 0; -1 where there is none. An instrument's is 1 + its index in the scene's list:
+        there depth, position and normals are its own, and curvatures NaN.
     face : ndarray of int32, shape (H, W)
         Triangle of a mesh, 0 for other shapes; -1 where there is none.
     """
@@ -87,6 +88,11 @@ class Labels:
     def mask(self) -> Mask:
         """Where there is a surface, shape (H, W)."""
         return self.instance >= 0
+
+    @property
+    def instrument(self) -> npt.NDArray[np.uint8]:
+        """1 + the index of the instrument that is seen, 0 where none is, shape (H, W)."""
+        return np.maximum(self.instance, 0).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,9 @@ class TruthMaps:
         Where the liquid film fills a valley.
     mask : ndarray of bool, shape (H, W)
         Where there is a surface.
+    instrument : ndarray of uint8, shape (H, W)
+        1 + the index of the instrument that is seen, 0 where none is. Where one is, depth, position and normals are its
+        own, also those of the base, curvatures and directions are NaN, and there is no pool.
     """
 
     depth: Array
@@ -146,6 +155,7 @@ class TruthMaps:
     k_max_base: Array
     pool: Mask
     mask: Mask
+    instrument: npt.NDArray[np.uint8]
 
     @property
     def larger_curvature(self) -> Array:
@@ -202,6 +212,8 @@ class HighlightPoint:
         Distance times the base's principal curvatures.
     pool : bool
         Whether the point lies in a pool of the liquid film.
+    hidden : bool
+        Whether an instrument hides it from the camera; it is not lit then.
     """
 
     light: int
@@ -218,6 +230,7 @@ class HighlightPoint:
     kd_min_base: float
     kd_max_base: float
     pool: bool
+    hidden: bool = False
 
     @property
     def min_gain(self) -> float:

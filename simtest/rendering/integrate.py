@@ -17,6 +17,7 @@ from simtest.rendering.frames import MisfitMaps, Radiance
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
+from simtest.rendering.instrument_kernel import InstrumentKernel
 from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
@@ -78,6 +79,8 @@ class Tracer:
         Solves the hits again in double precision.
     relief : ReliefKernel or None
         The surface's relief.
+    instruments : InstrumentKernel or None
+        What stands before the surface.
     """
 
     mi: Any
@@ -87,6 +90,12 @@ class Tracer:
     material: Material
     refinement: Refinement
     relief: ReliefKernel | None
+    instruments: InstrumentKernel | None = None
+
+    @property
+    def layers(self) -> int:
+        """How many sets of channels the radiance has: that of the surface, and that of instruments if there are any."""
+        return 1 if self.instruments is None else 2
 
     def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
@@ -101,16 +110,35 @@ class Tracer:
         self.refinement.apply(rays.origin, rays.direction, si)
         return make_hit(self.mi, si, self.relief, bent)
 
-    def _direct(self, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
-        """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`."""
-        specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw, albedo)
-        return [*specular, *diffuse]
+    def _direct(self, rays: Rays, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
+        """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`.
+
+        Where there are instruments those of their metal follow, and each is 0 where the other is in front.
+        """
+        if self.instruments is None:
+            specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw, albedo)
+            return [*specular, *diffuse]
+        import drjit as dr
+
+        blockers = self.instruments.before(self.scene)
+        ahead, metal = self.instruments.hit(rays)
+        in_front = ahead.base.t < hit.base.t
+        tissue = self.light.radiance(blockers, self.material, hit, draw, albedo)
+
+        def shine(specular: Any, diffuse: Any) -> tuple[Any, Any]:
+            return self.light.radiance(blockers, metal, ahead, draw)
+
+        # A branch, since few pixels see metal.
+        dark = self.mi.Spectrum(0), self.mi.Spectrum(0)
+        metallic = dr.if_stmt(dark, in_front, shine, lambda specular, diffuse: (specular, diffuse))
+        seen = [dr.select(in_front, 0, channel) for part in tissue for channel in part]
+        return seen + [dr.select(in_front, channel, 0) for part in metallic for channel in part]
 
     def _parts(
-        self, hit: Hit, draw: Draw | None, bounces: Bounces | None, count: int, block: int, sample: int
+        self, rays: Rays, hit: Hit, draw: Draw | None, bounces: Bounces | None, count: int, block: int, sample: int
     ) -> list[Any]:
         """Compute the channels of direct light and, if asked for, of further bounces."""
-        parts = self._direct(hit, draw)
+        parts = self._direct(rays, hit, draw)
         if bounces is not None:
             parts += [*bounces.radiance(hit.fine, count, block, sample)]
         return parts
@@ -144,7 +172,7 @@ class Tracer:
             # Radiance and labels of one launch go into one kernel.
             drawer = self.light.drawer(None)
             draw = None if drawer is None else drawer.at(0)
-            parts = self._parts(hit, draw, bounces, count, block, sample) if radiance else []
+            parts = self._parts(rays, hit, draw, bounces, count, block, sample) if radiance else []
             count_of_parts = len(parts)
             if labels is not None:
                 parts = parts + labels.trace(preliminary, hit, rays, self.sightlines.camera_from_model, self.relief)
@@ -283,22 +311,22 @@ class Tracer:
         """Sum direct light over samples by a loop inside the kernel."""
         import drjit as dr
 
-        mi, zeros = self.mi, [self.mi.Float(0) for _ in range(2 * channels(self.mi))]
+        mi, zeros = self.mi, [self.mi.Float(0) for _ in range(2 * self.layers * channels(self.mi))]
         number, end = mi.UInt32(start), mi.UInt32(stop)
         dr.make_opaque(number, end)
 
-        def light(hit: Hit, number: Any, albedo: Any, sums: Any) -> list[Any]:
-            parts = self._direct(hit, None if drawer is None else drawer.at(number), albedo)
+        def light(rays: Rays, hit: Hit, number: Any, albedo: Any, sums: Any) -> list[Any]:
+            parts = self._direct(rays, hit, None if drawer is None else drawer.at(number), albedo)
             return [total + part for total, part in zip(sums, parts, strict=True)]
 
         def step(number: Any, *sums: Any) -> tuple[Any, ...]:
-            _, _, hit = self._hit(*self.sightlines.sample(lanes, number))
-            return number + 1, *light(hit, number, None, sums)
+            rays, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            return number + 1, *light(rays, hit, number, None, sums)
 
         def painted_step(number: Any, held: Painted, *sums: Any) -> tuple[Any, ...]:
-            _, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            rays, _, hit = self._hit(*self.sightlines.sample(lanes, number))
             held = self._paint(hit, number, held)
-            return number + 1, held, *light(hit, number, held[0], sums)
+            return number + 1, held, *light(rays, hit, number, held[0], sums)
 
         if self.material.albedo is None:
             _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
@@ -336,9 +364,9 @@ class Tracer:
 
         which = self.mi.UInt32(number)
         dr.make_opaque(which)
-        _, _, hit = self._hit(*self.sightlines.sample(lanes, which))
+        rays, _, hit = self._hit(*self.sightlines.sample(lanes, which))
         draw = None if drawer is None else drawer.at(which)
-        return self._parts(hit, draw, bounces, count, block, number)
+        return self._parts(rays, hit, draw, bounces, count, block, number)
 
 
 def _misfit(mi: Any, sightline: Any, distance: Any, normal: Any, light: Any) -> tuple[Any, Any]:

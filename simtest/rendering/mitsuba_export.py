@@ -96,6 +96,8 @@ def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
         yield "camera.fx", camera.fx, f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
     if camera.skew != 0:
         yield "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"
+    for index in scene.shown_instruments:
+        yield f"instruments.{index}.present", True, "Mitsuba does not know simtest's instruments: must be false"
     relief = scene.surface.relief
     if relief is not None:
         yield (

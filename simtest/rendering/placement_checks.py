@@ -1,12 +1,14 @@
-"""Checks that camera and lights stand in free space."""
+"""Checks that camera and lights stand in free space, and instruments in the picture."""
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry import Camera
 from simtest.runtime.arrays import Array
 from simtest.spec.rig import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
+from simtest.surfaces.instrument import RoundCones
 
 RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
 """Scales of a source's rim at which its clearance is asked for."""
@@ -39,6 +41,29 @@ def check_lights(scene: Scene, surface: SurfaceModel) -> None:
             f"scene {scene.name}: rig.lights.{i} at ({position}) mm: lies {-clearances[i]:.3g} mm inside the "
             f"{scene.surface.label}; a light must be in free space{_advice(scene.rig, surface, int(i))}"
         )
+
+
+def check_instruments(scene: Scene, camera: Camera, cones: RoundCones) -> None:
+    """Raise `InputError` where an instrument, camera frame, mm, holds the camera or a light, or ends in the picture."""
+    lights = scene.rig.true_mm()
+    reaches = [0.0, *(0.0 if light.source is None else light.source.radius_mm for light in scene.rig.lights)]
+    clearances = cones.distances(np.concatenate([np.zeros((1, 3)), lights])) - np.array(reaches)[:, None]
+    names = ["the camera", *(f"rig.lights.{i}" for i in range(len(lights)))]
+    for place, part in zip(*np.nonzero(~(clearances > 0)), strict=True):
+        raise InputError(
+            f"scene {scene.name}: instruments.{cones.owners[part]}: lies {-clearances[place, part]:.3g} mm over "
+            f"{names[place]}; must leave it free: another tip, azimuth_deg or tilt_deg"
+        )
+    for index in np.unique(cones.owners):
+        # The shaft comes first.
+        end = cones.ends[np.flatnonzero(cones.owners == index)[0]]
+        pixel = camera.project(end[None])[0]
+        if np.isfinite(pixel).all() and camera.contains(pixel[None])[0]:
+            raise InputError(
+                f"scene {scene.name}: instruments.{index}.length_mm = {scene.instruments[index].length_mm:g}: its end "
+                f"is seen at ({pixel[0]:.0f}, {pixel[1]:.0f}) px; must be longer, or leave the picture by another "
+                "azimuth_deg or tilt_deg"
+            )
 
 
 def check_motion(scene: Scene, surface: SurfaceModel) -> None:

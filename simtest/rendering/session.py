@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from simtest.errors import InputError
 from simtest.rendering import adaptive, backend, block_truth, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
@@ -19,6 +20,8 @@ from simtest.rendering.direct import DirectLight, Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
+from simtest.rendering.instrument_kernel import InstrumentKernel
+from simtest.rendering.instruments import Cover, cover_of, place, shade
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
 from simtest.rendering.mesh_edges import MeshEdges
@@ -84,6 +87,8 @@ class Session:
         tissue.register(self.mi, self.variant)
         emission.register(self.mi, self.variant)
         self.rebuilds = 0
+        self._instruments: InstrumentKernel | None = None
+        self._cover: Cover | None = None
         self._labelled = labelled
         self._albedo: AlbedoKernel | None = None
         self._load_surface(scene)
@@ -106,6 +111,7 @@ class Session:
         InputError
             As for the session itself; it then stays at its scene.
         """
+        before = self.scene
         # Surface, camera and lights: refused here if they are not sound.
         if scene.surface != self.scene.surface or scene.film_level != self.scene.film_level:
             self._load_surface(scene)
@@ -130,6 +136,13 @@ class Session:
             self._shape_labels()
         # Values.
         self._apply(self._built)
+        try:
+            self._instruments, self._cover = place(self), None
+        except InputError:
+            # Back to where it was, unless it is being made.
+            if scene is not before:
+                self.update(before)
+            raise
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.
@@ -253,7 +266,8 @@ class Session:
         The exact truth that `truth` computes afterwards starts from the same hits. See `radiance` for `progress`.
         """
         radiance = self.labelled_radiance(progress)
-        return Frame(radiance, as_labels(self._labels))
+        labels, cover = as_labels(self._labels), self.cover()
+        return Frame(radiance, labels if cover is None else cover.labels(labels))
 
     def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
         """Render the radiance of `frame`, and trace its labels.
@@ -288,9 +302,16 @@ class Session:
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
-        radiance = as_radiance(parts)
+        own = len(parts) // tracer.layers
+        radiance = as_radiance(parts[:own])
         if self.scene.translucency is not None:
             radiance = self._translucent(radiance, channels, self.scene.translucency)
+        if self._instruments is not None:
+            # Metal in front of the surface; nothing spreads below it.
+            metal = as_radiance(parts[own:])
+            radiance = replace(
+                radiance, specular=radiance.specular + metal.specular, diffuse=radiance.diffuse + metal.diffuse
+            )
         return radiance, channels
 
     def _mean_over(self, motion: Motion, bounces: Bounces | None, progress: Progress | None) -> list[Image]:
@@ -321,8 +342,9 @@ class Session:
 
         if channels:
             self._centre = channels
-        labels = as_labels(self._centre_hits())
-        diffuse = spread(radiance.diffuse, labels.depth, labels.normal_base, self.camera, spec)
+        labels, cover = as_labels(self._centre_hits()), self.cover()
+        depth = labels.depth if cover is None else np.where(cover.seen, np.float32(np.nan), labels.depth)
+        diffuse = spread(radiance.diffuse, depth, labels.normal_base, self.camera, spec)
         return replace(radiance, diffuse=diffuse)
 
     def _tracer(self, sightlines: Sightlines | None = None) -> Tracer:
@@ -330,7 +352,8 @@ class Session:
         built, sightlines = self._built, sightlines or self.sightlines
         material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
         refinement = Refinement(self.mi, self._shape)
-        return Tracer(self.mi, built.scene, sightlines, self._light, material, refinement, self._relief)
+        kernel = self._instruments
+        return Tracer(self.mi, built.scene, sightlines, self._light, material, refinement, self._relief, kernel)
 
     def _centre_hits(self) -> list[Image]:
         """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""
@@ -338,6 +361,12 @@ class Session:
             labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)
             self._centre = self._tracer().centres(None, False, labels)[1]
         return self._centre
+
+    def cover(self) -> Cover | None:
+        """Return what instruments cover of the frame; None in a scene without instruments."""
+        if self._cover is None and self._instruments is not None:
+            self._cover = cover_of(self, self._instruments, self._centre_hits()[0])
+        return self._cover
 
     # Ground truth ------------------------------------------------------------------------------------------------
 
@@ -398,11 +427,11 @@ class Session:
 
         The full maps are kept while surface and camera stay.
         """
-        if stride != 1:
-            return self._cast_maps(stride)
-        if self._truth is None:
+        if stride == 1 and self._truth is None:
             self._truth = self._cast_maps(1)
-        return self._truth
+        maps = self._truth if stride == 1 else None
+        maps, cover = maps or self._cast_maps(stride), self.cover()
+        return maps if cover is None else cover.truth(maps, stride)
 
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]
@@ -451,6 +480,8 @@ class Session:
         if base not in self._highlights:
             self._highlights[base] = found_highlights.search(self, base)
         found = self._highlights[base]
+        if self._instruments is not None:
+            found = shade(self, self._instruments, found)
         return list(found) if radiance is None else found_highlights.lit_by(radiance, found)
 
 

@@ -37,6 +37,7 @@ FIELDS = {
     "pool": "where the liquid film fills a valley of the relief",
     "radiance_specular, radiance_diffuse, radiance_indirect": "parts of the radiance: direct off lobe, base; bounced",
     "mask": "where there is a surface",
+    "world_from_camera": "frame.json: the camera's pose, 4 x 4, mm; the world is the surface's own frame",
     "highlights": "frame.json: points where the fine normal bisects light and camera, camera frame, mm; radius_px by "
     "the surface's shape and the lobe alone, cloud an index in clouds, why_not the first condition of an isolated one "
     "that fails",
@@ -44,6 +45,14 @@ FIELDS = {
     "visible_highlights": "frame.json: spots of the noise-free frame; value and specular are radiance, glints indices "
     "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
 }
+
+INSTRUMENT_FIELDS = {
+    "instrument": "1 + the index in the scene's instruments of what is seen, 0 where none is; where one is, depth_mm, "
+    "position_mm and all normals are its own, curvature and directions NaN, pool false",
+    "visible_highlights.instrument": "frame.json: index of the instrument on which the spot lies; such a one is no "
+    "highlight of the surface",
+}
+"""Further fields of a scene with instruments."""
 
 MOTION_FIELD = (
     "scene.camera.motion: frame.png, radiance.exr and the radiance's parts are the mean over the exposure; labels, "
@@ -120,6 +129,7 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
     truth, radiance = frame.truth, frame.radiance
+    of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
     return {
         "depth_mm": truth.depth.astype(np.float32),
         "position_mm": truth.position.astype(np.float32),
@@ -136,6 +146,7 @@ def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
         "radiance_indirect": radiance.indirect,
         "pool": truth.pool,
         "mask": truth.mask,
+        **of_instruments,
     }
 
 
@@ -146,8 +157,9 @@ def _description(frame: LabelledFrame) -> Json:
         "scene": scene.model_dump(mode="json"),
         "camera": cast(Json, describe_camera(frame.camera)),
         "full_scale": frame.full_scale,
+        "world_from_camera": frame.world_from_camera.tolist(),
     }
-    fields: dict[str, Json] = {**FIELDS}
+    fields: dict[str, Json] = {**FIELDS, **(INSTRUMENT_FIELDS if scene.shown_instruments else {})}
     if sensor.encodes:
         fields["frame.png"] = "the sensor's own values, as encoding says; the largest is full scale"
         response = sensor.response.model_dump(mode="json")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
-from simtest.runtime.arrays import Image
+from simtest.runtime.arrays import Array, Image
 from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -38,6 +38,8 @@ class LabelledFrame:
         The spots that can be seen in the noise-free frame, the brightest first.
     full_scale : float
         Radiance behind the lens that became 1.
+    world_from_camera : ndarray, shape (4, 4)
+        The camera's pose, mm; the world is the surface's own frame.
     variant : str
         Mitsuba variant.
     """
@@ -51,6 +53,7 @@ class LabelledFrame:
     clouds: Sequence[HighlightPoint]
     visible_highlights: list[VisibleHighlight]
     full_scale: float
+    world_from_camera: Array
     variant: str
 
 
@@ -83,5 +86,6 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
         clouds=view.clouds,
         visible_highlights=view.visible_highlights,
         full_scale=view.full_scale,
+        world_from_camera=session.surface.model_from_camera,
         variant=session.variant,
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.calibration import Calibration, NoiseModel
 from simtest.rendering import HighlightPoint, Radiance, Session, glints
@@ -42,6 +43,8 @@ class RenderedView:
         Radiance behind the lens that becomes 1 (`Exposure`); 0 where no light reaches the sensor.
     calibration : Calibration
         What reconstruction is told.
+    instruments : ndarray of uint8, shape (H, W), or None
+        1 + the index of the instrument that is seen, 0 where none is; None in a scene without instruments.
     """
 
     scene: Scene
@@ -51,6 +54,7 @@ class RenderedView:
     clouds: Sequence[HighlightPoint]
     full_scale: float
     calibration: Calibration
+    instruments: npt.NDArray[np.uint8] | None = None
 
     @property
     def is_rough(self) -> bool:
@@ -68,7 +72,7 @@ class RenderedView:
         scale = self.full_scale
         noise = sensor.noise_model().at(at / scale, self.radiance.channels) if scale > 0 else np.zeros_like(at)
         sigma = np.broadcast_to(np.asarray(noise, dtype=float) * scale, at.shape)
-        return describe(spots, light, specular, sigma, self.highlights, camera.seen)
+        return describe(spots, light, specular, sigma, self.highlights, camera.seen, self.instruments)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
@@ -87,7 +91,9 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     # What reconstruction is told may include the distance of the brightest highlight.
     brightest = max((h for h in highlights if h.lit), key=lambda h: h.radiance, default=None)
     calibration = scene.calibration(None if brightest is None else brightest.distance)
-    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration)
+    cover = session.cover()
+    instruments = None if cover is None else cover.numbers
+    return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments)
 
 
 def render_picture(session: Session, scene: Scene) -> Image:

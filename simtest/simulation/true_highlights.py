@@ -203,7 +203,7 @@ def _examined(
     `others` are columns and rows, shape (N, 2), of the points that may not lie in its half-height region.
     """
     if not point.lit:
-        return None, "in shadow"
+        return None, "hidden by an instrument" if point.hidden else "in shadow"
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
     if component is None:
         return None, "part of a brighter one"

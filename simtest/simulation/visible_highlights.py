@@ -7,6 +7,7 @@ visible highlight is a local maximum of the light behind the lens whose saddle t
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
@@ -49,6 +50,9 @@ class VisibleHighlight:
         Index of the light and number of the cloud of its brightest glint, or else of the nearest lit one.
     glints : tuple of int
         Indices of the lit glints in it, the brightest first.
+    instrument : int or None
+        Index of the instrument on which its peak lies; it is no highlight of the surface then, and has no light, cloud
+        or glints.
     """
 
     peak_px: Array
@@ -62,6 +66,7 @@ class VisibleHighlight:
     light: int | None
     cloud: int | None
     glints: tuple[int, ...]
+    instrument: int | None = None
 
     @property
     def radius_px(self) -> float:
@@ -70,6 +75,7 @@ class VisibleHighlight:
 
     def to_json(self) -> dict[str, Json]:
         """Return the fields as JSON."""
+        of_instrument: dict[str, Json] = {} if self.instrument is None else {"instrument": self.instrument}
         return {
             "peak_px": self.peak_px.tolist(),
             "value": self.value,
@@ -82,6 +88,7 @@ class VisibleHighlight:
             "light": self.light,
             "cloud": self.cloud,
             "glints": list(self.glints),
+            **of_instrument,
         }
 
 
@@ -215,8 +222,9 @@ def _pixels(spots: Spots, number: int) -> tuple[IntArray, IntArray]:
 
 
 def describe(
-    spots: Spots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight], seen: Mask | None = None
-) -> list[VisibleHighlight]:
+    spots: Spots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight], seen: Mask | None = None,
+    instruments: npt.NDArray[np.uint8] | None = None,
+) -> list[VisibleHighlight]:  # fmt: skip
     """Describe the spots of a frame, the brightest first.
 
     Parameters
@@ -229,6 +237,8 @@ def describe(
         Noise at each peak, radiance.
     glints : list of TrueHighlight
         All of the frame. A spot's light and cloud are those of its brightest glint, or else of the nearest lit one.
+    instruments : ndarray of uint8, shape (H, W), optional
+        1 + the index of the instrument that is seen, 0 where none is.
     """
     lit = [number for number, glint in enumerate(glints) if glint.lit]
     at = np.array([glints[number].bp_px for number in lit]).reshape(-1, 2)
@@ -236,7 +246,17 @@ def describe(
     for number, held in enumerate(glints_of(spots, glints)):
         row, column = int(spots.rows[number]), int(spots.columns[number])
         peak = np.array([column, row]) + PIXEL_CENTRE
-        nearest = held[0] if held else lit[int(np.linalg.norm(at - peak, axis=1).argmin())] if lit else None
+        owner = 0 if instruments is None else int(instruments[row, column])
+        held = () if owner else held
+        nearest = (
+            None
+            if owner
+            else held[0]
+            if held
+            else lit[int(np.linalg.norm(at - peak, axis=1).argmin())]
+            if lit
+            else None
+        )
         shape = shape_of(spots, number, specular, seen)
         value = float(specular[row, column])
         described.append(
@@ -252,6 +272,7 @@ def describe(
                 light=None if nearest is None else glints[nearest].light,
                 cloud=None if nearest is None else glints[nearest].cloud,
                 glints=held,
+                instrument=owner - 1 if owner else None,
             )
         )
     return described

@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import SceneCamera
+from simtest.spec.instrument import Instrument
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
@@ -18,6 +19,9 @@ from simtest.spec.surface import Surface
 from simtest.spec.tissue_colour import TissueColour
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 from simtest.spec.translucency import Translucency
+
+MOST_INSTRUMENTS = 8
+"""More than a patient has ports for."""
 
 
 class Effort(Spec):
@@ -71,6 +75,14 @@ class Scene(Spec):
     sensor: Sensor = Sensor()
     render: Effort = Effort()
     known: KnownSpec = KnownSpec()
+    instruments: tuple[Instrument, ...] = Field(
+        (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
+    )
+
+    @property
+    def shown_instruments(self) -> dict[int, Instrument]:
+        """The instruments that are present, by their index in `instruments`."""
+        return {i: instrument for i, instrument in enumerate(self.instruments) if instrument.present}
 
     @property
     def film_level(self) -> float | None:
@@ -90,6 +102,23 @@ class Scene(Spec):
                 "surface.relief is not given"
             )
         return self
+
+    @model_validator(mode="after")
+    def _lights_instruments(self) -> "Scene":
+        if self.shown_instruments and self.render.path_depth > 2:
+            raise ValueError(
+                f"render.path_depth = {self.render.path_depth}: light that bounces is not traced between instruments "
+                "and tissue; must be 2 where instruments are present"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _as_ever(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what says nothing: a scene without instruments is written as it was before there were any."""
+        dumped: dict[str, Any] = dump(self)
+        if not self.instruments:
+            dumped.pop("instruments", None)
+        return dumped
 
     @property
     def albedo(self) -> TissueColour | None:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
 from simtest.runtime.resources import find, shown
@@ -261,4 +262,6 @@ def swept_example(cases: list[Case]) -> "dict[str, Value]":
         if case.is_paper:
             example |= {key: value for key, value in case.paper_columns().items() if key not in example}
             example["bound_deg"] = 0.0
+        if case.data.get("instruments"):
+            example[ON_INSTRUMENT] = False
     return example

@@ -1,6 +1,6 @@
 """Matches detections, which come from the frame alone, to true highlights."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from simtest.errors import Failure
 from simtest.geometry.isophotes import encloses
 from simtest.reconstruction.pipeline import Specularity
 from simtest.runtime.arrays import Array
+from simtest.simulation.rendered_view import RenderedView
 
 
 def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> dict[int, int]:
@@ -34,6 +35,23 @@ def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> d
         if i not in matched and j not in matched.values():
             matched[i] = j
     return matched
+
+
+def on_instruments(
+    specularities: Sequence[Specularity], matched: Mapping[int, int], view: RenderedView
+) -> list[bool] | None:
+    """Return which detections that match no true highlight have their peak on an instrument; None where none is listed.
+
+    What shines there is the instrument: it is no answer about the tissue, and no false detection.
+    """
+    if not view.scene.instruments:
+        return None
+    if view.instruments is None:
+        return [False] * len(specularities)
+    height, width = view.instruments.shape
+    pixels = [peak_px(specularity).astype(int) for specularity in specularities]
+    peaks = [(min(max(row, 0), height - 1), min(max(column, 0), width - 1)) for column, row in pixels]
+    return [i not in matched and bool(view.instruments[peak]) for i, peak in enumerate(peaks)]
 
 
 def _is_undetected(specularity: Specularity) -> bool:

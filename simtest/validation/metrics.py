@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simtest.conventions import HIGHLIGHT_ISOVALUE
+from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
@@ -33,6 +33,7 @@ def rows(
     estimators: Sequence[str],
     unfound: str = MISSED,
     rough: RoughTruth | None = None,
+    on_instrument: Sequence[bool] | None = None,
 ) -> list[ResultRow]:
     """Make the rows of one realisation: of each detection, and of each truth that no detection found.
 
@@ -50,6 +51,8 @@ def rows(
         Names and status for the rows of truths that no detection found.
     rough : RoughTruth, optional
         What stands beside the true highlights on a surface with relief.
+    on_instrument : sequence of bool, optional
+        Of a scene with instruments, for each detection: see `matching.on_instruments`.
     """
     rough = rough or RoughTruth()
     made = []
@@ -60,6 +63,8 @@ def rows(
         truth = None if true_id is None else truths[true_id]
         row = replace(_scene_row(scene, common, truth), specularity=i, true_id=true_id)
         row = rough.filled(row, i, truth)
+        if on_instrument is not None:
+            row = replace(row, swept={**row.swept, ON_INSTRUMENT: on_instrument[i]})
         if not isinstance(patch := specularity.patch, Failure):
             bp_x, bp_y = patch.peak_px.tolist()
             row = replace(row, bp_x_px=bp_x, bp_y_px=bp_y, saturated_share=patch.saturated_share(HIGHLIGHT_ISOVALUE))

@@ -12,7 +12,7 @@ from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
-from simtest.validation.matching import match
+from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
 from simtest.validation.rough_truth import rough_truth
@@ -106,5 +106,6 @@ def realise(
         swept={**case.swept, **drawn},
     )
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
-    made = rows(session, common, specularities, truths, matched, list(estimators), unfound, rough)
+    metal = on_instruments(specularities, matched, view)
+    made = rows(session, common, specularities, truths, matched, list(estimators), unfound, rough, metal)
     return Realisation(number, view, made, frame, specularities, truths, matched)

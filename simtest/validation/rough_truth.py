@@ -92,7 +92,9 @@ class RoughTruth:
         snr = None if number is None else self.visible[number].peak_snr
         row = replace(row, visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
         if self.is_rough:
-            row = replace(row, frame_visible=len(shown(self.visible)))
+            # Of the surface: what shines on an instrument is no answer that is missing.
+            own = [spot for spot in self.visible if spot.instrument is None]
+            row = replace(row, frame_visible=len(shown(own)))
         if truth is not None:
             row = replace(row, cloud=truth.cloud)
         elif number is not None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.geometry import chi_squared, student_t
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
@@ -33,6 +34,8 @@ class Figures:
         Of these, how many failed.
     n_false : int
         False detections, answered or not, which count nowhere else.
+    n_instrument : int or None
+        Detections that show an instrument, which count nowhere else; None in a run without instruments.
     mean_deg, mean_oracle_deg, rms_deg, std_deg, median_deg, p95_deg, max_deg : float or None
         Of the errors of the answers.
     mean_penalised_deg : float or None
@@ -61,10 +64,14 @@ class Figures:
     mean_penalised_deg: float | None
     ci95_deg: Interval
     coverage95: float | None
+    n_instrument: int | None = None
 
     def to_json(self) -> Json:
         """Return the entry of summary.json."""
-        return {**vars(self), "ci95_deg": list(self.ci95_deg)}
+        entry: dict[str, Json] = {**vars(self), "ci95_deg": list(self.ci95_deg)}
+        if self.n_instrument is None:
+            del entry["n_instrument"]
+        return entry
 
 
 def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
@@ -77,6 +84,8 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
 
 def figures(rows: pl.DataFrame) -> Figures:
     """Compute the figures of the rows of one setting and estimator."""
+    has_instruments = ON_INSTRUMENT in rows.columns
+    metal = rows.filter(pl.col(ON_INSTRUMENT).fill_null(False)).height if has_instruments else None
     # Of the true highlights: answered, failed, missed.
     true = rows.filter(pl.col("true_id").is_not_null())
     answered = true.filter(pl.col("status") == "ok")
@@ -104,12 +113,14 @@ def figures(rows: pl.DataFrame) -> Figures:
         mean_penalised_deg=_or_none(np.mean, penalised),
         ci95_deg=mean_interval(errors),
         coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
+        n_instrument=metal,
     )
 
 
 def _sees_nothing(rows: pl.DataFrame) -> pl.Expr:
     """Return where a detection shows nothing visible: on a relief a spot may melt several glints, or hold none."""
-    return pl.col("visible_id").is_null() if "visible_id" in rows.columns else pl.lit(True)
+    nothing = pl.col("visible_id").is_null() if "visible_id" in rows.columns else pl.lit(True)
+    return nothing & ~pl.col(ON_INSTRUMENT).fill_null(False) if ON_INSTRUMENT in rows.columns else nothing
 
 
 def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:
