@@ -345,21 +345,23 @@ SEARCHED: dict[str, dict[str, object]] = {
     "colon": {"type": "anatomy", "path": "colon"},
     "liver": {"type": "anatomy", "path": "liver"},
 }
-FINER = 10
-"""How many times finer the exhaustive grid is, along each axis."""
+FINER, BLOCK_PX = 10, 40
+"""How many times finer the exhaustive grid is along each axis, and the side of the blocks in which it is traced, px."""
 
 SAME_PX = 0.05
 
 
 def exhaustive(session: Session) -> Array:
     """Return the glints, px, that start from every cell of the finer grid in which the misfit may have a zero."""
-    maps = session.fine_misfits(FINER, 0)
-    w = maps.fine[0]
-    corners = np.stack([w[:, :-1, :-1], w[:, 1:, :-1], w[:, :-1, 1:], w[:, 1:, 1:]])
+    camera = session.camera
+    rows, columns = np.mgrid[0 : camera.height : BLOCK_PX, 0 : camera.width : BLOCK_PX]
+    blocks = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    w = session.tile_misfits(0, FINER, blocks, BLOCK_PX)
+    corners = np.stack([w[..., :-1, :-1], w[..., 1:, :-1], w[..., :-1, 1:], w[..., 1:, 1:]])
     with np.errstate(invalid="ignore"):
         may = ((corners.min(axis=0) <= 0) & (corners.max(axis=0) >= 0)).all(axis=0)
-    rows, columns = np.nonzero(may)
-    seeds = (np.stack([columns, rows], axis=1) + 1.0 - maps.margin) / FINER
+    own, below, right = np.nonzero(may)
+    seeds = blocks[own] + np.stack([right, below], axis=1) / FINER
     found = glints._newton(session, seeds, session.scene.rig.true_mm()[0])
     return glints.distinct(found[session.camera.contains(found)], glints.SAME_PX)
 

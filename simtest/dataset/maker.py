@@ -20,7 +20,7 @@ from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, Picture
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import RenderedView, render_view, shows_isolated
+from simtest.simulation.rendered_view import RenderedView, has_quick_look, may_show, render_view, shows_isolated
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
@@ -91,21 +91,27 @@ class Maker:
         return Sample(meta, images)
 
     def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
-        """Draw until the frame shows enough isolated highlights, judged by one ray per pixel and direct light."""
+        """Draw until the frame shows enough isolated highlights; the last draw is taken as it is."""
         dataset = self.plan.dataset
-        attempt, drawn = 0, self.plan.draw(index)
-        while dataset.highlights and attempt + 1 < dataset.tries and not self._shows_enough(drawn):
-            attempt += 1
+        attempt, last = 0, dataset.tries - 1 if dataset.highlights else 0
+        while True:
             drawn = self.plan.draw(index, attempt)
-        session = self._at(drawn)
-        frame = session.frame()
-        return drawn, attempt, render_view(session, drawn.scene, frame.radiance), frame
+            if attempt == last or self._promises(drawn):
+                session = self._at(drawn)
+                frame = session.frame()
+                view = render_view(session, drawn.scene, frame.radiance)
+                if attempt == last or has_quick_look(drawn.scene) or view.isolated >= dataset.highlights:
+                    return drawn, attempt, view, frame
+            attempt += 1
 
-    def _shows_enough(self, drawn: Drawn) -> bool:
-        # A cheap look, since an attempt may be rejected: one ray per pixel and direct light.
+    def _promises(self, drawn: Drawn) -> bool:
+        """Return whether a draw is worth its frame: by a quick look, or, where that saves nothing, by geometry."""
+        least = self.plan.dataset.highlights
+        if not has_quick_look(drawn.scene):
+            return may_show(self._at(drawn), drawn.scene, least)
         quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
         scene = drawn.scene.model_copy(update={"render": quick})
-        return shows_isolated(self._at(replace(drawn, scene=scene)), scene, self.plan.dataset.highlights)
+        return shows_isolated(self._at(replace(drawn, scene=scene)), scene, least)
 
     def _at(self, drawn: Drawn) -> Session:
         """Return the session, updated to a scene."""

@@ -43,7 +43,7 @@ class FileEntry:
 
 @dataclass
 class Manifest:
-    """Record of a dataset's folder, updated after each file.
+    """Record of a dataset's folder, updated as files are finished.
 
     Parameters
     ----------

@@ -38,6 +38,11 @@ SHARDS_PER_PROCESS = 8
 """After so many a process is replaced, since rebuilding scenes in a loop grows memory."""
 
 
+UNSAVED_SHARE = 0.05
+"""The manifest is written again when more than this share of its shards is new: a file of n shards for every one of n
+would be quadratic. After a kill the shards that it lacks are read and entered; none is made again."""
+
+
 @dataclass(frozen=True)
 class ShardTask:
     """Argument of `write_shard`: folder, specification as JSON, index among the plan's shards, and Mitsuba variant."""
@@ -98,9 +103,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         # The tables of a dataset that was complete before no longer fit.
         manifest.tables = {}
         manifest.save(folder)
-    for done_task, entry in engine.run(write_shard, tasks, step):
-        manifest.shards[plan.shards[missing[done_task]].name] = entry
-        manifest.save(folder)
+    _write_shards(plan, manifest, folder, engine.run(write_shard, tasks, step), missing)
     # tables and card, of all shards
     if not manifest.tables or not all((folder / name).exists() for name in manifest.tables):
         if progress:
@@ -112,6 +115,23 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     # parts of interrupted runs
     for left in folder.glob(f"*{PART}*"):
         left.unlink(missing_ok=True)
+
+
+def _write_shards(
+    plan: Plan, manifest: Manifest, folder: Path, finished: Iterator[tuple[int, FileEntry]], missing: list[int]
+) -> None:
+    """Enter shards into the manifest as they are finished; the manifest is saved whatever ends the run, but a kill."""
+    unsaved = 0
+    try:
+        for task, entry in finished:
+            manifest.shards[plan.shards[missing[task]].name] = entry
+            unsaved += 1
+            if unsaved > UNSAVED_SHARE * len(manifest.shards):
+                manifest.save(folder)
+                unsaved = 0
+    finally:
+        if unsaved:
+            manifest.save(folder)
 
 
 def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:

@@ -24,6 +24,10 @@ NEAR_PX = 1.5
 GRID_WAVE = 6.0
 """Steps of the seeds' grid per wave of the finest band; pixels that are wider are divided."""
 
+TILE_PX, VARIES = 4, 0.5
+"""Pixels along the side of the tiles that are divided: those in which no component of the misfit is farther from 0 than
+this share of its range over the tile and the pixels round it."""
+
 MAX_DIVISION = 4
 LEAST_WAVE_PX = 1.5
 """Pixels are divided by at most this. Relief whose waves are shorter than this many px is not resolved there, and acts
@@ -84,34 +88,74 @@ def _seeds(session: "Session", index: int) -> Array:
     resolved = waves >= LEAST_WAVE_PX
     if not resolved.any():
         return np.empty((0, 2))
-    # As fine as most of the resolved part of the frame needs.
+    # As fine as most of the resolved part of the frame needs; where one cell a pixel will do its own maps serve.
     parts = int(np.clip(np.ceil(GRID_WAVE / np.percentile(waves[resolved][::8], 10)), 1, MAX_DIVISION))
-    if parts == 1:
-        maps, light = session.misfits(), index
-    else:
-        maps, light = session.fine_misfits(parts, index), 0
-    seeds = _grid_seeds(maps.fine[light], maps.margin, parts)
+    maps = session.misfits()
+    w, margin = maps.fine[index][:, None], maps.margin
+    first = np.zeros((1, 2), dtype=np.int64)
+    if parts > 1:
+        tiles = tiles_near_zeros(maps.fine[index])
+        if not len(tiles):
+            return np.empty((0, 2))
+        w, first = session.tile_misfits(index, parts, tiles - margin, TILE_PX), tiles * parts - 1
+    seeds = _grid_seeds(w, first, margin * parts, parts)
     height, width = waves.shape
     rows, columns = (np.clip(seeds[:, axis].astype(int), 0, size - 1) for axis, size in ((1, height), (0, width)))
     return seeds[resolved[rows, columns]]
 
 
-def _grid_seeds(w: Image, margin: int, parts: int) -> Array:
-    """Return the seeds, shape (N, 2), px, of a misfit's map, shape (2, h, w), of pixels divided into `parts`."""
+def tiles_near_zeros(w: Image) -> IntArray:
+    """Return the first columns and rows, shape (T, 2), of the tiles of a map in which the misfit may have a zero.
+
+    Those are left out in which one component, of shape (h, w) in `w`, is farther from 0 than it varies.
+    """
+    low, high = w, w
+    for axis in (1, 2):
+        # From one pixel before each tile to one after it.
+        count = -(-w.shape[axis] // TILE_PX)
+        wide = [(0, 0), (0, 0), (0, 0)]
+        wide[axis] = (1, count * TILE_PX + 1 - w.shape[axis])
+        low, high = np.pad(low, wide, mode="edge"), np.pad(high, wide, mode="edge")
+        windows = [np.arange(count) * TILE_PX + offset for offset in range(TILE_PX + 2)]
+        low = np.fmin.reduce([np.take(low, own, axis=axis) for own in windows])
+        high = np.fmax.reduce([np.take(high, own, axis=axis) for own in windows])
+    slack = VARIES * (high - low)
+    rows, columns = np.nonzero(((low <= slack) & (high >= -slack)).all(axis=0))
+    return np.stack([columns, rows], axis=1) * TILE_PX
+
+
+def _grid_seeds(w: Image, first: IntArray, margin: int, parts: int) -> Array:
+    """Return the seeds, shape (N, 2), px, of grids of a misfit of pixels divided into `parts`.
+
+    The misfit is of shape (2, T, h, w). `first` are columns and rows, shape (T, 2), of the grids' first cells in a map
+    that begins `margin` cells before the frame.
+    """
     # Newton steps from central differences.
-    along_x, along_y = (w[:, 1:-1, 2:] - w[:, 1:-1, :-2]) / 2, (w[:, 2:, 1:-1] - w[:, :-2, 1:-1]) / 2
-    inner = w[:, 1:-1, 1:-1]
+    inner = w[..., 1:-1, 1:-1]
+    along_x = (w[..., 1:-1, 2:] - w[..., 1:-1, :-2]) / 2
+    along_y = (w[..., 2:, 1:-1] - w[..., :-2, 1:-1]) / 2
     determinant = along_x[0] * along_y[1] - along_x[1] * along_y[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         step_x = (along_y[0] * inner[1] - along_y[1] * inner[0]) / determinant
         step_y = (along_x[1] * inner[0] - along_x[0] * inner[1]) / determinant
         short = (np.abs(step_x) < NEAR_PX) & (np.abs(step_y) < NEAR_PX)
-    rows, columns = np.nonzero(short)
-    stepped = np.stack([columns + 1.5 + step_x[short], rows + 1.5 + step_y[short]], axis=1)
+    cells, order = _in_rows(np.nonzero(short), first)
+    stepped = cells + 1.5 + np.stack([step_x[short], step_y[short]], axis=1)[order]
     # Cells in which the interpolated misfit has its zero, where differences over two pixels are too coarse.
-    rows, columns = crossed(w)
-    seeds = (np.concatenate([np.stack([columns + 1.0, rows + 1.0], axis=1), stepped]) - margin) / parts
+    crossing, _ = _in_rows(crossed(w), first)
+    seeds = (np.concatenate([crossing + 1.0, stepped]) - margin) / parts
     return distinct(seeds, SAME_SEED_PX / parts)
+
+
+def _in_rows(cells: tuple[IntArray, ...], first: IntArray) -> tuple[IntArray, IntArray]:
+    """Return columns and rows, shape (N, 2), in one map, of cells by grid, row and column, row by row; and the order.
+
+    Whatever the grids, the same cells come in the same order.
+    """
+    grid, row, column = cells
+    whole = np.stack([column, row], axis=1) + first[grid]
+    order = np.lexsort((whole[:, 0], whole[:, 1]))
+    return whole[order], order
 
 
 def _newton(session: "Session", seeds: Array, light: Array) -> Array:

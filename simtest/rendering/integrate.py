@@ -11,9 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import PIXEL_CENTRE
 from simtest.rendering.direct import DirectLight, Material
-from simtest.rendering.frames import MisfitMaps, Radiance
+from simtest.rendering.frames import Radiance
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
@@ -23,7 +22,7 @@ from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import CHANNELS, ShapeLabels
-from simtest.runtime.arrays import Array, Image
+from simtest.runtime.arrays import Image
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
@@ -35,9 +34,6 @@ LANES = 2**22
 
 RAYS = 2**24
 """Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between launches."""
-
-MARGIN_PX = 2
-"""How far maps of the misfit reach beyond the frame."""
 
 PAINT_EVERY, SAME_PATCH = 3, 0.02
 """Samples that share an albedo, and how far apart they may lie, as a share of the distance. Every fourth sample of the
@@ -97,7 +93,7 @@ class Tracer:
         """How many sets of channels the radiance has: that of the surface, and that of instruments if there are any."""
         return 1 if self.instruments is None else 2
 
-    def _hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
+    def hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
         preliminary = self.scene.ray_intersect_preliminary(rays.traced, True, rays.active)
@@ -166,9 +162,9 @@ class Tracer:
         pixels = camera.width * camera.height
         rows: list[list[Image]] = []
         count_of_parts = 0
-        for block, (first, count) in enumerate(_blocks(pixels)):
+        for block, (first, count) in enumerate(blocks_of(pixels)):
             lanes = self.sightlines.lanes(first, count, False, 0)
-            rays, preliminary, hit = self._hit(*self.sightlines.centre(lanes), labels is not None)
+            rays, preliminary, hit = self.hit(*self.sightlines.centre(lanes), labels is not None)
             # Radiance and labels of one launch go into one kernel.
             drawer = self.light.drawer(None)
             draw = None if drawer is None else drawer.at(0)
@@ -176,7 +172,7 @@ class Tracer:
             count_of_parts = len(parts)
             if labels is not None:
                 parts = parts + labels.trace(preliminary, hit, rays, self.sightlines.camera_from_model, self.relief)
-            rows.append(_evaluate(parts, count))
+            rows.append(evaluate(parts, count))
             if progress:
                 progress(first + count, pixels, "rendering")
         maps = self._maps(rows)
@@ -189,7 +185,7 @@ class Tracer:
         mi, camera = self.mi, self.sightlines.camera
         depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
         rows: list[list[Image]] = []
-        for first, count in _blocks(camera.width * camera.height):
+        for first, count in blocks_of(camera.width * camera.height):
             own = slice(first, first + count)
             preliminary = dr.zeros(mi.PreliminaryIntersection3f, count)
             preliminary.t = mi.Float(np.nan_to_num(depth[own], nan=np.inf))
@@ -199,7 +195,7 @@ class Tracer:
             rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
             hit = self._points(rays, preliminary, True)
             rotation = self.sightlines.camera_from_model
-            rows.append(_evaluate(labels.trace(preliminary, hit, rays, rotation, self.relief), count))
+            rows.append(evaluate(labels.trace(preliminary, hit, rays, rotation, self.relief), count))
         return self._maps(rows)
 
     def _maps(self, rows: list[list[Image]]) -> list[Image]:
@@ -207,36 +203,6 @@ class Tracer:
         shape = (self.sightlines.camera.height, self.sightlines.camera.width)
         return [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
                 for pieces in zip(*rows, strict=True)]  # fmt: skip
-
-    def misfits(self, lights: Array, division: int, base: bool) -> MisfitMaps:
-        """Trace the misfits for lights, shape (L, 3), camera frame, mm, at the centres of pixels divided both ways.
-
-        Without `base` only those of the fine normal.
-        """
-        import drjit as dr
-
-        mi, camera = self.mi, self.sightlines.camera
-        margin = MARGIN_PX * division
-        height, width = camera.height * division + 2 * margin, camera.width * division + 2 * margin
-        sources = [mi.Vector3f(*light.tolist()) for light in lights]
-        dr.make_opaque(sources)
-        rows: list[list[Image]] = []
-        for first, count in _blocks(height * width):
-            start, across = mi.UInt32(first), mi.UInt32(width)
-            dr.make_opaque(start, across)
-            index = dr.arange(mi.UInt32, count) + start
-            row = index // across
-            x, y = ((mi.Float(i) + PIXEL_CENTRE) / division - MARGIN_PX for i in (index - row * across, row))
-            rays, _, hit = self._hit(x, y)
-            values = [hit.base.t]
-            for si in (hit.fine, hit.base) if base and self.relief is not None else (hit.fine,):
-                normal = self.sightlines.camera_from_model @ mi.Vector3f(si.sh_frame.n)
-                values += [part for light in sources for part in _misfit(mi, rays.sightline, hit.base.t, normal, light)]
-            rows.append(_evaluate([dr.select(hit.base.is_valid(), value, dr.nan) for value in values], count))
-        channels = [np.concatenate(pieces).reshape(height, width) for pieces in zip(*rows, strict=True)]
-        shape = (-1, len(lights), 2, height, width)
-        both = np.stack(channels[1:]).reshape(shape)
-        return MisfitMaps(channels[0], both[0], both[-1], margin)
 
     # Several samples ---------------------------------------------------------------------------------------------
 
@@ -257,7 +223,7 @@ class Tracer:
         height, width = self.sightlines.tiled_size
         camera = self.sightlines.camera
         # Trace: sums over the samples of each block of pixels.
-        blocks = list(_blocks(height * width))
+        blocks = list(blocks_of(height * width))
         lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
         channels = self._means(lanes, samples, own, bounces, _share_of(progress, height * width * len(own)))
         # Arrange: from tiles to rows, without what lies beyond the frame.
@@ -270,7 +236,7 @@ class Tracer:
         `tell` is called with how many samples have been traced.
         """
         blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
-                  for first, count in _blocks(len(pixels)))  # fmt: skip
+                  for first, count in blocks_of(len(pixels)))  # fmt: skip
         return self._means(blocks, samples, range(samples), None, tell)
 
     def _means(
@@ -290,7 +256,7 @@ class Tracer:
                     parts = self._looped(lanes, drawer, start, stop)
                 else:
                     parts = self._single(lanes, drawer, start, bounces, count, block)
-                added = np.stack(_evaluate(parts, count)).astype(np.float64)
+                added = np.stack(evaluate(parts, count)).astype(np.float64)
                 sums = added if sums is None else sums + added
                 traced += count * (stop - start)
                 if tell:
@@ -320,11 +286,11 @@ class Tracer:
             return [total + part for total, part in zip(sums, parts, strict=True)]
 
         def step(number: Any, *sums: Any) -> tuple[Any, ...]:
-            rays, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
             return number + 1, *light(rays, hit, number, None, sums)
 
         def painted_step(number: Any, held: Painted, *sums: Any) -> tuple[Any, ...]:
-            rays, _, hit = self._hit(*self.sightlines.sample(lanes, number))
+            rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
             held = self._paint(hit, number, held)
             return number + 1, held, *light(rays, hit, number, held[0], sums)
 
@@ -364,22 +330,12 @@ class Tracer:
 
         which = self.mi.UInt32(number)
         dr.make_opaque(which)
-        rays, _, hit = self._hit(*self.sightlines.sample(lanes, which))
+        rays, _, hit = self.hit(*self.sightlines.sample(lanes, which))
         draw = None if drawer is None else drawer.at(which)
         return self._parts(rays, hit, draw, bounces, count, block, number)
 
 
-def _misfit(mi: Any, sightline: Any, distance: Any, normal: Any, light: Any) -> tuple[Any, Any]:
-    """Compute normal minus bisector across sightlines, camera frame, as `highlights.misfit` does."""
-    import drjit as dr
-
-    bisector = dr.normalize(dr.normalize(light - sightline * distance) - sightline)
-    first, second = mi.coordinate_system(-sightline)
-    gap = normal - bisector
-    return dr.dot(first, gap), dr.dot(second, gap)
-
-
-def _blocks(pixels: int) -> Iterator[tuple[int, int]]:
+def blocks_of(pixels: int) -> Iterator[tuple[int, int]]:
     """Split a number of pixels into runs: first, count."""
     for first in range(0, pixels, LANES):
         yield first, min(LANES, pixels - first)
@@ -390,7 +346,7 @@ def _share_of(progress: Progress | None, total: int) -> Tell | None:
     return progress and (lambda traced: progress(traced, total, "rendering"))
 
 
-def _evaluate(values: list[Any], count: int) -> list[Image]:
+def evaluate(values: list[Any], count: int) -> list[Image]:
     """Compute all channels in one kernel; a constant one is broadcast."""
     import drjit as dr
 

@@ -133,16 +133,16 @@ def turned_pixels(camera: Camera, pixels: Array, turns: Array) -> Array:
     return camera.project(directions + turns[:, :1] * first + turns[:, 1:] * second)
 
 
-def crossed(w: Image) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the cells of a grid in which the linear misfit of a triangle half has its zero.
+def crossed(w: Image) -> tuple[IntArray, ...]:
+    """Return the indices of the cells of grids in which the linear misfit of a triangle half has its zero.
 
-    The misfit is of shape (2, h, w); a cell is named by its first corner.
+    The misfit is of shape (2, ..., h, w); a cell is named by its first corner: (grid,) row and column.
     """
-    corners = [w[:, :-1, :-1], w[:, :-1, 1:], w[:, 1:, :-1], w[:, 1:, 1:]]
+    corners = [w[..., :-1, :-1], w[..., :-1, 1:], w[..., 1:, :-1], w[..., 1:, 1:]]
     with np.errstate(invalid="ignore"):
         low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        rows, columns = np.nonzero(((low <= 0) & (high >= 0)).all(axis=0))
-    a, b, c, d = (corner[:, rows, columns] for corner in corners)
+        cells = np.nonzero(((low <= 0) & (high >= 0)).all(axis=0))
+    a, b, c, d = (np.stack([part[cells] for part in corner]) for corner in corners)
 
     def inside(*triangle: Image) -> Mask:
         p, q, r = triangle
@@ -150,4 +150,4 @@ def crossed(w: Image) -> tuple[IntArray, IntArray]:
         return np.asarray((signs >= 0).all(axis=0) | (signs <= 0).all(axis=0))
 
     held = inside(a, b, c) | inside(b, d, c)
-    return rows[held], columns[held]
+    return tuple(index[held] for index in cells)

@@ -26,12 +26,13 @@ from simtest.rendering.integrate import Progress, Tracer, as_radiance
 from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
 from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.misfit_grid import MisfitGrid, trace_grid
+from simtest.rendering.misfit_maps import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.rendering.shapes import make_shape
-from simtest.runtime.arrays import Array, Image
+from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.spec.motion import Motion
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
@@ -415,12 +416,12 @@ class Session:
     def misfits(self) -> MisfitMaps:
         """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
         if self._misfits is None:
-            self._misfits = self._tracer().misfits(self.scene.rig.true_mm(), 1, base=True)
+            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm())
         return self._misfits
 
-    def fine_misfits(self, division: int, light: int) -> MisfitMaps:
-        """Return the fine misfit of one light at the centres of pixels that are divided along both axes."""
-        return self._tracer().misfits(self.scene.rig.true_mm()[[light]], division, base=False)
+    def tile_misfits(self, light: int, division: int, corners: IntArray, size: int) -> Image:
+        """Return the fine misfit of one light in tiles of divided pixels (see `misfit_maps.trace_tiles`)."""
+        return trace_tiles(self._tracer(), self.scene.rig.true_mm()[light], division, corners, size)
 
     def truth(self, stride: int = 1) -> TruthMaps:
         """Return the ground truth at the centre of every pixel, or of every `stride`-th along both axes.

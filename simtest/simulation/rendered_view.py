@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from simtest.calibration import Calibration, NoiseModel
 from simtest.rendering import HighlightPoint, Radiance, Session, glints
+from simtest.rendering.light_points import DRAWN, FIXED
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
@@ -60,6 +61,11 @@ class RenderedView:
     def is_rough(self) -> bool:
         """Whether the surface carries a relief."""
         return self.scene.surface.relief is not None
+
+    @property
+    def isolated(self) -> int:
+        """How many isolated highlights it shows."""
+        return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -112,13 +118,32 @@ def render_picture(session: Session, scene: Scene) -> Image:
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
+def has_quick_look(scene: Scene) -> bool:
+    """Return whether a scene's frame of one sample a pixel and direct light is cheaper than its own.
+
+    It is not where a source of finite size is sampled by as many points at each centre as in the whole pixel: then the
+    frame that is kept is judged itself.
+    """
+    effort = scene.render
+    wide = any(light.source is not None for light in scene.rig.lights)
+    return effort.path_depth > 2 or not wide or effort.samples_per_pixel * DRAWN > FIXED
+
+
+def may_show(session: Session, scene: Scene, least: int) -> bool:
+    """Move a session to a scene, and return whether so many of its highlight points may be isolated at all.
+
+    Nothing is rendered: no frame of a scene for which this is false shows as many.
+    """
+    session.update(scene)
+    return sum(may_be_isolated(point) for point in session.highlights()) >= least
+
+
 def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
 
     The frame is rendered, with its labels, only where so many highlight points may be isolated at all.
     """
-    session.update(scene)
-    if sum(may_be_isolated(point) for point in session.highlights()) < least:
+    if not may_show(session, scene, least):
         return False
     radiance = session.labelled_radiance()
     highlights, _ = _judged(session, radiance, collect(radiance.total, scene.sensor, session.camera))

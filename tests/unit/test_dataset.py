@@ -15,11 +15,11 @@ from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES
-from simtest.dataset.manifest import NAME, new_manifest, read_manifest
+from simtest.dataset.manifest import NAME, FileEntry, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
-from simtest.dataset.shard_writer import write_dataset
+from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import repair_files, verify
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import make_engine
@@ -282,6 +282,45 @@ def test_a_finished_shard_that_the_manifest_lost_is_not_made_again(made, copy, m
     manifest = read_manifest(copy)
     manifest.shards.pop(sorted(manifest.shards)[0])
     manifest.save(copy)
+    monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
+    write_dataset(tiny(**SIX), copy, make_engine())
+    assert contents(copy) == contents(made)
+
+
+@pytest.fixture(scope="module")
+def many():
+    return Plan(tiny(samples=360, samples_per_anatomy=6, shard_mb=1e-6))
+
+
+@given(stop=st.integers(1, 360))
+@settings(max_examples=15, deadline=None)
+def test_the_manifest_is_written_in_proportion_to_the_shards_and_once_more_at_an_end(many, stop):
+    manifest, written = new_manifest(many, "llvm_ad_rgb"), []
+    manifest.save = lambda _: written.append(set(manifest.shards))
+
+    def finished():
+        for number in range(stop):
+            # A kill here leaves few shards to be read again.
+            assert len(manifest.shards) - len(written[-1] if written else ()) <= 0.05 * len(manifest.shards)
+            yield number, FileEntry(number, "")
+        raise StopError
+
+    with pytest.raises(StopError):
+        _write_shards(many, manifest, Path("unused"), finished(), list(range(len(many.shards))))
+    assert len(manifest.shards) == stop
+    assert written[-1] == set(manifest.shards)
+    # Each shard by itself would be stop (stop + 1) / 2 entries.
+    assert sum(map(len, written)) <= 25 * stop
+
+
+def test_shards_that_the_manifest_lacks_after_a_kill_are_not_made_again(copy, made, monkeypatch):
+    manifest = read_manifest(copy)
+    for name in manifest.tables:
+        (copy / name).unlink()
+    manifest.shards.clear()
+    manifest.tables.clear()
+    manifest.save(copy)
+    assert {fault.what for fault in verify(copy)} == {"not finished; the dataset's command goes on with it"}
     monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
     write_dataset(tiny(**SIX), copy, make_engine())
     assert contents(copy) == contents(made)

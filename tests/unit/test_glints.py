@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from simtest.rendering import Session, glints
 from simtest.simulation.rendered_view import render_view
@@ -58,6 +60,56 @@ def test_search_finds_what_an_exhaustive_one_finds(sessions, surface):
     found = glints.search(session, 0)
     missing = [zero for zero in boxed_zeros(session) if np.linalg.norm(found - zero, axis=1).min() > 0.3]
     assert missing == []
+
+
+FINE = {"bands": [{"slope_deg": 5.0, "wavelength_mm": 0.4}], "seed": 3}
+"""Its waves span four pixels: they are divided."""
+
+
+@pytest.fixture(scope="module")
+def divided():
+    return Session(scene("plane", FINE))
+
+
+def test_search_by_tiles_is_that_of_the_whole_divided_frame(divided, monkeypatch):
+    found = glints.search(divided, 0)
+    tiles = glints.tiles_near_zeros(divided.misfits().fine[0])
+    assert len(found) > 50
+    assert 0 < len(tiles) < 0.7 * (CAMERA["width"] / 4 + 1) * (CAMERA["height"] / 4 + 1)
+    monkeypatch.setattr(glints, "VARIES", np.inf)
+    assert len(glints.tiles_near_zeros(divided.misfits().fine[0])) == 51 * 41
+    assert glints.search(divided, 0).tobytes() == found.tobytes()
+    # Too strict a choice loses some.
+    monkeypatch.setattr(glints, "VARIES", -0.4)
+    assert len(glints.search(divided, 0)) < len(found)
+
+
+def test_tiles_hold_the_frames_own_misfits(divided):
+    maps = divided.misfits()
+    corners = np.array([[0, 0], [196, 156], [64, 32], [100, 8]])
+    tiles = divided.tile_misfits(0, 1, corners, 4)
+    for number, (column, row) in enumerate(corners + maps.margin - 1):
+        expected = maps.fine[0][:, row : row + 6, column : column + 6]
+        np.testing.assert_allclose(tiles[:, number], expected, rtol=0, atol=1e-6)
+    # Of pixels cut in three, the middle cells have the pixels' own centres.
+    middle = divided.tile_misfits(0, 3, corners, 4)[:, :, 2:-1:3, 2:-1:3]
+    np.testing.assert_allclose(middle, tiles[:, :, 1:-1, 1:-1], rtol=0, atol=2e-4)
+
+
+@given(x=st.floats(0, 29.9), y=st.floats(0, 21.9), turn=st.floats(0, 6.28), holes=st.integers(0, 400))
+@settings(max_examples=30, deadline=None)
+def test_the_tile_of_a_zero_is_chosen_and_far_ones_are_not(x, y, turn, holes):
+    rows, columns = np.mgrid[0:22, 0:30] + 0.5
+    along, across = np.cos(turn) * (columns - x) + np.sin(turn) * (rows - y), rows - y - 0.3 * (columns - x)
+    w = np.stack([along, across]).astype(np.float32)
+    far = w + np.array([100.0, 0.0], dtype=np.float32)[:, None, None]
+    if np.hypot(rows[holes // 30 % 22, 0] - y, columns[0, holes % 30] - x) > 6:
+        w[:, holes // 30 % 22, holes % 30] = np.nan
+    chosen = glints.tiles_near_zeros(w).tolist()
+    assert [int(x) // 4 * 4, int(y) // 4 * 4] in chosen
+    assert len(chosen) < 25
+    assert len(glints.tiles_near_zeros(far)) == 0
+    assert len(glints.tiles_near_zeros(np.full_like(w, np.nan))) == 0
 
 
 def boxed_zeros(session, size=0.25):

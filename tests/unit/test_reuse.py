@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from simtest.dataset.maker import Maker
+from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session, found_highlights, glints, highlights
-from simtest.simulation.rendered_view import render_view, shows_isolated
+from simtest.simulation.rendered_view import has_quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
@@ -154,3 +154,47 @@ def test_a_frame_that_is_not_rendered_shows_too_few_highlights(family):
             answers.append(shows_isolated(session, drawn, least))
             assert answers[-1] == (shown >= least), (attempt, least)
     assert set(answers) == {True, False}
+
+
+# Which frames have a quick look ---------------------------------------------------------------------------------------
+
+DISC = {"source": {"type": "disc", "radius_mm": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("samples", "depth", "light", "quick"),
+    [
+        (16, 2, DISC, False),
+        (4, 2, DISC, False),
+        (1, 2, DISC, False),
+        (17, 2, DISC, True),
+        (4, 3, DISC, True),
+        (4, 2, {}, True),
+    ],
+)
+def test_a_quick_look_is_taken_where_it_costs_less_than_the_frame(samples, depth, light, quick):
+    drawn = scene(ROUGH, lights=[{**LIGHTS[0], **light}], samples=samples)
+    effort = drawn.render.model_copy(update={"path_depth": depth})
+    assert has_quick_look(drawn.model_copy(update={"render": effort})) is quick
+
+
+@pytest.mark.parametrize("tries", [8, 2])
+def test_wide_sources_are_judged_by_the_frame_that_is_kept(tries, monkeypatch):
+    bands = [{"slope_deg": 3.0, "wavelength_mm": 2.0}]
+    wide = {"rig.lights": [{**LIGHTS[0], **DISC}], "render.samples_per_pixel": 4, "surface.relief": {"bands": bands}}
+    tilts = {"surface.tilt_deg": {"low": 0.0, "high": 30.0}}
+    described = {"name": "wide", "samples": 2, "seed": 1, "tries": tries, "estimators": ["cone_axis"]}
+    described["families"] = [{"scene": "sphere", "set": SET | wide, "per_sample": tilts}]
+    plan = Plan(validate(Dataset, described | {"splits": {"train": 1, "validation": 0, "test": 0}}, "wide"))
+    monkeypatch.setattr("simtest.dataset.maker.shows_isolated", lambda *_: pytest.fail("looked at twice"))
+    maker, session, attempts = Maker(plan), Session(plan.draw(0).scene, colour_variant()), []
+    for index in range(2):
+        sample = maker.make(index)
+        # Each draw's whole frame, until one shows a highlight.
+        shown = []
+        while len(shown) < tries and not any(shown):
+            shown.append(render_view(session, plan.draw(index, len(shown)).scene).isolated)
+        assert sample.meta["attempt"] == len(shown) - 1
+        assert sum(bool(truth["isolated"]) for truth in sample.meta["highlights"]) == shown[-1]
+        attempts.append((len(shown) - 1, shown[-1]))
+    assert attempts == {8: [(3, 1), (0, 1)], 2: [(1, 0), (0, 1)]}[tries]
