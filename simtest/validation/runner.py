@@ -366,10 +366,10 @@ def _warn_of_another(job: _Job) -> None:
 
 def _record_in(folder: Path) -> dict[str, Any] | None:
     """Return how the finished run in a folder was made; None where there is none."""
-    if (folder / PARTS).is_dir():
-        # Beside the parts of a stopped run anything may be incomplete.
-        return None
     try:
+        if (folder / PARTS).is_dir():
+            # Beside the parts of a stopped run anything may be incomplete.
+            return None
         record = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
         return dict(record) if "fingerprint" in record else None
     except (OSError, ValueError, KeyError, TypeError):
