@@ -15,7 +15,7 @@ from simtest.surfaces.mesh_geometry import area_vectors, face_edges
 from simtest.surfaces.model import RayHits, TriangleMesh
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.tube import Tube
+from simtest.surfaces.tube import Tube, TubeChart
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
@@ -197,6 +197,12 @@ class Colon(MeshedSurface):
         self.model_from_camera = lumen_pose(
             recipe.type, viewpoint, self._sites, self._build.clearance, self._build.probe.cast
         )
+
+    @property
+    def chart(self) -> TubeChart | None:
+        """The tube's parameters on the mesh (see `SurfaceModel.chart`); None with pedunculated polyps."""
+        tube = self._build.tube
+        return None if tube.has_stalks else TubeChart(tube, self._build.corners)
 
     def _sites(self, rng: Generator) -> Array:
         """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
