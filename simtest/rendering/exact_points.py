@@ -107,6 +107,11 @@ def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHit
     Normals and curvatures are those of the `fine` surface, or else of its base.
     """
     exact = (surface.fine_points if fine else surface.points)(np.asarray(origins), directions, hits)
+    return in_camera(surface, exact)
+
+
+def in_camera(surface: SurfaceModel, exact: SurfacePoints) -> SurfacePoints:
+    """Turn points of the model frame to the camera frame."""
     rotation = surface.model_from_camera[:3, :3]
     return replace(
         exact,

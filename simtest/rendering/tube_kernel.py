@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from simtest.runtime.arrays import Array
-from simtest.surfaces import RayHits, SurfacePoints
+from simtest.surfaces import RayHits
 from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
 
 BLOCK = 2**17
@@ -21,6 +21,13 @@ BLOCK = 2**17
 
 END_MM = 1.0
 """How far beyond the tube's ends a solution may lie (see `Tube.solve`)."""
+
+_FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
+    **dict.fromkeys(("distance", "k_min", "k_max"), ((), float)),
+    **dict.fromkeys(("position", "normal", "direction_min", "direction_max"), ((3,), float)),
+    **dict.fromkeys(("pool", "valid"), ((), bool)),
+}
+"""What `TubeKernel.solve` returns: shapes of a point's values, and their types."""
 
 _TINY = float(np.finfo(float).tiny)
 
@@ -55,7 +62,7 @@ class _Table:
     """Rows of numbers that a kernel gathers."""
 
     def __init__(self, mi: Any, rows: Array) -> None:
-        self.mi, (self.length, self.columns) = mi, rows.shape
+        self.mi, self.columns = mi, rows.shape[1]
         self._values = mi.Float64(np.ascontiguousarray(rows, dtype=np.float64).ravel())
 
     def row(self, index: Any, active: Any = True) -> list[Any]:
@@ -85,7 +92,8 @@ class TubeKernel:
         self._folds, self._panels = _Table(mi, numbers.folds), _Table(mi, numbers.panels)
         self._waves = _Table(mi, numbers.waves) if len(numbers.waves) else None
         self._corners = _Table(mi, chart.corners.reshape(-1, 2))
-        self._n = {name: mi.Float64(value) for name, value in numbers.constants.items()}
+        constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
+        self._n = {name: mi.Float64(value) for name, value in constants.items()}
         self._counts = {"folds": mi.UInt32(len(numbers.folds)), "waves": mi.UInt32(len(numbers.waves))}
         # Opaque, so that another colon compiles no new kernel.
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
@@ -95,6 +103,9 @@ class TubeKernel:
 
         Returns the fields of `SurfacePoints` that are not the base's own.
         """
+        if not len(origins):
+            # Dr.Jit ends the process on a kernel without rays.
+            return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
         import drjit as dr
 
         mi = self.mi
@@ -131,9 +142,11 @@ class TubeKernel:
             dt = dr.dot(miss, dr.cross(pu, pv)) * inverse
             done = dr.squared_norm(miss) < NEWTON_TOLERANCE_MM**2
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
-            scale = dr.select(done, 0, dr.minimum(1, MAX_SHIFT_MM / dr.maximum(dr.abs(dt), _TINY)))
+            scale = dr.minimum(1, MAX_SHIFT_MM / dr.maximum(dr.abs(dt), _TINY))
             found |= active & done
-            u, v, t = (dr.select(active & ~done, a, b) for a, b in ((u - scale * du, u), (v - scale * dv, v), (t + scale * dt, t)))
+            scale = dr.select(active & ~done, scale, 0)
+            # 0 times the NaN of a singular matrix is NaN: such a ray is given up.
+            u, v, t = u - scale * du, v - scale * dv, t + scale * dt
             # A ray that leaves the neighbourhood of its hit is given up.
             active &= ~done & (dr.abs(t - start) <= MAX_SHIFT_MM)
             step += 1
@@ -210,8 +223,7 @@ class TubeKernel:
         bend = n["rate"] + n["sway"] * n["omega"] * turning
         twist = -n["sway"] * dr.square(n["omega"]) * swaying
         # Polynomials about the nearest knot; x and z stand side by side.
-        last = self._panels.length - 1
-        knot = dr.clip(dr.round(u / n["spacing"]), 0, last)
+        knot = dr.clip(dr.round(u / n["spacing"]), 0, n["last_knot"])
         start_x, start_z, *powers = self._panels.row(mi.UInt32(knot))
         share = (u - knot * n["spacing"]) / (n["spacing"] / 2)
         x, z = powers[-2], powers[-1]
@@ -294,7 +306,7 @@ def _arrays(mi: Any, values: dict[str, Any], found: Any) -> dict[str, Array]:
     flat = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
     flat = {name: dr.ravel(value) if dr.depth_v(value) > 1 else value for name, value in flat.items()}
     dr.eval(flat, found)
-    arrays: dict[str, Array] = {"valid": np.array(found)}
+    arrays: dict[str, Array] = {"valid": np.array(found), "pool": np.zeros(len(found), dtype=bool)}
     for name, value in flat.items():
         rows = np.array(value)
         arrays[name] = rows.reshape(-1, 3) if dr.depth_v(values[name]) > 1 else rows
