@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from simtest.rendering.lanes import lanes
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits
 from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
@@ -109,13 +110,14 @@ class TubeKernel:
         import drjit as dr
 
         mi = self.mi
-        origin, direction = (mi.Vector3d(np.ascontiguousarray(v.T)) for v in (origins, directions))
-        start = mi.Float64(hits.distance)
+        origin, direction = (
+            mi.Vector3d(*(lanes(mi.Float64, part, np.float64) for part in rays.T)) for rays in (origins, directions)
+        )
+        start = lanes(mi.Float64, hits.distance, np.float64)
         valid = dr.isfinite(start)
-        weights = np.ascontiguousarray(hits.barycentric, dtype=np.float64)
-        second, third = mi.Float64(weights[:, 0].copy()), mi.Float64(weights[:, 1].copy())
+        second, third = (lanes(mi.Float64, part, np.float64) for part in hits.barycentric.T)
         # (u, v) of the hit in its triangle
-        face = mi.UInt32(hits.face.astype(np.uint32))
+        face = lanes(mi.UInt32, hits.face, np.uint32)
         corners = [self._corners.row(3 * face + i, valid) for i in range(3)]
         shares = (1 - second - third, second, third)
         u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
