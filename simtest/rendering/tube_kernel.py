@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering.lanes import lanes
+from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits
 from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
@@ -111,13 +111,13 @@ class TubeKernel:
 
         mi = self.mi
         origin, direction = (
-            mi.Vector3d(*(lanes(mi.Float64, part, np.float64) for part in rays.T)) for rays in (origins, directions)
+            vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in (origins, directions)
         )
-        start = lanes(mi.Float64, hits.distance, np.float64)
+        start = to_kernel(mi.Float64, hits.distance, np.float64)
         valid = dr.isfinite(start)
-        second, third = (lanes(mi.Float64, part, np.float64) for part in hits.barycentric.T)
+        second, third = (to_kernel(mi.Float64, part, np.float64) for part in hits.barycentric.T)
         # (u, v) of the hit in its triangle
-        face = lanes(mi.UInt32, hits.face, np.uint32)
+        face = to_kernel(mi.UInt32, hits.face, np.uint32)
         corners = [self._corners.row(3 * face + i, valid) for i in range(3)]
         shares = (1 - second - third, second, third)
         u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
@@ -305,11 +305,9 @@ def _arrays(mi: Any, values: dict[str, Any], found: Any) -> dict[str, Array]:
     """Return lanes as arrays of double precision, NaN where there is no point."""
     import drjit as dr
 
-    flat = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
-    flat = {name: dr.ravel(value) if dr.depth_v(value) > 1 else value for name, value in flat.items()}
-    dr.eval(flat, found)
+    kept = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
+    dr.eval(kept, found)
     arrays: dict[str, Array] = {"valid": np.array(found), "pool": np.zeros(len(found), dtype=bool)}
-    for name, value in flat.items():
-        rows = np.array(value)
-        arrays[name] = rows.reshape(-1, 3) if dr.depth_v(values[name]) > 1 else rows
+    for name, value in kept.items():
+        arrays[name] = vectors_from_kernel(value, np.float64) if dr.depth_v(value) > 1 else np.array(value)
     return arrays
