@@ -21,6 +21,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.kept_arrays import kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, rough_edges
@@ -251,15 +252,20 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     InputError
         If the recipe gives no body, or one too large for the grid.
     """
+    body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
+    arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
+    digest = blake2b(key.encode(), digest_size=12).hexdigest()
+    return BuiltLiver(TriangleMesh(**arrays), f"liver-{digest}", body)
+
+
+def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:
+    """Make the mesh of a level set (see `build`)."""
     # marching cubes, made even, then split where the surface bends sharply
-    body = Body(recipe)
     vertices, faces = _march(body, GRID_MM if edge_mm is None else edge_mm)
     vertices = _even(body, vertices, faces)
     for _ in range(_SPLITS if edge_mm is None else 0):
         vertices, faces = _split(body, vertices, faces)
-    normals = body.normals(vertices)
-    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
-    return BuiltLiver(TriangleMesh(vertices, faces, normals), f"liver-{digest}", body)
+    return TriangleMesh(vertices, faces, body.normals(vertices))
 
 
 def _march(body: Body, spacing: float) -> tuple[Array, IntArray]:
