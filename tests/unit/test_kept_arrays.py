@@ -14,7 +14,7 @@ from simtest.runtime.kept_arrays import cache_folder, kept
 from simtest.runtime.resources import find
 from simtest.spec.surface import PlaneSurface
 from simtest.spec.tissue_colour import TissueColour
-from simtest.surfaces import liver, tissue_pattern
+from simtest.surfaces import colon, liver, tissue_pattern
 from simtest.surfaces.analytic import Plane
 from simtest.surfaces.recipe import load_recipe
 
@@ -172,19 +172,22 @@ def test_several_processes_at_once(folder):
     assert len(list(folder.iterdir())) == 4
 
 
-def test_a_liver_is_the_same_from_disk(folder):
-    recipe = load_recipe(find("liver", "meshes"))
+@pytest.mark.parametrize(("name", "module"), [("liver", liver), ("colon", colon)])
+def test_an_anatomy_is_the_same_from_disk(folder, name, module):
+    recipe = load_recipe(find(name, "meshes"))
     builds = []
     for _ in range(2):
-        liver.build.cache_clear()
-        builds.append(liver.build(recipe, 4.0))
-    liver.build.cache_clear()
+        module.build.cache_clear()
+        builds.append(module.build(recipe, 4.0))
+    module.build.cache_clear()
     assert len(list(folder.iterdir())) == 1
     for name, values in vars(builds[0].mesh).items():
         found = getattr(builds[1].mesh, name)
         assert found is not values
         assert (found.dtype, found.tobytes()) == (values.dtype, values.tobytes())
     assert builds[0].key == builds[1].key
+    if name == "colon":
+        assert builds[0].corners.tobytes() == builds[1].corners.tobytes()
 
 
 def test_a_pattern_is_the_same_from_disk(folder):
