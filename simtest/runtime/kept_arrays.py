@@ -13,7 +13,8 @@ import time
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
@@ -41,6 +42,8 @@ SOURCES = ("surfaces", "geometry", "spec", "runtime/seeds.py")
 """Below simtest/: what the arrays are made by."""
 
 LIBRARIES = ("numpy", "scipy", "scikit-image")
+
+_keeping: ContextVar[bool] = ContextVar("keeping", default=True)
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -72,9 +75,19 @@ def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
         arrays = make()
     for warning in caught:
         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    if not caught:
+    if not caught and _keeping.get():
         _write(path, arrays)
     return arrays
+
+
+@contextlib.contextmanager
+def only_reading() -> Iterator[None]:
+    """Within it nothing more is kept: for what is made once and never again, such as a dataset's anatomies."""
+    before = _keeping.set(False)
+    try:
+        yield
+    finally:
+        _keeping.reset(before)
 
 
 def cache_folder() -> Path | None:

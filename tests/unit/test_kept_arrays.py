@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from simtest.runtime import kept_arrays
-from simtest.runtime.kept_arrays import cache_folder, kept
+from simtest.runtime.kept_arrays import cache_folder, kept, only_reading
 from simtest.runtime.resources import find
+from simtest.spec.relief import Relief, ReliefBand
 from simtest.spec.surface import PlaneSurface
 from simtest.spec.tissue_colour import TissueColour
-from simtest.surfaces import colon, liver, tissue_pattern
+from simtest.surfaces import colon, liver, relief_field, tissue_pattern
 from simtest.surfaces.analytic import Plane
 from simtest.surfaces.recipe import load_recipe
 
@@ -160,6 +161,19 @@ def test_what_warns_is_not_kept_and_warns_each_time(folder):
     assert not folder.exists()
 
 
+def test_only_reading_keeps_nothing_more(folder):
+    make, calls = counted()
+    kept("kind", "one", make)
+    with only_reading():
+        assert_same(kept("kind", "one", make))
+        assert len(calls) == 1
+        assert_same(kept("kind", "two", make))
+    assert len(calls) == 2
+    assert len(list(folder.iterdir())) == 1
+    kept("kind", "two", make)
+    assert len(list(folder.iterdir())) == 2
+
+
 def test_several_processes_at_once(folder):
     code = (
         "import numpy as np; from simtest.runtime.kept_arrays import kept\n"
@@ -188,6 +202,21 @@ def test_an_anatomy_is_the_same_from_disk(folder, name, module):
     assert builds[0].key == builds[1].key
     if name == "colon":
         assert builds[0].corners.tobytes() == builds[1].corners.tobytes()
+
+
+def test_a_relief_is_the_same_from_disk(folder):
+    bands = (ReliefBand(wavelength_mm=1.0, slope_deg=4.0), ReliefBand(wavelength_mm=0.4, slope_deg=2.0, kind="pits"))
+    fields = []
+    for _ in range(2):
+        relief_field._make_field.cache_clear()
+        fields.append(relief_field.make_relief(Relief(bands=bands, seed=3)))
+    relief_field._make_field.cache_clear()
+    assert len(list(folder.iterdir())) == 1
+    assert fields[0] is not fields[1]
+    assert (fields[0].deviation, fields[0].finest_wave) == (fields[1].deviation, fields[1].finest_wave)
+    for first, second in zip(fields[0].bands, fields[1].bands, strict=True):
+        for name in ("lattice_from_model", "coefficients", "diffused"):
+            assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
 
 
 def test_a_pattern_is_the_same_from_disk(folder):
