@@ -1,8 +1,12 @@
 """What tests share: the rendering backend's cache, and where the reference meshes lie."""
 
+import os
 from pathlib import Path
 
 import pytest
+
+# Tests change constants and functions that the key of a kept array does not know of.
+os.environ["SIMTEST_CACHE"] = "off"
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 

@@ -18,6 +18,7 @@ from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, Picture
+from simtest.runtime.kept_arrays import only_reading
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import RenderedView, has_quick_look, may_show, render_view, shows_isolated
@@ -120,10 +121,12 @@ class Maker:
             self._session = None
             forget_meshes()
             backend.release_memory()
-        if self._session is None:
-            self._anatomy = drawn.anatomy
-            self._session = Session(drawn.scene, self._variant, labelled=True)
-        self._session.update(drawn.scene)
+        # For the same reason nothing of it is kept on disk.
+        with only_reading():
+            if self._session is None:
+                self._anatomy = drawn.anatomy
+                self._session = Session(drawn.scene, self._variant, labelled=True)
+            self._session.update(drawn.scene)
         return self._session
 
     def _estimates(

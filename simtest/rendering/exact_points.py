@@ -7,6 +7,7 @@ import numpy as np
 
 from simtest.rendering.frames import TruthMaps
 from simtest.rendering.hits import make_hit
+from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
@@ -50,9 +51,9 @@ def trace_hits(
     hits = pack_hits(
         np.where(missed, np.nan, np.array(preliminary.t)),
         np.array(preliminary.prim_index),
-        np.array(preliminary.prim_uv).T,
+        vectors_from_kernel(preliminary.prim_uv, np.float32),
     )
-    shading, geometric = (np.array(n, dtype=np.float64).T for n in normals)
+    shading, geometric = (vectors_from_kernel(n, np.float64) for n in normals)
     if shape.kind == "mesh":
         # A triangle may be seen from behind.
         with np.errstate(invalid="ignore"):
@@ -75,7 +76,7 @@ def trace_starts(mi: Any, scene: Any, origins: Array, directions: Array) -> RayH
     return pack_hits(
         np.where(np.array(valid), np.array(preliminary.t), np.nan),
         np.array(preliminary.prim_index),
-        np.array(preliminary.prim_uv).T,
+        vectors_from_kernel(preliminary.prim_uv, np.float32),
     )
 
 
@@ -84,10 +85,10 @@ def _rays(mi: Any, origins: Array, directions: Array) -> tuple[Any, Any]:
     asked = np.asarray(np.isfinite(directions).all(axis=1) & np.isfinite(origins).all(axis=1))
     # No NaN may enter the renderer.
     ray = mi.Ray3f(
-        mi.Point3f(_columns(np.where(asked[:, None], origins, 0.0))),
-        mi.Vector3f(_columns(np.where(asked[:, None], directions, [0.0, 0.0, 1.0]))),
+        vectors_to_kernel(mi.Point3f, mi.Float, np.where(asked[:, None], origins, 0.0), np.float32),
+        vectors_to_kernel(mi.Vector3f, mi.Float, np.where(asked[:, None], directions, [0.0, 0.0, 1.0]), np.float32),
     )
-    return ray, mi.Bool(asked)
+    return ray, to_kernel(mi.Bool, asked, bool)
 
 
 def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
@@ -107,6 +108,11 @@ def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHit
     Normals and curvatures are those of the `fine` surface, or else of its base.
     """
     exact = (surface.fine_points if fine else surface.points)(np.asarray(origins), directions, hits)
+    return in_camera(surface, exact)
+
+
+def in_camera(surface: SurfaceModel, exact: SurfacePoints) -> SurfacePoints:
+    """Turn points of the model frame to the camera frame."""
     rotation = surface.model_from_camera[:3, :3]
     return replace(
         exact,
@@ -125,7 +131,3 @@ def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tu
     images = {name: values.reshape(*size, *values.shape[1:]) for name, values in maps.items()}
     none = np.zeros(size, dtype=np.uint8)
     return TruthMaps(**images, pool=points.pool.reshape(size), mask=points.valid.reshape(size), instrument=none)
-
-
-def _columns(values: Array) -> Any:
-    return np.ascontiguousarray(values.T, dtype=np.float32)

@@ -17,6 +17,7 @@ from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.hits import Hit, make_hit
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.instrument_kernel import InstrumentKernel
+from simtest.rendering.kernel_arrays import to_kernel
 from simtest.rendering.light_points import Draw, Drawer
 from simtest.rendering.mitsuba_values import channels
 from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
@@ -188,9 +189,9 @@ class Tracer:
         for first, count in blocks_of(camera.width * camera.height):
             own = slice(first, first + count)
             preliminary = dr.zeros(mi.PreliminaryIntersection3f, count)
-            preliminary.t = mi.Float(np.nan_to_num(depth[own], nan=np.inf))
-            preliminary.prim_index = mi.UInt32(face[own].view(np.uint32))
-            preliminary.prim_uv = mi.Point2f(*(mi.Float(share[own]) for share in place))
+            preliminary.t = to_kernel(mi.Float, np.nan_to_num(depth[own], nan=np.inf), np.float32)
+            preliminary.prim_index = to_kernel(mi.UInt32, face[own].view(np.uint32), np.uint32)
+            preliminary.prim_uv = mi.Point2f(*(to_kernel(mi.Float, share[own], np.float32) for share in place))
             preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
             rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
             hit = self._points(rays, preliminary, True)

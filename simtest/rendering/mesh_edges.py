@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
+from simtest.rendering.kernel_arrays import vectors_to_kernel
 from simtest.rendering.strokes import BEHIND, Strokes
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.surfaces import TriangleMesh
@@ -163,8 +164,10 @@ class MeshEdges:
         across = np.cross(along, directions)
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         starts = points + aside * reach * across
-        origins, ways = (np.ascontiguousarray(values.T, dtype=np.float32) for values in (starts, directions))
-        ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(ways))
+        ray = mi.Ray3f(
+            vectors_to_kernel(mi.Point3f, mi.Float, starts, np.float32),
+            vectors_to_kernel(mi.Vector3f, mi.Float, directions, np.float32),
+        )
         distance = np.array(self._scene.ray_intersect_preliminary(ray, True).t, dtype=np.float64)
         return starts + np.where(np.isfinite(distance), distance, np.nan)[:, None] * directions
 

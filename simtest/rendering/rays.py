@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera, ViewMask
+from simtest.rendering.kernel_arrays import to_kernel
 from simtest.runtime.arrays import Array, Mask
 
 Pixels = npt.NDArray[np.uint32]
@@ -144,7 +145,7 @@ class Sightlines:
         import drjit as dr
 
         mi = self.mi
-        index, salt = mi.UInt32(pixels), mi.UInt32(seed)
+        index, salt = to_kernel(mi.UInt32, pixels, np.uint32), mi.UInt32(seed)
         dr.make_opaque(salt)
         row = index // self._width
         return Lanes(index - row * self._width, row, *mi.sample_tea_32(index, salt))

@@ -440,7 +440,7 @@ class Session:
         if stride == 1:
             # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
             hits, shading, geometric = as_hits(self._centre_hits())
-            points = block_truth.solve(self.surface, *self.sightlines.in_view(pixels), hits)
+            points = block_truth.solve(self.mi, self.surface, *self.sightlines.in_view(pixels), hits)
         else:
             points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])

@@ -8,14 +8,15 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.runtime.kept_arrays import kept
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, off_between, rough_edges
 from simtest.surfaces.mesh_geometry import area_vectors, face_edges
 from simtest.surfaces.model import RayHits, TriangleMesh
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.tube import Tube
+from simtest.surfaces.tube import Tube, TubeChart
 
 TRIANGLES = 200_000
 """Size of the rendered mesh: edges of about 0.4 mm at the default sizes."""
@@ -98,8 +99,17 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     InputError
         If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
+    tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
+    arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
+    corners = arrays.pop("corners")
+    digest = blake2b(key.encode(), digest_size=12).hexdigest()
+    return BuiltColon(TriangleMesh(**arrays), f"colon-{digest}", tube, corners)
+
+
+def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
+    """Make vertices, faces and normals of the mesh, and (u, v) at its triangles' corners (see `build`)."""
     # cells, square on the bare tube
-    tube = Tube(recipe)
+    recipe = tube.recipe
     area = recipe.length_mm * 2 * math.pi * recipe.radius_mm
     cell = math.sqrt(2 * area / TRIANGLES) if edge_mm is None else edge_mm
     if (count := 2 * area / cell**2) > MAX_TRIANGLES:
@@ -129,8 +139,7 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     # A corner beyond the seam has v = 2 pi or a little more, while its vertex is that of v = 0.
     around = corners[:, :, 1]
     corners[:, :, 1] = np.where(around < around.max(axis=1, keepdims=True) - math.pi, around + 2 * math.pi, around)
-    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
-    return BuiltColon(TriangleMesh(vertices, faces, normals), f"colon-{digest}", tube, corners)
+    return {"vertices": vertices, "faces": faces, "normals": normals, "corners": corners}
 
 
 def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:
@@ -197,6 +206,12 @@ class Colon(MeshedSurface):
         self.model_from_camera = lumen_pose(
             recipe.type, viewpoint, self._sites, self._build.clearance, self._build.probe.cast
         )
+
+    @property
+    def chart(self) -> TubeChart | None:
+        """The tube's parameters on the mesh (see `SurfaceModel.chart`); None with pedunculated polyps."""
+        tube = self._build.tube
+        return None if tube.has_stalks else TubeChart(tube, self._build.corners)
 
     def _sites(self, rng: Generator) -> Array:
         """Draw sites around the middle part of the centreline, shape (N, 3), mm."""

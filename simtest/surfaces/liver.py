@@ -21,9 +21,11 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.kept_arrays import kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, rough_edges
+from simtest.surfaces.level_grid import in_blocks, level_grid
 from simtest.surfaces.mesh_geometry import face_edges
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator
 from simtest.surfaces.poses import organ_pose
@@ -105,7 +107,7 @@ class Body:
 
     def normals(self, points: Array) -> Array:
         """Return the unit outward normals of the level sets through points, shape (N, 3)."""
-        gradient = self.evaluate(points, second=False).gradient
+        gradient = in_blocks(lambda some: self.evaluate(some, second=False).gradient, points)
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def values(self, points: Array) -> Array:
@@ -125,6 +127,19 @@ class Body:
             bed = 0.5 * scale * (((d @ A) * d).sum(axis=1) - 1)
             f = self.recipe.fossa.edge_mm * np.logaddexp(*(part / self.recipe.fossa.edge_mm for part in (f, -bed)))
         return f + self.recipe.relief_mm * np.cos(points @ self._waves.T + self._phases).sum(axis=1)
+
+    def slopes(self, points: Array, radius: float) -> Array:
+        """Return upper bounds of the gradient's length within a radius, mm, of points, shape (N, 3).
+
+        Smooth maxima and minima have gradients that are means of their parts'. Those of the ellipsoids and of the face
+        are linear in the point.
+        """
+        rest = self._face(points)[1]
+        steepest = np.linalg.norm(rest, axis=1) + radius / self.recipe.visceral_radius_mm
+        for centre, A, scale in (*self._lobes, *([self._fossa] if self._fossa else [])):
+            own = scale * (np.linalg.norm((points - centre) @ A, axis=1) + radius * np.linalg.norm(A, 2))
+            steepest = np.maximum(steepest, own)
+        return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
     def evaluate(self, points: Array, second: bool = True) -> _Value:
         """Return F, mm, with gradient and, if `second`, Hessian, 1/mm, at points of shape (N, 3)."""
@@ -196,8 +211,12 @@ class BuiltLiver(BuiltMesh):
     @property
     def shape_operators(self) -> Array:
         """S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
-        at = self.body.evaluate(self.mesh.vertices)
-        return implicit_shape_operator(at.gradient, at.hessian)[1]
+
+        def operators(points: Array) -> Array:
+            at = self.body.evaluate(points)
+            return implicit_shape_operator(at.gradient, at.hessian)[1]
+
+        return in_blocks(operators, self.mesh.vertices)
 
     def clearance(self, points: Array) -> Array:
         """Return the distance to the mesh, mm, with the exact sign of F; positive outside."""
@@ -233,15 +252,20 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     InputError
         If the recipe gives no body, or one too large for the grid.
     """
+    body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
+    arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
+    digest = blake2b(key.encode(), digest_size=12).hexdigest()
+    return BuiltLiver(TriangleMesh(**arrays), f"liver-{digest}", body)
+
+
+def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:
+    """Make the mesh of a level set (see `build`)."""
     # marching cubes, made even, then split where the surface bends sharply
-    body = Body(recipe)
     vertices, faces = _march(body, GRID_MM if edge_mm is None else edge_mm)
     vertices = _even(body, vertices, faces)
     for _ in range(_SPLITS if edge_mm is None else 0):
         vertices, faces = _split(body, vertices, faces)
-    normals = body.normals(vertices)
-    digest = blake2b(f"{recipe.model_dump_json()} {edge_mm}".encode(), digest_size=12).hexdigest()
-    return BuiltLiver(TriangleMesh(vertices, faces, normals), f"liver-{digest}", body)
+    return TriangleMesh(vertices, faces, body.normals(vertices))
 
 
 def _march(body: Body, spacing: float) -> tuple[Array, IntArray]:
@@ -256,10 +280,7 @@ def _march(body: Body, spacing: float) -> tuple[Array, IntArray]:
             f"liver recipe: a grid of {cells} cells of {spacing:g} mm; at most {MAX_CELLS} allowed: make the lobes "
             "smaller or the edges longer"
         )
-    slab = np.stack(np.meshgrid(axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 2)
-    grid = np.empty([len(axis) for axis in axes])
-    for row, x in zip(grid, axes[0], strict=True):  # slab by slab: little memory
-        row[:] = body.values(np.column_stack([np.full(len(slab), x), slab])).reshape(row.shape)
+    grid = level_grid(body.values, body.slopes, axes)
     if not grid.min() < 0 < grid.max():
         raise InputError("liver recipe: the visceral face leaves nothing of the lobes: raise visceral_offset_mm")
     vertices, faces, _, _ = marching_cubes(grid, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
@@ -291,10 +312,14 @@ def _split(body: Body, vertices: Array, faces: IntArray) -> tuple[Array, IntArra
 
 def _project(body: Body, points: Array, steps: int) -> Array:
     """Move points along the gradient onto F = 0, by steps of Newton's method."""
-    for _ in range(steps):
-        at = body.evaluate(points, second=False)
-        points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
-    return points
+
+    def moved(points: Array) -> Array:
+        for _ in range(steps):
+            at = body.evaluate(points, second=False)
+            points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
+        return points
+
+    return in_blocks(moved, points)
 
 
 class Liver(MeshedSurface):

@@ -11,6 +11,7 @@ from simtest.runtime.arrays import Array, IntArray, Mask
 
 if TYPE_CHECKING:
     from simtest.surfaces.relief_field import ReliefField
+    from simtest.surfaces.tube import TubeChart
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,11 @@ class SurfaceModel(ABC):
     @abstractmethod
     def shape(self) -> Shape:
         """Return the shape that the renderer builds, in the model frame."""
+
+    @property
+    def chart(self) -> "TubeChart | None":
+        """What a kernel needs to solve the base's exact points as `points` does; None where it cannot."""
+        return None
 
     @abstractmethod
     def clearance(self, points: Array) -> Array:

@@ -15,7 +15,8 @@ from functools import cached_property, lru_cache, reduce
 import numpy as np
 
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import AnyArray, Array, Mask
+from simtest.runtime.kept_arrays import kept
 from simtest.spec.relief import Relief, ReliefBand
 from simtest.surfaces.model import SurfacePoints
 
@@ -280,7 +281,26 @@ def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
 
 @lru_cache(maxsize=4)
 def _make_field(spec: Relief) -> ReliefField:
-    """Make the relief without a film."""
+    """Make the relief without a film, or read it."""
+    arrays = kept("relief", spec.model_dump_json(), lambda: _packed(_drawn(spec)))
+    parts = (arrays[name] for name in ("lattices_from_model", "coefficients", "diffused"))
+    bands = tuple(BandField(*band) for band in zip(*parts, strict=True))
+    return ReliefField(bands, float(arrays["deviation"]), float(arrays["finest_wave"]))
+
+
+def _packed(field: ReliefField) -> dict[str, AnyArray]:
+    """Return a relief as arrays by name."""
+    return {
+        "lattices_from_model": np.stack([band.lattice_from_model for band in field.bands]),
+        "coefficients": np.stack([band.coefficients for band in field.bands]),
+        "diffused": np.stack([band.diffused for band in field.bands]),
+        "deviation": np.array(field.deviation),
+        "finest_wave": np.array(field.finest_wave),
+    }
+
+
+def _drawn(spec: Relief) -> ReliefField:
+    """Draw the bands of a relief."""
     branches = np.random.SeedSequence(spec.seed).spawn(len(spec.bands))
     bands = tuple(_make_band(band, branch, spec.diffusion_mm)
                   for band, branch in zip(spec.bands, branches, strict=True))  # fmt: skip

@@ -8,14 +8,17 @@ chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and
 of the light that comes back from below the vessel's depth.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import AnyArray, Array
+from simtest.runtime.kept_arrays import kept
 from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces.haemoglobin import TISSUE_SATURATION, blood_absorption, reach
 from simtest.surfaces.model import SurfaceModel
@@ -43,6 +46,9 @@ WALL = 0.1
 
 BLUR_PER_DEPTH = 0.4
 """Standard deviation of the blur of a vessel's edge over its depth."""
+
+_PLAIN, _LATTICES = ("base", "mottled", "netted", "absorption", "share"), ("mottling", "capillaries")
+"""Fields of `TissuePattern`: arrays, and lattices."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,29 @@ def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
 
 @lru_cache(maxsize=4)
 def _make(patch: Patch, spec: TissueColour) -> TissuePattern:
+    return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
+
+
+def _packed(pattern: TissuePattern) -> dict[str, AnyArray]:
+    """Return a pattern as arrays by name."""
+    plain = {name: getattr(pattern, name) for name in _PLAIN}
+    fields = {f"{name}_{part}": value for name in _LATTICES for part, value in vars(getattr(pattern, name)).items()}
+    table = {f"vessels_{part}": np.asarray(value) for part, value in vars(pattern.vessels).items()}
+    return {**plain, **fields, **table}
+
+
+def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
+    """Return the pattern of `_packed`."""
+    mottling, capillaries = (
+        Lattice(arrays[f"{name}_lattice_from_model"], arrays[f"{name}_values"]) for name in _LATTICES
+    )
+    vessels = SegmentTable(float(arrays["vessels_cell_mm"]), arrays["vessels_first"], arrays["vessels_rows"])
+    plain: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
+    return TissuePattern(mottling=mottling, capillaries=capillaries, vessels=vessels, **plain)
+
+
+def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
+    """Make the pattern of a patch."""
     net, mottle, grow = np.random.SeedSequence(spec.seed).spawn(3)
     blood = blood_absorption(TISSUE_SATURATION)
     # Relative to green

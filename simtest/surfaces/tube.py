@@ -52,6 +52,36 @@ class _Fold:
     kappa: float
 
 
+@dataclass(frozen=True)
+class TubeNumbers:
+    """A tube without pedunculated polyps as numbers, for a kernel.
+
+    Parameters
+    ----------
+    constants : dict
+        Scalars of the module's formulas.
+    folds : ndarray, shape (K, 7)
+        along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`).
+    waves : ndarray, shape (W, 3)
+        q, m and phase of the relief's waves.
+    panels : ndarray, shape (knots, 2 + 2 * powers)
+        x and z of each knot, then of the polynomial's coefficients about it, the lowest first.
+    """
+
+    constants: dict[str, float]
+    folds: Array
+    waves: Array
+    panels: Array
+
+
+@dataclass(frozen=True)
+class TubeChart:
+    """A tube with its parameters (u, v) at the corners of a mesh's triangles, shape (F, 3, 2)."""
+
+    tube: "Tube"
+    corners: Array
+
+
 class Tube:
     """The surface of a recipe as a function of (u, v): u along the centreline, mm; v around it, rad.
 
@@ -255,6 +285,24 @@ class Tube:
             fuv -= q * m * cosine
             fvv -= m * m * cosine
         return Jet(f, fu, fv, fuu, fuv, fvv)
+
+    def numbers(self) -> TubeNumbers:
+        """Return the tube as numbers, without its pedunculated polyps."""
+        recipe = self.recipe
+        rate, omega = math.radians(recipe.bend_deg) / recipe.length_mm, 2 * math.pi / recipe.sway_length_mm
+        constants = {
+            "length": recipe.length_mm, "radius": recipe.radius_mm, "taenia": recipe.taenia_mm,
+            "taenia_phase": float(self._taenia_phase), "relief": recipe.relief_mm, "rate": rate,
+            "sway": math.radians(recipe.sway_deg), "omega": omega, "phase": float(self._phase),
+            "spacing": float(self._knots[1] - self._knots[0]),
+        }  # fmt: skip
+        folds = [
+            (f.along, math.sin(f.centre), math.cos(f.centre), f.depth, 1 / f.width**2, f.slant, f.kappa)
+            for f in self._folds
+        ]
+        powers = self._panels.transpose(2, 1, 0).reshape(len(self._knots), -1)
+        panels = np.hstack([self._knot_points[:, [0, 2]], powers])
+        return TubeNumbers(constants, np.array(folds), np.array(self._relief).reshape(-1, 3), panels)
 
     def frame(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return T, rho and tau, three arrays of shape (N, 3)."""

@@ -1,0 +1,313 @@
+"""The exact points of a generated colon in one kernel, in double precision: the formulas of `simtest.surfaces.tube`.
+
+The tube in NumPy is the plain reference. There every operation on a frame's rays writes an array; here Newton's method
+and the curvatures of a ray stay in registers. In the orthonormal basis (T, rho, tau) of a point
+
+    P_u = (A, r_u, 0),  P_v = (0, r_v, r),  A = 1 - psi' r cos v
+    P_u x P_v = (r_u r, -A r, A r_v)
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
+from simtest.runtime.arrays import Array
+from simtest.surfaces import RayHits
+from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
+
+BLOCK = 2**17
+"""Rays of a launch: they bound the memory."""
+
+END_MM = 1.0
+"""How far beyond the tube's ends a solution may lie (see `Tube.solve`)."""
+
+_FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
+    **dict.fromkeys(("distance", "k_min", "k_max"), ((), float)),
+    **dict.fromkeys(("position", "normal", "direction_min", "direction_max"), ((3,), float)),
+    **dict.fromkeys(("pool", "valid"), ((), bool)),
+}
+"""What `TubeKernel.solve` returns: shapes of a point's values, and their types."""
+
+_TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True)
+class _Radius:
+    """r(u, v), mm, and its derivatives at the lanes of a kernel; the second ones are 0 where not asked for."""
+
+    f: Any
+    u: Any
+    v: Any
+    uu: Any
+    uv: Any
+    vv: Any
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Position, mm, and basis of points: C(u), T, rho, tau, mitsuba.Vector3d; psi' and psi''; cosine and sine of v."""
+
+    centre: Any
+    T: Any
+    rho: Any
+    tau: Any
+    bend: Any
+    twist: Any
+    cosine: Any
+    sine: Any
+
+
+class _Table:
+    """Rows of numbers that a kernel gathers."""
+
+    def __init__(self, mi: Any, rows: Array) -> None:
+        self.mi, self.columns = mi, rows.shape[1]
+        self._values = mi.Float64(np.ascontiguousarray(rows, dtype=np.float64).ravel())
+
+    def row(self, index: Any, active: Any = True) -> list[Any]:
+        """Return the numbers of rows, mitsuba.UInt32."""
+        import drjit as dr
+
+        first = index * self.columns
+        return [dr.gather(self.mi.Float64, self._values, first + i, active) for i in range(self.columns)]
+
+
+class TubeKernel:
+    """Solves rays against a tube.
+
+    Parameters
+    ----------
+    mi : module
+        mitsuba with the variant set.
+    chart : TubeChart
+        The tube, and its parameters at the corners of the rendered triangles.
+    """
+
+    def __init__(self, mi: Any, chart: TubeChart) -> None:
+        import drjit as dr
+
+        numbers = chart.tube.numbers()
+        self.mi = mi
+        self._folds, self._panels = _Table(mi, numbers.folds), _Table(mi, numbers.panels)
+        self._waves = _Table(mi, numbers.waves) if len(numbers.waves) else None
+        self._corners = _Table(mi, chart.corners.reshape(-1, 2))
+        constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
+        self._n = {name: mi.Float64(value) for name, value in constants.items()}
+        self._counts = {"folds": mi.UInt32(len(numbers.folds)), "waves": mi.UInt32(len(numbers.waves))}
+        # Opaque, so that another colon compiles no new kernel.
+        dr.make_opaque(list(self._n.values()), list(self._counts.values()))
+
+    def solve(self, origins: Array, directions: Array, hits: RayHits, model_from_camera: Array) -> dict[str, Array]:
+        """Compute the exact points, camera frame, on rays of the model frame, shape (N, 3) (see `exact_points.solve`).
+
+        Returns the fields of `SurfacePoints` that are not the base's own.
+        """
+        if not len(origins):
+            # Dr.Jit ends the process on a kernel without rays.
+            return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
+        import drjit as dr
+
+        mi = self.mi
+        origin, direction = (
+            vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in (origins, directions)
+        )
+        start = to_kernel(mi.Float64, hits.distance, np.float64)
+        valid = dr.isfinite(start)
+        second, third = (to_kernel(mi.Float64, part, np.float64) for part in hits.barycentric.T)
+        # (u, v) of the hit in its triangle
+        face = to_kernel(mi.UInt32, hits.face, np.uint32)
+        corners = [self._corners.row(3 * face + i, valid) for i in range(3)]
+        shares = (1 - second - third, second, third)
+        u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
+        t, u, v, found = self._newton(origin, direction, start, u, v, valid)
+        found &= (u >= -END_MM) & (u <= self._n["length"] + END_MM)
+        return self._described(origin, direction, t, u, v, found, model_from_camera)
+
+    def _newton(self, origin: Any, direction: Any, start: Any, u: Any, v: Any, valid: Any) -> tuple[Any, ...]:
+        """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are found."""
+        import drjit as dr
+
+        mi = self.mi
+
+        def body(t: Any, u: Any, v: Any, active: Any, found: Any, step: Any) -> tuple[Any, ...]:
+            frame, r = self._frame(u, v), self._radius(u, v, second=False)
+            along = 1 - frame.bend * r.f * frame.cosine
+            miss = frame.centre + r.f * frame.rho - origin - t * direction
+            pu, pv = along * frame.T + r.u * frame.rho, r.v * frame.rho + r.f * frame.tau
+            # The linear system P_u du + P_v dv - direction dt = -miss by Cramer's rule, for -du, -dv and dt
+            minor = dr.cross(pv, direction)
+            inverse = 1 / dr.dot(pu, minor)
+            du = dr.dot(miss, minor) * inverse
+            dv = dr.dot(miss, dr.cross(direction, pu)) * inverse
+            dt = dr.dot(miss, dr.cross(pu, pv)) * inverse
+            done = dr.squared_norm(miss) < NEWTON_TOLERANCE_MM**2
+            # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
+            scale = dr.minimum(1, MAX_SHIFT_MM / dr.maximum(dr.abs(dt), _TINY))
+            found |= active & done
+            scale = dr.select(active & ~done, scale, 0)
+            # 0 times the NaN of a singular matrix is NaN: such a ray is given up.
+            u, v, t = u - scale * du, v - scale * dv, t + scale * dt
+            # A ray that leaves the neighbourhood of its hit is given up.
+            active &= ~done & (dr.abs(t - start) <= MAX_SHIFT_MM)
+            step += 1
+            return t, u, v, active, found, step
+
+        t, u, v, _, found, _ = dr.while_loop(
+            state=(mi.Float64(start), u, v, mi.Bool(valid), mi.Bool(False), mi.UInt32(0)),
+            cond=lambda t, u, v, active, found, step: active & (step < NEWTON_STEPS),
+            body=body,
+            labels=("t", "u", "v", "active", "found", "step"),
+        )
+        return t, u, v, found
+
+    def _described(
+        self, origin: Any, direction: Any, t: Any, u: Any, v: Any, found: Any, model_from_camera: Array
+    ) -> dict[str, Array]:
+        """Evaluate normals and curvatures at solutions, and turn all to the camera frame (see `pack_points`)."""
+        import drjit as dr
+
+        mi = self.mi
+        frame, r = self._frame(u, v), self._radius(u, v, second=True)
+        bend, cosine, sine = frame.bend, frame.cosine, frame.sine
+        A = 1 - bend * r.f * cosine
+        # Derivatives and normal in the basis (T, rho, tau)
+        pu, pv = mi.Vector3d(A, r.u, 0), mi.Vector3d(0, r.v, r.f)
+        puu = mi.Vector3d(
+            -frame.twist * r.f * cosine - 2 * bend * r.u * cosine, A * bend * cosine + r.uu, -A * bend * sine
+        )
+        puv = mi.Vector3d(bend * (r.f * sine - r.v * cosine), r.uv, r.u)
+        pvv = mi.Vector3d(0, r.vv - r.f, 2 * r.v)
+        inward = dr.normalize(mi.Vector3d(r.u * r.f, -A * r.f, A * r.v))
+        E, F, G = dr.dot(pu, pu), dr.dot(pu, pv), dr.dot(pv, pv)
+        L, M, N = (-dr.dot(inward, d) for d in (puu, puv, pvv))
+        inverse = 1 / (E * G - F * F)
+        duals = (G * inverse) * pu - (F * inverse) * pv, (E * inverse) * pv - (F * inverse) * pu
+        # Model frame, turned to face the origin; S changes its sign with the normal.
+        normal, first, second = (self._in_model(frame, w) for w in (inward, *duals))
+        sign = dr.select(dr.dot(normal, direction) > 0, mi.Float64(-1), mi.Float64(1))
+        normal = normal * sign
+        # Eigenvalues and eigenvectors of S in a tangent basis, S = sum of II_ij d_i d_j^T
+        tangent, other = _tangent_basis(mi, normal)
+        a, b, c = (
+            sign * (L * (f1 * f2) + M * (f1 * s2 + s1 * f2) + N * (s1 * s2))
+            for (f1, s1), (f2, s2) in _pairs([(dr.dot(first, w), dr.dot(second, w)) for w in (tangent, other)])
+        )
+        mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
+        turned_sine, turned_cosine = dr.sincos(dr.atan2(b, (a - c) / 2) / 2)
+        found &= dr.isfinite(mean) & dr.isfinite(t) & dr.all(dr.isfinite(normal))
+        rotation = mi.Matrix3d(model_from_camera[:3, :3].T.tolist())
+        centre = mi.Vector3d(*model_from_camera[:3, 3].tolist())
+        dr.make_opaque(rotation, centre)
+        values = {
+            "distance": t,
+            "position": rotation @ (origin + t * direction - centre),
+            "normal": rotation @ normal,
+            "k_min": mean - half,
+            "k_max": mean + half,
+            "direction_min": rotation @ (turned_cosine * other - turned_sine * tangent),
+            "direction_max": rotation @ (turned_cosine * tangent + turned_sine * other),
+        }
+        return _arrays(mi, values, found)
+
+    @staticmethod
+    def _in_model(frame: _Frame, local: Any) -> Any:
+        return local.x * frame.T + local.y * frame.rho + local.z * frame.tau
+
+    def _frame(self, u: Any, v: Any) -> _Frame:
+        """Compute C(u) and the basis (see `Tube.heading`, `Tube.centreline` and `Tube.frame`)."""
+        import drjit as dr
+
+        mi, n = self.mi, self._n
+        swaying, turning = dr.sincos(n["omega"] * u + n["phase"])
+        psi = n["rate"] * u + n["sway"] * swaying
+        bend = n["rate"] + n["sway"] * n["omega"] * turning
+        twist = -n["sway"] * dr.square(n["omega"]) * swaying
+        # Polynomials about the nearest knot; x and z stand side by side.
+        knot = dr.clip(dr.round(u / n["spacing"]), 0, n["last_knot"])
+        start_x, start_z, *powers = self._panels.row(mi.UInt32(knot))
+        share = (u - knot * n["spacing"]) / (n["spacing"] / 2)
+        x, z = powers[-2], powers[-1]
+        for i in range(len(powers) - 4, -1, -2):
+            x, z = dr.fma(x, share, powers[i]), dr.fma(z, share, powers[i + 1])
+        s, c = dr.sincos(psi)
+        sine, cosine = dr.sincos(v)
+        T = mi.Vector3d(s, 0, c)
+        rho, tau = mi.Vector3d(cosine * c, sine, -cosine * s), mi.Vector3d(-sine * c, cosine, sine * s)
+        return _Frame(mi.Vector3d(start_x + x, 0, start_z + z), T, rho, tau, bend, twist, cosine, sine)
+
+    def _radius(self, u: Any, v: Any, second: bool) -> _Radius:
+        """Compute r and its derivatives (see `Tube.radius`)."""
+        import drjit as dr
+
+        mi, n = self.mi, self._n
+        # taeniae
+        sine, cosine = dr.sincos(3 * (v - n["taenia_phase"]))
+        zero = mi.Float64(0)
+        sums = [n["radius"] + n["taenia"] * cosine, zero, -3 * n["taenia"] * sine]
+        sums += [zero, zero, -9 * n["taenia"] * cosine] if second else []
+        # folds and sessile polyps
+        sine_v, cosine_v = dr.sincos(v)
+
+        def fold(i: Any, *sums: Any) -> tuple[Any, ...]:
+            along, sine_c, cosine_c, depth, inverse, slant, kappa = self._folds.row(i)
+            sine, cosine = sine_v * cosine_c - cosine_v * sine_c, cosine_v * cosine_c + sine_v * sine_c
+            x, leaning = u - along - slant * sine, slant * cosine
+            bump = depth * dr.exp(-dr.square(x) * inverse / 2 + kappa * (cosine - 1))
+            eu, ev = -x * inverse, x * leaning * inverse - kappa * sine
+            parts = [1, eu, ev]
+            if second:
+                evv = -(dr.square(leaning) + x * slant * sine) * inverse - kappa * cosine
+                parts += [eu * eu - inverse, eu * ev + leaning * inverse, ev * ev + evv]
+            return i + 1, *(total - bump * part for total, part in zip(sums, parts, strict=True))
+
+        sums = self._summed(fold, self._counts["folds"], sums)
+
+        def wave(i: Any, *sums: Any) -> tuple[Any, ...]:
+            q, m, phase = self._waves.row(i)  # type: ignore[union-attr]
+            sine, cosine = dr.sincos(q * u + m * v + phase)
+            sine, cosine = n["relief"] * sine, n["relief"] * cosine
+            parts = [-cosine, q * sine, m * sine]
+            parts += [q * q * cosine, q * m * cosine, m * m * cosine] if second else []
+            return i + 1, *(total - part for total, part in zip(sums, parts, strict=True))
+
+        if self._waves is not None:
+            sums = self._summed(wave, self._counts["waves"], sums)
+        return _Radius(*sums, *([] if second else [zero] * 3))
+
+    def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:
+        import drjit as dr
+
+        names = ("i", *(f"sum_{i}" for i in range(len(sums))))
+        state = (self.mi.UInt32(0), *(self.mi.Float64(part) for part in sums))
+        return list(dr.while_loop(state, lambda i, *_: i < count, term, labels=names)[1:])
+
+
+def _pairs(rows: list[tuple[Any, Any]]) -> tuple[tuple[Any, Any], ...]:
+    """Return which of two vectors enter a, b and c of the matrix (a b; b c)."""
+    tangent, other = rows
+    return (tangent, tangent), (tangent, other), (other, other)
+
+
+def _tangent_basis(mi: Any, normal: Any) -> tuple[Any, Any]:
+    """Return the basis of `simtest.geometry.vectors.tangent_basis`."""
+    import drjit as dr
+
+    sign = dr.select(normal.z >= 0, mi.Float64(1), mi.Float64(-1))
+    a = -1 / (sign + normal.z)
+    b = normal.x * normal.y * a
+    first = mi.Vector3d(1 + sign * dr.square(normal.x) * a, sign * b, -sign * normal.x)
+    return first, mi.Vector3d(b, sign + dr.square(normal.y) * a, -normal.y)
+
+
+def _arrays(mi: Any, values: dict[str, Any], found: Any) -> dict[str, Array]:
+    """Return lanes as arrays of double precision, NaN where there is no point."""
+    import drjit as dr
+
+    kept = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
+    dr.eval(kept, found)
+    arrays: dict[str, Array] = {"valid": np.array(found), "pool": np.zeros(len(found), dtype=bool)}
+    for name, value in kept.items():
+        arrays[name] = vectors_from_kernel(value, np.float64) if dr.depth_v(value) > 1 else np.array(value)
+    return arrays

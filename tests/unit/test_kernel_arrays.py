@@ -1,0 +1,67 @@
+"""Arrays on their way into kernels and back: the same values, and the same kernels for any number and any memory."""
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session, backend
+from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
+from simtest.spec import load_scene
+
+
+@pytest.fixture(scope="module")
+def mi():
+    return backend.load()
+
+
+def kernels(work):
+    """Return the hashes of the kernels that some work runs."""
+    import drjit as dr
+
+    before = dr.flag(dr.JitFlag.KernelHistory)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    try:
+        dr.kernel_history_clear()
+        work()
+        return {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
+    finally:
+        dr.kernel_history_clear()
+        dr.set_flag(dr.JitFlag.KernelHistory, before)
+
+
+@pytest.mark.parametrize("count", [1, 5, 1000])
+def test_values_come_back(mi, count):
+    rng = np.random.default_rng(count)
+    points, numbers = rng.normal(size=(count, 3)), rng.integers(0, 2**32, count)
+    there = vectors_to_kernel(mi.Vector3d, mi.Float64, points, np.float64)
+    np.testing.assert_array_equal(vectors_from_kernel(there, np.float64), points)
+    np.testing.assert_array_equal(np.array(to_kernel(mi.UInt32, numbers, np.uint32)), numbers)
+    single = vectors_to_kernel(mi.Point3f, mi.Float, points, np.float32)
+    np.testing.assert_array_equal(vectors_from_kernel(single, np.float64), points.astype(np.float32))
+
+
+def test_memory_of_any_alignment_gives_one_kernel(mi):
+    import drjit as dr
+
+    room = np.arange(4096.0)
+    seen, plain = set(), set()
+    for start in range(8):
+        some = room[start : start + 1000]
+        seen |= kernels(lambda some=some: dr.eval(to_kernel(mi.Float64, some, np.float64) * 3 + 1))
+        plain |= kernels(lambda some=some: dr.eval(mi.Float64(some) * 3 + 1))
+    assert len(seen) == 1
+    # Negative control: Dr.Jit's own conversion reads the memory in place.
+    assert len(plain) > 1
+
+
+def test_the_number_of_rays_is_in_no_kernel():
+    session = Session(load_scene("sphere"))
+    rng = np.random.default_rng(4)
+
+    def cast(count):
+        rays = session.sightlines.in_model(rng.uniform(100, 200, (count, 2)))
+        return lambda: (session.exact_hits(*rays), session._hits(*rays))
+
+    first = kernels(cast(3))
+    assert first
+    for count in (5, 8, 100):
+        assert kernels(cast(count)) == first
