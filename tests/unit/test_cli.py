@@ -149,7 +149,7 @@ BAD_USE = {
     "render plane --out x --set surface.tilt_deg.x=1": "surface.tilt_deg is a plain value, not a table",
     "schema kidney": 'Invalid value "kidney" for OF. Choose from: "scene", "experiment", "dataset"',
     "dataset tiny": "parameter --out requires an argument",
-    "dataset kidney --out made": "kidney: no such file; shipped by name: endoscopy, learning, tiny",
+    "dataset kidney --out made": "kidney: no such file; shipped by name: endoscopy, learning, smooth, tiny",
     "dataset tiny --out made --samples 0": "tiny.toml with replaced values: samples = 0: must be greater than or equal",
     "dataset tiny --out made --workers 0": "workers = 0: must be 1 to 256",
     "dataset tiny --out made --set sensor.bits=4": "sensor.bits = 4: must be greater than or equal to 8",
