@@ -157,4 +157,6 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
     except ValueError as error:
         raise InputError(f"{shown(path)}: not valid JSON ({error}); remove the folder") from error
     if held != json.loads(json.dumps(wanted)):
-        raise InputError(f"{shown(folder)}: holds the bank of another recipe, seed or size; remove it or name another --out")
+        raise InputError(
+            f"{shown(folder)}: holds the bank of another recipe, seed or size; remove it or name another --out"
+        )
