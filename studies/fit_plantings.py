@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.fitting.bank import CHAINS, Bank, make_bank
+from simtest.realism.fitting.bank import Bank, make_bank, read_bank
+from simtest.realism.fitting.emulator import learn
 from simtest.realism.fitting.frames import FrameMaker
+from simtest.realism.fitting.inference import REPEATS, infer
 from simtest.realism.fitting.parameters import Parameter, fitted_parameters, narrowed, one_family
 from simtest.realism.fitting.summaries import summarise
 from simtest.realism.frame_statistics import measure
@@ -54,23 +56,52 @@ def frames(dataset: Dataset, parameters: list[Parameter], number: int, folder: P
     return np.array([[np.nan if v is None else v for v in row] for row in held], dtype=float), middle
 
 
+def coverage(dataset: Dataset, parameters: list[Parameter], bank: Bank, folder: Path, numbers: list[int]) -> None:
+    """Fit each planting and print how many intervals hold the truth, how wide they are, and the errors of centres."""
+    emulator = learn(bank, from_integer(SEED), REPEATS)
+    held, widths, errors = [], [], []
+    for number in numbers:
+        seen, middle = frames(dataset, parameters, number, folder)
+        found = infer(emulator, seen, from_integer(SEED + number))
+        held.append((found.interval[:, 0] <= middle) & (middle <= found.interval[:, 1]))
+        widths.append(found.interval[:, 1] - found.interval[:, 0])
+        errors.append(found.centre - middle)
+    print(f"{len(numbers)} plantings of {FRAMES} frames; bank of {len(np.unique(bank.radiance))} radiances")
+    print("| parameter | intervals that hold the truth | median width, share of the range | RMS error, same |")
+    print("|---|---|---|---|")
+    for p, parameter in enumerate(parameters):
+        inside, width = int(np.sum([row[p] for row in held])), float(np.median([row[p] for row in widths]))
+        rms = float(np.sqrt(np.mean([row[p] ** 2 for row in errors])))
+        print(f"| {parameter.key} | {inside} of {len(numbers)} | {width:.2f} | {rms:.3f} |")
+
+
 def main() -> None:
     """Render, fit and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--plantings", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="first planting, where several processes share them")
+    parser.add_argument("--made", action="store_true", help="judge what is there, and render nothing")
     parser.add_argument("--bank", type=int, default=200)
     told = parser.parse_args()
     told.out.mkdir(parents=True, exist_ok=True)
     dataset = one_family(load_dataset(RECIPE))
     parameters = fitted_parameters(dataset)
+    if told.made:
+        whole = 0
+        while (told.out / "bank" / f"{whole:06d}.json").is_file():
+            whole += 1
+        numbers = [n for n in range(told.plantings) if (told.out / f"planting_{n:02d}.json").is_file()]
+        coverage(dataset, parameters, read_bank(told.out / "bank", whole, parameters), told.out, numbers)
+        return
+    bank = make_bank(dataset, parameters, told.out / "bank", told.bank)
     for number in range(told.first, told.plantings):
         try:
             frames(dataset, parameters, number, told.out)
         except InputError as error:
             raise SystemExit(str(error)) from None
         print(f"planting {number}", flush=True)
+    coverage(dataset, parameters, bank, told.out, list(range(told.first, told.plantings)))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """What a frame of given parameters shows: the mean of its summaries and their spread, learnt from a bank.
 
-The mean of each summary is a quadratic form of the parameters, fitted by ridge regression; the spread about it has one
-correlation for all parameters and a scale that follows them log-linearly. Both are taken from residuals of folds that
-the regression did not see, so that what the form misses counts as spread.
+The mean of each summary is a quadratic form of the parameters, fitted by ridge regression; the covariance about it is
+the same for all parameters. It is taken from residuals of folds that the regression did not see, so that what the
+form misses counts as spread.
 """
 
 from dataclasses import dataclass, replace
@@ -28,6 +28,9 @@ MIXED_PENALTY = 5.0
 SHRINKAGE = 0.05
 """Share by which correlations are drawn to 0: some summaries nearly say the same."""
 
+LEAST_VARIANCE = 0.05
+"""Least variance of standardised residuals along any direction."""
+
 LEAST_RADIANCES = 20
 """A smaller bank has too few radiances for folds."""
 
@@ -42,10 +45,10 @@ class Emulator:
         The bank's mean and deviation of each summary.
     weights : ndarray, shape (F, S)
         Of the features of `features`, standardised summaries.
-    log_sd : ndarray, shape (1 + P, S)
-        Log of the residuals' deviation, linear in the parameters.
-    correlation : ndarray, shape (S, S)
-        Of the residuals.
+    covariance : ndarray, shape (S, S)
+        Of the residuals of a picture.
+    error : ndarray, shape (S, S)
+        Covariance of the errors of `mean`, over the ranges.
     draws : ndarray, shape (R, F, S)
         Errors of `weights`, as the bank's radiances leave them.
     """
@@ -53,9 +56,14 @@ class Emulator:
     centre: Array
     scale: Array
     weights: Array
-    log_sd: Array
-    correlation: Array
+    covariance: Array
+    error: Array
     draws: Array
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters P; there are 1 + P + P + P (P - 1) / 2 features."""
+        return int((np.sqrt(9 + 8 * (len(self.weights) - 1)) - 3) / 2)
 
     def standardised(self, summaries: Array) -> Array:
         """Return summaries, shape (N, S), in the bank's deviations, clipped."""
@@ -72,16 +80,17 @@ class Emulator:
     @cached_property
     def bends(self) -> Array:
         """The second derivatives of the mean, the same at all parameters, shape (P, P, S)."""
-        count = self.log_sd.shape[0] - 1
+        count = self.parameters
         first, second = np.triu_indices(count, k=1)
         bends = np.zeros((count, count, self.weights.shape[1]))
         bends[np.arange(count), np.arange(count)] = 8 * self.weights[1 + count : 1 + 2 * count]
         bends[first, second] = bends[second, first] = 4 * self.weights[1 + 2 * count :]
         return bends
 
-    def deviation(self, shares: Array) -> Array:
-        """Return the residuals' deviation at parameters, shape (P,) -> (S,)."""
-        return np.asarray(np.exp(np.append(1.0, 2 * shares - 1) @ self.log_sd))
+    @property
+    def deviation(self) -> Array:
+        """The deviation of a picture's summaries about their mean, shape (S,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def redrawn(self, number: int) -> "Emulator":
         """Return the emulator of another bank of the same size."""
@@ -126,9 +135,7 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
     """
     radiances, numbers = np.unique(bank.radiance, return_inverse=True)
     if len(radiances) < LEAST_RADIANCES:
-        raise InputError(
-            f"bank of {len(radiances)} radiances: must have at least {LEAST_RADIANCES}; give a larger --bank"
-        )
+        raise InputError(f"bank of {len(radiances)} radiances: must have at least {LEAST_RADIANCES}; raise --size")
     centre, scale = np.nanmean(bank.summaries, axis=0), np.nanstd(bank.summaries, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     values = np.clip((bank.summaries - centre) / scale, -LIMIT, LIMIT)
@@ -147,8 +154,9 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
             x[known], values[known, s], fold[known], bank.shares.shape[1]
         )
         errors[:, :, s] = (signs[:, known] * residuals[known, s]) @ solver.T
-    log_sd, standard = _scales(bank.shares, residuals)
-    return Emulator(centre, scale, weights, log_sd, _correlation(standard), errors)
+    # The error of the mean at the bank's own pictures, which lie all over the ranges.
+    wrong = np.einsum("nf,rfs->rns", x[:: max(1, len(x) // 100)], errors).reshape(-1, values.shape[1])
+    return Emulator(centre, scale, weights, _covariance(residuals), wrong.T @ wrong / len(wrong), errors)
 
 
 def _ridge(x: Array, y: Array, fold: IntArray, parameters: int) -> tuple[Array, Array, Array]:
@@ -173,38 +181,17 @@ def _solver(x: Array, penalty: Array) -> Array:
     return np.asarray(np.linalg.solve(x.T @ x + np.diag(len(x) * penalty + 1e-9), x.T))
 
 
-def _scales(shares: Array, residuals: Array) -> tuple[Array, Array]:
-    """Return the log-linear deviation of residuals, shape (1 + P, S), and the residuals over it."""
-    x = np.hstack([np.ones((len(shares), 1)), 2 * shares - 1])
-    log_sd = np.zeros((x.shape[1], residuals.shape[1]))
-    standard = np.full(residuals.shape, np.nan)
-    for s in range(residuals.shape[1]):
-        known = np.isfinite(residuals[:, s])
-        if not known.any():
-            continue
-        overall = np.sqrt(np.mean(residuals[known, s] ** 2)) + 1e-6
-        # The log of a normal residual is -0.635 in the mean; large penalty, since logs are noisy.
-        logs = np.log(np.abs(residuals[known, s]) / overall + 0.05) + 0.5
-        penalty = np.full(x.shape[1], 0.1)
-        slopes = (_solver(x[known], penalty) @ (logs - logs.mean()))[1:]
-        shape = np.exp(x[known, 1:] @ slopes)
-        level = np.sqrt(np.mean((residuals[known, s] / shape) ** 2)) + 1e-6
-        log_sd[:, s] = np.append(np.log(level), slopes)
-        standard[known, s] = residuals[known, s] / (level * shape)
-    return log_sd, standard
-
-
-def _correlation(standard: Array) -> Array:
-    """Return the correlation of residuals from the pairs that are known, positive definite."""
-    known = np.isfinite(standard)
-    filled = np.where(known, np.clip(standard, -LIMIT, LIMIT), 0.0)
+def _covariance(residuals: Array) -> Array:
+    """Return the covariance of residuals from the pairs that are known, positive definite."""
+    known = np.isfinite(residuals)
+    filled = np.where(known, residuals, 0.0)
+    sd = np.sqrt((filled**2).sum(axis=0) / np.maximum(known.sum(axis=0), 1)) + 1e-3
+    filled = filled / sd
     pairs = known.T.astype(float) @ known
-    correlation = filled.T @ filled / np.maximum(pairs, 1.0)
-    sd = np.sqrt(np.maximum(np.diag(correlation), 1e-6))
-    correlation = (1 - SHRINKAGE) * correlation / np.outer(sd, sd)
+    correlation = (1 - SHRINKAGE) * (filled.T @ filled) / np.maximum(pairs, 1.0)
     np.fill_diagonal(correlation, 1.0)
     # Pairs of different pictures may leave a negative direction.
     values, vectors = np.linalg.eigh(correlation)
-    mended = (vectors * np.maximum(values, 0.02)) @ vectors.T
-    sd = np.sqrt(np.diag(mended))
-    return np.asarray(mended / np.outer(sd, sd))
+    mended = (vectors * np.maximum(values, LEAST_VARIANCE)) @ vectors.T
+    scale = sd / np.sqrt(np.diag(mended))
+    return np.asarray(mended * np.outer(scale, scale))

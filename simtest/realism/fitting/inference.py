@@ -1,9 +1,10 @@
 """From the summaries of scenes to the distribution of parameters that they have, with intervals from repeated fits.
 
 Each scene's parameters are normal about a centre, independent of each other; its summaries are those of the emulator
-with its spread, and all scenes share a gap between the emulator and the real frames. Centre, spread and size of the
-gap maximise the likelihood of the scenes' mean and scatter. Each repeated fit has other scenes (bootstrap), another
-bank (errors of the emulator) and another gap.
+with its spread, and all scenes share a gap between the emulator and the real frames. The centre and the gap's size are
+the most probable ones for the scenes' mean, the spread for their scatter. Each repeated fit has other scenes
+(bootstrap), another bank (errors of the emulator), another gap and another middle of the prior; so an interval covers
+the range where nothing else says more.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ REPEATS = 60
 STARTS = 6
 """Centres at which the first fit starts; the best end is taken."""
 
-SPREAD_PRIOR, CENTRE_PRIOR, GAP_PRIOR = 0.2, 0.4, 1.0
+SPREAD_PRIOR, CENTRE_PRIOR, GAP_PRIOR = 0.2, 0.35, 1.0
 """Deviations of the half-normal prior of a spread and of the normal prior of a centre about the middle, shares of the
 range; mean of the exponential prior of the gap, deviations of a frame's summaries."""
 
@@ -34,6 +35,9 @@ NOT_TOLD = 0.6
 """A parameter is not told where its interval covers more than this share of its range."""
 
 SPREAD_ENDS = (0.01, 0.5)
+
+CENTRE_ENDS = (-0.2, 1.2)
+"""Where repeated fits look for centres: ends at the range would hide how far their errors reach."""
 
 
 @dataclass(frozen=True)
@@ -100,21 +104,27 @@ def infer(
         Called with fits done and fits in all.
     """
     values, told = _complete(emulator, scenes)
-    parameters = emulator.log_sd.shape[0] - 1
-    everything = _moments(values, np.arange(len(values)))
-    # The first fit: several starts.
-    starts = [np.full(parameters, 0.5), *rng.uniform(0.15, 0.85, (STARTS - 1, parameters))]
-    ends = [_maximise(emulator, everything, told, _point(start)) for start in starts]
-    best = min(ends, key=lambda end: end[1])[0]
-    centre, spread, gap = _parts(best, parameters)
-    # Repeated fits from its end.
-    deviation = emulator.deviation(centre)[told]
+    parameters = emulator.parameters
+    everything = moments(values, np.arange(len(values)))
+    middle = np.full(parameters, 0.5)
+    # The first fit: several starts. The spread follows from the centre, and its curvature moves the centre.
+    starts = [middle, *rng.uniform(0.15, 0.85, (STARTS - 1, parameters))]
+    spread = np.zeros(parameters)
+    for _ in range(2):
+        fits = [_centre(emulator, everything, told, spread, start, middle) for start in starts]
+        centre, gap, _ = min(fits, key=lambda one: one[2])
+        spread, starts = _spread(emulator, everything, told, centre), [centre]
+    centre = np.clip(centre, 0.0, 1.0)
+    # Repeated fits from its end: other scenes, another gap, another bank, and another middle of the prior.
+    deviation = emulator.deviation[told]
     found = []
     for number in range(repeats):
-        drawn = _moments(values, rng.integers(len(values), size=len(values)))
-        shifted = Scenes(drawn.count, drawn.mean + gap * deviation * rng.standard_normal(len(deviation)), drawn.scatter)
-        point, _ = _maximise(emulator.redrawn(number), shifted, told, best)
-        found.append(_parts(point, parameters)[:2])
+        drawn = moments(values, rng.integers(len(values), size=len(values)))
+        moved = gap * deviation * rng.standard_normal(len(deviation))
+        shifted = Scenes(drawn.count, drawn.mean + moved, everything.scatter)
+        prior = 0.5 + CENTRE_PRIOR * rng.standard_normal(parameters)
+        other = _centre(emulator.redrawn(number), shifted, told, spread, centre, prior)[0]
+        found.append((other, _spread(emulator, drawn, told, np.clip(other, 0.0, 1.0))))
         if step:
             step(number + 1, repeats)
     centres, spreads = (np.array(part) for part in zip(*found, strict=True))
@@ -128,7 +138,7 @@ def _complete(emulator: Emulator, scenes: Array) -> tuple[Array, Array]:
     """
     values = emulator.standardised(scenes)
     told = np.isfinite(values).mean(axis=0) > LEAST_TOLD
-    values, correlation = values[:, told], emulator.correlation[np.ix_(told, told)]
+    values, correlation = values[:, told], emulator.covariance[np.ix_(told, told)]
     centre = np.nanmean(values, axis=0) if told.any() else np.empty(0)
     for row in values:
         known = np.isfinite(row)
@@ -139,67 +149,74 @@ def _complete(emulator: Emulator, scenes: Array) -> tuple[Array, Array]:
     return values, told
 
 
-def _moments(values: Array, rows: IntArray) -> Scenes:
+def moments(values: Array, rows: IntArray) -> Scenes:
+    """Return the mean and scatter of some rows of scenes' standardised summaries."""
     chosen = values[rows]
     mean = chosen.mean(axis=0)
     return Scenes(len(chosen), mean, (chosen - mean).T @ (chosen - mean))
 
 
-def _point(centre: Array) -> Array:
-    """Return the optimiser's coordinates: centres, logs of spreads, log of the gap."""
-    return np.concatenate([centre, np.full(len(centre), np.log(0.08)), [np.log(0.3)]])
-
-
-def _parts(point: Array, parameters: int) -> tuple[Array, Array, float]:
-    return point[:parameters], np.exp(point[parameters:-1]), float(np.exp(point[-1]))
-
-
-def _maximise(emulator: Emulator, scenes: Scenes, told: Array, start: Array) -> tuple[Array, float]:
-    """Return the point of the largest posterior and its negative log."""
+def _centre(
+    emulator: Emulator, scenes: Scenes, told: Array, spread: Array, start: Array, prior: Array
+) -> tuple[Array, float, float]:
+    """Return the most probable centre, shape (P,), the gap, and the negative log posterior there."""
     # Imported here: the command's start must not pay for it.
     from scipy.optimize import minimize
 
-    parameters = emulator.log_sd.shape[0] - 1
-    bounds = [(0.0, 1.0)] * parameters + [tuple(np.log(SPREAD_ENDS))] * parameters + [(np.log(LEAST_GAP), np.log(5.0))]
-    found = minimize(lambda p: negative_log(emulator, scenes, told, p), start, jac=True, bounds=bounds, method="L-BFGS-B",
-                     options={"maxiter": 80})  # fmt: skip
-    return np.asarray(found.x), float(found.fun)
+    bounds = [CENTRE_ENDS] * len(start) + [(np.log(LEAST_GAP), np.log(5.0))]
+    found = minimize(
+        lambda point: negative_log(emulator, scenes, told, spread, prior, point),
+        np.append(start, np.log(0.2)),
+        jac=True,
+        bounds=bounds,
+        method="L-BFGS-B",
+        options={"maxiter": 100},
+    )
+    return np.asarray(found.x[:-1]), float(np.exp(found.x[-1])), float(found.fun)
 
 
-def negative_log(emulator: Emulator, scenes: Scenes, told: Array, point: Array) -> tuple[float, Array]:
-    """Return the negative log posterior of a point and its gradient, shape (2 P + 1,).
+def negative_log(
+    emulator: Emulator, scenes: Scenes, told: Array, spread: Array, prior: Array, point: Array
+) -> tuple[float, Array]:
+    """Return the negative log posterior of a centre and the log of the gap, and its gradient, shape (P + 1,).
 
-    The mean of n scenes is normal with covariance C / n + gap^2, their scatter Wishart with n - 1 degrees of freedom,
-    where C = D R D + J' diag(spread^2) J of the emulator's deviation D, correlation R and slopes J.
+    The mean of n scenes is normal about the emulator's. Its covariance is that of a scene over n, the emulator's own
+    error, and the gap's. A scene's covariance mixes the scenes' scatter with the bank's residuals.
     """
-    count = emulator.log_sd.shape[0] - 1
-    centre, spread, gap = _parts(point, count)
-    slopes, deviation = emulator.slopes(centre)[:, told], emulator.deviation(centre)[told]
-    bends = emulator.bends[:, :, told]
-    curvature = bends[np.arange(count), np.arange(count)] / 2
-    own = emulator.correlation[np.ix_(told, told)] * np.outer(deviation, deviation)
-    covariance = own + (slopes.T * spread**2) @ slopes
-    gaps = (gap * deviation) ** 2
+    centre, gap = point[:-1], float(np.exp(point[-1]))
+    inside, gaps = np.ix_(told, told), (gap * emulator.deviation[told]) ** 2
+    # As many scenes as there are summaries outweigh the bank.
+    weight = (scenes.count - 1) / (scenes.count - 1 + np.count_nonzero(told))
+    own = weight * scenes.scatter / (scenes.count - 1) + (1 - weight) * emulator.covariance[inside]
+    covariance = own / scenes.count + emulator.error[inside] + np.diag(gaps)
     # A quadratic form has the mean over scenes that its curvature adds.
+    curvature = emulator.bends[np.arange(len(centre)), np.arange(len(centre))][:, told] / 2
     residual = scenes.mean - emulator.mean(centre)[0, told] - spread**2 @ curvature
-    value_mean, by_mean = _gaussian(covariance / scenes.count + np.diag(gaps), np.outer(residual, residual), 1)
-    value_scatter, by_scatter = _gaussian(covariance, scenes.scatter, scenes.count - 1)
-    pull = np.linalg.solve(covariance / scenes.count + np.diag(gaps), residual)
-    by_covariance = by_mean / scenes.count + by_scatter
-    # By the centre: the mean, the frames' deviation, and the slopes.
-    by_log_sd = 2 * ((by_covariance * own).sum(axis=0) + np.diag(by_mean) * gaps)
-    gradient_centre = -slopes @ pull
-    gradient_centre += 2 * emulator.log_sd[1:, told] @ by_log_sd
-    gradient_centre += 2 * np.einsum("q,pqs,st,qt->p", spread**2, bends, by_covariance, slopes, optimize=True)
-    # By the logs of spreads and gap.
-    gradient_spread = 2 * spread**2 * (np.einsum("ps,st,pt->p", slopes, by_covariance, slopes) - curvature @ pull)
-    gradient_gap = 2 * float(np.diag(by_mean) @ gaps)
-    # Priors.
-    value = value_mean + value_scatter + np.sum((spread / SPREAD_PRIOR) ** 2) / 2 + gap / GAP_PRIOR
-    value += np.sum(((centre - 0.5) / CENTRE_PRIOR) ** 2) / 2
-    gradient_centre += (centre - 0.5) / CENTRE_PRIOR**2
-    gradient_spread += (spread / SPREAD_PRIOR) ** 2
-    return float(value), np.concatenate([gradient_centre, gradient_spread, [gradient_gap + gap / GAP_PRIOR]])
+    value, by_covariance = _gaussian(covariance, np.outer(residual, residual), 1)
+    slopes = emulator.slopes(centre)[:, told]
+    gradient = -slopes @ np.linalg.solve(covariance, residual) + (centre - prior) / CENTRE_PRIOR**2
+    value += np.sum(((centre - prior) / CENTRE_PRIOR) ** 2) / 2 + gap / GAP_PRIOR
+    by_gap = 2 * float(np.diag(by_covariance) @ gaps) + gap / GAP_PRIOR
+    return float(value), np.append(gradient, by_gap)
+
+
+def _spread(emulator: Emulator, scenes: Scenes, told: Array, centre: Array) -> Array:
+    """Return the most probable deviations of parameters between scenes, shape (P,), from the summaries' scatter."""
+    from scipy.optimize import minimize
+
+    slopes, own = emulator.slopes(centre)[:, told], emulator.covariance[np.ix_(told, told)]
+
+    def negative(logs: Array) -> tuple[float, Array]:
+        spread = np.exp(logs)
+        value, by_covariance = _gaussian(own + (slopes.T * spread**2) @ slopes, scenes.scatter, scenes.count - 1)
+        gradient = 2 * spread**2 * np.einsum("ps,st,pt->p", slopes, by_covariance, slopes)
+        prior = (spread / SPREAD_PRIOR) ** 2
+        return float(value + prior.sum() / 2), gradient + prior
+
+    low, high = (float(np.log(end)) for end in SPREAD_ENDS)
+    found = minimize(negative, np.full(len(centre), np.log(0.08)), jac=True, bounds=[(low, high)] * len(centre),
+                     method="L-BFGS-B", options={"maxiter": 60})  # fmt: skip
+    return np.asarray(np.exp(found.x))
 
 
 def _gaussian(covariance: Array, scatter: Array, count: int) -> tuple[float, Array]:
