@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.fitting.bank import Bank, make_bank, read_bank
+from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
 from simtest.realism.fitting.emulator import learn
 from simtest.realism.fitting.frames import FrameMaker
 from simtest.realism.fitting.inference import REPEATS, infer
@@ -88,9 +88,7 @@ def main() -> None:
     dataset = one_family(load_dataset(RECIPE))
     parameters = fitted_parameters(dataset)
     if told.made:
-        whole = 0
-        while (told.out / "bank" / f"{whole:06d}.json").is_file():
-            whole += 1
+        whole = count_made(told.out / "bank")
         numbers = [n for n in range(told.plantings) if (told.out / f"planting_{n:02d}.json").is_file()]
         coverage(dataset, parameters, read_bank(told.out / "bank", whole, parameters), told.out, numbers)
         return

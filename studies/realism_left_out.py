@@ -17,10 +17,11 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.realism.distance import NEAR, by_scene
-from simtest.realism.fitting.fit import fit
+from simtest.realism.fitting.bank import count_made, make_bank, read_bank
+from simtest.realism.fitting.fit import fit_to_bank, summarise_scenes
 from simtest.realism.fitting.frames import FrameMaker
 from simtest.realism.fitting.outcome import recipe_toml
-from simtest.realism.fitting.parameters import one_family
+from simtest.realism.fitting.parameters import fitted_parameters, one_family
 from simtest.realism.frame_sets import open_frames
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, measure
 from simtest.runtime.files import write_json
@@ -77,6 +78,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--recipe", default="endoscopy")
     parser.add_argument("--size", type=int, default=150, help="radiances of the bank")
+    parser.add_argument("--stopped", action="store_true", help="take what a stopped bank holds")
     parser.add_argument("--made", type=int, default=20, help="frames of each fitted recipe")
     told = parser.parse_args()
     told.out.mkdir(parents=True, exist_ok=True)
@@ -84,8 +86,14 @@ def main() -> None:
         frames = open_frames([told.frames / name for name in REAL])
         real = by_scene([(frame.name, measure(frame.read())) for frame in frames])
         dataset, tissue = one_family(load_dataset(told.recipe), "tissue_colon"), {}
+        parameters = fitted_parameters(dataset)
+        if told.stopped:
+            bank = read_bank(told.bank, count_made(told.bank), parameters)
+        else:
+            bank = make_bank(dataset, parameters, told.bank, told.size)
         for frame in frames:
-            found = fit([f for f in frames if f is not frame], dataset, told.bank, told.size)
+            seen = summarise_scenes([f for f in frames if f is not frame])
+            found = fit_to_bank(seen, dataset, parameters, bank)
             (told.out / f"without_{frame.name}.toml").write_text(recipe_toml(found.recipe), encoding="utf-8")
             tissue[frame.name] = made(found.recipe, told.made, told.out / f"without_{frame.name}.json")
             print(f"without {frame.name}: {'; '.join(found.notes())}", flush=True)

@@ -112,6 +112,14 @@ def make_bank(
     return read_bank(folder, size, parameters)
 
 
+def count_made(folder: Path) -> int:
+    """Return how many radiances a folder holds, counted from the first without a gap: those of a stopped bank."""
+    count = 0
+    while (folder / f"{count:06d}.json").is_file():
+        count += 1
+    return count
+
+
 def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     """Read the first `size` radiances of a bank; those that could not be measured are left out."""
     shares, summaries, radiance = [], [], []

@@ -25,6 +25,10 @@ LEAST_WIDTH = 0.02
 """A fitted range keeps at least this half width, share of the recipe's."""
 
 
+Seen = tuple[dict[str, Array], set[tuple[int, int]], dict[str, str]]
+"""Mean summaries by scene, sizes of frames, and reasons by frame that was left out."""
+
+
 @dataclass(frozen=True)
 class FittedRecipe:
     """What a fit found.
@@ -81,9 +85,7 @@ class FittedRecipe:
         return notes
 
 
-def summarise_scenes(
-    frames: Sequence[NamedFrame], progress: Progress | None = None
-) -> tuple[dict[str, Array], set[tuple[int, int]], dict[str, str]]:
+def summarise_scenes(frames: Sequence[NamedFrame], progress: Progress | None = None) -> Seen:
     """Return the mean summaries of each scene, the sizes of frames, and why frames were left out.
 
     Raises
@@ -96,7 +98,8 @@ def summarise_scenes(
     for number, frame in enumerate(frames):
         try:
             picture = frame.read()
-            held.setdefault(frame.scene, []).append(summarise(measure(picture)))
+            summaries = summarise(measure(picture))
+            held.setdefault(frame.scene, []).append(summaries)
             sizes.add((picture.shape[1], picture.shape[0]))
         except InputError as error:
             left_out[frame.name] = str(error)
@@ -152,8 +155,22 @@ def fit(
         If there are too few scenes, nothing to fit, or the bank cannot be made.
     """
     parameters = fitted_parameters(dataset)
-    scenes, sizes, left_out = summarise_scenes(frames, progress)
+    seen = summarise_scenes(frames, progress)
     bank = make_bank(dataset, parameters, folder, size, progress=progress)
+    return fit_to_bank(seen, dataset, parameters, bank, seed, progress, repeats)
+
+
+def fit_to_bank(
+    seen: Seen,
+    dataset: Dataset,
+    parameters: list[Parameter],
+    bank: Bank,
+    seed: int = 0,
+    progress: Progress | None = None,
+    repeats: int = REPEATS,
+) -> FittedRecipe:
+    """Fit a recipe to scenes that were measured, with a bank that was made (parameters as in `fit`)."""
+    scenes, sizes, left_out = seen
     rng = from_integer(seed)
     emulator = learn(bank, rng, repeats)
     step = None if progress is None else (lambda done, total: progress(done, total, "repeating the fit"))
