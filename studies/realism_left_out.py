@@ -2,8 +2,8 @@
 
     python -m studies.realism_left_out --frames FOLDER --bank FOLDER --out FOLDER [--made N]
 
-Each real colonoscopic scene is left out in turn, the colon's family of `--recipe` is fitted to the others, and frames
-of the fitted recipe are compared with the scene left out. The distance of a statistic is the mean Wasserstein distance
+Each real colonoscopic scene is left out in turn, the colon's family of `--recipe` (by default the wide ranges of
+`studies/realism_left_out.toml`) is fitted to the others, and frames of the fitted recipe are compared with the scene left out. The distance of a statistic is the mean Wasserstein distance
 of a left-out scene and its frames, over the mean one of a left-out scene and the other real scenes: at 1 the recipe
 predicts a new scene as well as the other real scenes do. The real frames stay where they are.
 """
@@ -28,6 +28,7 @@ from simtest.runtime.files import write_json
 from simtest.spec.dataset_recipe import Dataset, Splits, load_dataset
 
 REAL = ("fig5_a.bmp", "fig7_a.bmp", "hyperkvasir_0qkwl.jpg", "hyperkvasir_0qx73.jpg", "hyperkvasir_0rx1i.jpg")
+RECIPE = Path(__file__).with_suffix(".toml")
 PER_ANATOMY = 4
 QUARTILED = ("per_frame", "radius", "axis_ratio", "clipped")
 
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, required=True, help="folder of the real frames")
     parser.add_argument("--bank", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--recipe", default="endoscopy")
+    parser.add_argument("--recipe", default=str(RECIPE), help="whose colon is fitted")
     parser.add_argument("--size", type=int, default=150, help="radiances of the bank")
     parser.add_argument("--stopped", action="store_true", help="take what a stopped bank holds")
     parser.add_argument("--made", type=int, default=20, help="frames of each fitted recipe")

@@ -122,7 +122,7 @@ def count_made(folder: Path) -> int:
 
 def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     """Read the first `size` radiances of a bank; those that could not be measured are left out."""
-    shares, summaries, radiance = [], [], []
+    shares, summaries, radiance, reason = [], [], [], ""
     for index in range(size):
         path = folder / f"{index:06d}.json"
         try:
@@ -134,10 +134,12 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
                     shares.append([float(p.to_unit(np.array(v))) for p, v in zip(parameters, values, strict=True)])
                     summaries.append(told)
                     radiance.append(index)
+                else:
+                    reason = str(row["left_out"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{shown(path)}: no file of a bank ({error}); remove it, and it is made again") from error
     if not shares:
-        raise InputError(f"{shown(folder)}: the bank holds no frame that can be measured")
+        raise InputError(f"{shown(folder)}: the bank holds no frame that can be measured ({reason})")
     return Bank(np.array(shares), np.array(summaries, dtype=float), np.array(radiance))
 
 
@@ -145,10 +147,11 @@ def _row(frame: "DrawnFrame", parameters: Sequence[Parameter]) -> dict[str, Json
     """Return what is kept of a picture."""
     try:
         told: Sequence[float] = summarise(measure(frame.picture)).tolist()
-    except InputError:
-        told = ()
+        reason = None
+    except InputError as error:
+        told, reason = (), str(error)
     values: dict[str, Json] = {parameter.key: frame.values[parameter.key] for parameter in parameters}
-    return {"values": values, "summaries": [v if math.isfinite(v) else None for v in told]}
+    return {"values": values, "summaries": [v if math.isfinite(v) else None for v in told], "left_out": reason}
 
 
 def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
