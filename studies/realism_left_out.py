@@ -2,10 +2,11 @@
 
     python -m studies.realism_left_out --frames FOLDER --bank FOLDER --out FOLDER [--made N]
 
-Each real colonoscopic scene is left out in turn, the colon's family of `--recipe` (by default the wide ranges of
-`studies/realism_left_out.toml`) is fitted to the others, and frames of the fitted recipe are compared with the scene left out. The distance of a statistic is the mean Wasserstein distance
-of a left-out scene and its frames, over the mean one of a left-out scene and the other real scenes: at 1 the recipe
-predicts a new scene as well as the other real scenes do. The real frames stay where they are.
+Each real colonoscopic scene is left out in turn, the colon's family of `--recipe` is fitted to the others, and frames
+of the fitted recipe are compared with the scene left out. The default recipe, `studies/realism_left_out.toml`, has wide
+ranges. The distance of a statistic is the mean Wasserstein distance of a left-out scene and its frames, over the mean
+one of a left-out scene and the other real scenes: at 1 the recipe predicts a new scene as well as the other real scenes
+do. The real frames stay where they are.
 """
 
 import argparse

@@ -78,7 +78,9 @@ def test_the_written_recipe_reads_back_the_same(tmp_path):
     path.write_text(recipe_toml(recipe))
     assert load_dataset(path) == recipe
     slope = tomllib.loads(path.read_text())["families"][0]["per_anatomy"]["surface.relief.bands.0.slope_deg"]
-    assert slope == {"low": 2.25, "high": 4.75}
+    low, high = dataset.families[0].per_anatomy["surface.relief.bands.0.slope_deg"].ends
+    assert slope["low"] == pytest.approx(0.75 * low + 0.25 * high, rel=1e-4)
+    assert slope["high"] == pytest.approx(0.25 * low + 0.75 * high, rel=1e-4)
 
 
 # Inference -----------------------------------------------------------------------------------------------------------

@@ -52,6 +52,12 @@ class Bank:
     summaries: Array
     radiance: IntArray
 
+    def ends(self) -> tuple[Array, Array]:
+        """Return the least and the largest value of each summary, shape (S,); infinite where no picture tells it."""
+        known = np.isfinite(self.summaries)
+        low = np.where(known, self.summaries, np.inf).min(axis=0)
+        return np.asarray(low), np.asarray(np.where(known, self.summaries, -np.inf).max(axis=0))
+
     def chosen(self, rows: IntArray) -> "Bank":
         """Return the bank of these rows."""
         return Bank(self.shares[rows], self.summaries[rows], self.radiance[rows])

@@ -136,8 +136,7 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
     radiances, numbers = np.unique(bank.radiance, return_inverse=True)
     if len(radiances) < LEAST_RADIANCES:
         raise InputError(f"bank of {len(radiances)} radiances: must have at least {LEAST_RADIANCES}; raise --size")
-    centre, scale = np.nanmean(bank.summaries, axis=0), np.nanstd(bank.summaries, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    centre, scale = _standard(bank.summaries)
     values = np.clip((bank.summaries - centre) / scale, -LIMIT, LIMIT)
     x, fold = features(bank.shares), rng.permutation(len(radiances))[numbers] % FOLDS
     # One sign a radiance: its pictures share what the form misses of it (wild cluster bootstrap).
@@ -157,6 +156,15 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
     # The error of the mean at the bank's own pictures, which lie all over the ranges.
     wrong = np.einsum("nf,rfs->rns", x[:: max(1, len(x) // 100)], errors).reshape(-1, values.shape[1])
     return Emulator(centre, scale, weights, _covariance(residuals), wrong.T @ wrong / len(wrong), errors)
+
+
+def _standard(summaries: Array) -> tuple[Array, Array]:
+    """Return mean and deviation of each summary's known values; 0 and 1 where no picture tells it, or all alike."""
+    known = np.isfinite(summaries)
+    count = np.maximum(known.sum(axis=0), 1)
+    centre = np.where(known, summaries, 0.0).sum(axis=0) / count
+    scale = np.sqrt((np.where(known, summaries - centre, 0.0) ** 2).sum(axis=0) / count)
+    return centre, np.where(scale > 0, scale, 1.0)
 
 
 def _ridge(x: Array, y: Array, fold: IntArray, parameters: int) -> tuple[Array, Array, Array]:

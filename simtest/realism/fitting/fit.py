@@ -66,7 +66,7 @@ class FittedRecipe:
     def out_of_reach(self) -> list[str]:
         """Summaries of which most scenes lie outside of all frames of the bank."""
         values = np.array(list(self.scenes.values()))
-        low, high = np.nanmin(self.bank.summaries, axis=0), np.nanmax(self.bank.summaries, axis=0)
+        low, high = self.bank.ends()
         outside = ((values < low) | (values > high)).mean(axis=0)
         return [name for name, share in zip(NAMES, outside, strict=True) if share > 0.5]
 

@@ -102,10 +102,11 @@ def _summaries(found: FittedRecipe) -> list[Json]:
     emulator, fitted = found.emulator, found.fitted
     values = np.array(list(found.scenes.values()))
     shown_mean = emulator.mean(fitted.centre)[0] * emulator.scale + emulator.centre
+    low, high = found.bank.ends()
     rows: list[Json] = []
     for s, name in enumerate(NAMES):
         told = values[np.isfinite(values[:, s]), s]
-        ends = [_plain(np.nanmin(found.bank.summaries[:, s])), _plain(np.nanmax(found.bank.summaries[:, s]))]
+        ends = [_plain(low[s]), _plain(high[s])]
         rows.append(
             {
                 "name": name,
