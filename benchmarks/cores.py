@@ -52,7 +52,7 @@ def commands(folder: Path) -> dict[str, tuple[list[str], float | None]]:
         "validate overview": (["validate", "overview", *out("overview")], LIMIT),
         "validate overview, a worker a core": (["validate", "overview", *workers, *out("overview-w")], LIMIT),
         "validate anatomy, a worker a core": (["validate", "anatomy", *workers, *out("anatomies")], LIMIT),
-        "dataset endoscopy, 40 samples": (["dataset", "endoscopy", "--samples", "40", *out("dataset")], None),
+        "dataset smooth, 40 samples": (["dataset", "smooth", "--samples", "40", *out("dataset")], None),
         "nightly": (["nightly", "--profile", "quick", "--reports", str(folder / "nightly-{n}")], LIMIT),
     }
 

@@ -107,9 +107,9 @@ class Measured:
 def recipes() -> dict[str, Dataset]:
     """Return the recipes that are costed, with seeds that no run had before: nothing of them is kept in any folder."""
     seed = int.from_bytes(os.urandom(4), "little")
-    smooth = load_dataset("endoscopy", {"seed": seed})
+    smooth = load_dataset("smooth", {"seed": seed})
     tissue = validate(Dataset, {**TISSUE, "samples": 1000, "seed": seed}, "tissue")
-    return {"smooth: endoscopy": smooth, "tissue": tissue}
+    return {"smooth": smooth, "tissue": tissue}
 
 
 def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES) -> Measured:

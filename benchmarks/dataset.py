@@ -1,6 +1,6 @@
 """Datasets: encoding, reading, and how well rendering and writing overlap.
 
-The samples are those of the shipped dataset `endoscopy`: 640 x 480 with 16 samples a pixel and all labels.
+The samples are those of the shipped dataset `smooth`: 640 x 480 with 16 samples a pixel and all labels.
 """
 
 import tempfile
@@ -28,7 +28,7 @@ ROUNDS = 5
 
 def figures() -> list[Figure]:
     """Measure encoding, overlap and reading."""
-    maker = Maker(Plan(load_dataset("endoscopy", {"samples": 10 * COUNT, "samples_per_anatomy": 2 * COUNT})))
+    maker = Maker(Plan(load_dataset("smooth", {"samples": 10 * COUNT, "samples_per_anatomy": 2 * COUNT})))
     maker.make(0)
     samples = [maker.make(index) for index in range(COUNT)]
     size = sum(len(data) for data in samples[0].encode().values()) / 1e6
@@ -47,7 +47,7 @@ def figures() -> list[Figure]:
 
 def _with_anatomies() -> list[Figure]:
     """Time samples of new anatomies, each anatomy shared by as many samples as in a real run."""
-    measured = measure(recipes()["smooth: endoscopy"])
+    measured = measure(recipes()["smooth"])
     about = (
         f"{measured.samples_s.mean():.2f} s of its own, and {measured.anatomies_s.mean():.1f} s of each anatomy over "
     )

@@ -19,7 +19,7 @@ import sys
 from simtest.dataset.plan import Plan
 from simtest.dataset.maker import Maker
 from simtest.spec import load_dataset
-maker = Maker(Plan(load_dataset("endoscopy", {"samples": 100000, "samples_per_anatomy": 4, "tries": 1,
+maker = Maker(Plan(load_dataset("smooth", {"samples": 100000, "samples_per_anatomy": 4, "tries": 1,
     "camera.width": 64, "camera.height": 48, "camera.fx": 32.0, "camera.fy": 32.0, "render.samples_per_pixel": 1})))
 samples, every = map(int, sys.argv[1:])
 for index in range(samples):

@@ -22,7 +22,7 @@ from simtest.dataset.plan import Plan
 from simtest.dataset.maker import Maker
 from simtest.spec import load_dataset
 settings, samples = json.loads(sys.argv[1]), int(sys.argv[2])
-maker = Maker(Plan(load_dataset("endoscopy", settings)))
+maker = Maker(Plan(load_dataset("smooth", settings)))
 for index in range(samples):
     maker.make(index).encode()
 """

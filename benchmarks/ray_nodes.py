@@ -30,7 +30,7 @@ LINEAR = 0.9
 
 def figures(dataset: Dataset | None = None, rounds: int = ROUNDS) -> list[Figure]:
     """Make the dataset on one node and on two, in turns."""
-    wanted = dataset or load_dataset("endoscopy", SETTINGS)
+    wanted = dataset or load_dataset("smooth", SETTINGS)
     times: dict[int, list[float]] = {1: [], 2: []}
     digests = set()
     with tempfile.TemporaryDirectory() as scratch:

@@ -125,9 +125,9 @@ def figures() -> list[Figure]:
         for what, function in steps(session).items():
             function()  # the first one compiles
             shown += _figures(f"{name}: {what}", count(function))
-    maker = Maker(Plan(load_dataset("endoscopy", {"samples": 1000})))
+    maker = Maker(Plan(load_dataset("smooth", {"samples": 1000})))
     maker.make(0)
-    shown += _figures("sample of the dataset endoscopy", count(lambda: maker.make(1)))
+    shown += _figures("sample of the dataset smooth", count(lambda: maker.make(1)))
     return shown
 
 

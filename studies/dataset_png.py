@@ -27,7 +27,7 @@ STRATEGIES = {"default": cv2.IMWRITE_PNG_STRATEGY_DEFAULT, "Huffman": cv2.IMWRIT
 
 def figures() -> list[Figure]:
     """Measure each image's own encoding, then the same pixels under each setting."""
-    members = Maker(Plan(load_dataset("endoscopy", {"samples": 100}))).make(0).encode()
+    members = Maker(Plan(load_dataset("smooth", {"samples": 100}))).make(0).encode()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -34,7 +34,7 @@ def make(
     Parameters
     ----------
     described : str
-        A dataset file, or the name of a shipped one: endoscopy, learning, tiny.
+        A dataset file, or the name of a shipped one: endoscopy, learning, smooth, tiny.
     """
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset

@@ -138,6 +138,20 @@ def may_show(session: Session, scene: Scene, least: int) -> bool:
     return sum(may_be_isolated(point) for point in session.highlights()) >= least
 
 
+def unlabelled_view(session: Session, scene: Scene, radiance: Radiance) -> RenderedView:
+    """Expose a radiance for its picture alone: a view without highlights.
+
+    The session stands at a scene that differs from this one in nothing but its sensor. Highlights are searched where
+    the exposure follows the brightest isolated one.
+    """
+    exposure = scene.sensor.exposure
+    if exposure.full_scale is None and exposure.average is None and exposure.percentile is None:
+        return render_view(session, scene, radiance)
+    light = collect(radiance.total, scene.sensor, session.camera)
+    full_scale = _full_scale(scene, _mean(light), [], [], session.camera.seen)
+    return RenderedView(scene, radiance, light, [], [], full_scale, scene.calibration(None))
+
+
 def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
 

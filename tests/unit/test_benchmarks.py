@@ -136,7 +136,7 @@ def test_shards_are_drawn_from_the_measured_times():
 
 @pytest.fixture(scope="module")
 def measured():
-    plan = Plan(cost.recipes()["smooth: endoscopy"])
+    plan = Plan(cost.recipes()["smooth"])
     return cost.Measured(np.array([1.0, 2.0]), np.array([10.0]), 1.5e6, 1e-3, (0.0, 0.0), plan)
 
 
@@ -160,7 +160,7 @@ def test_tables_by_one_process_count_against_many_workers(measured):
 
 
 def test_anatomies_are_timed_in_the_families_shares():
-    plan = Plan(cost.recipes()["smooth: endoscopy"])
+    plan = Plan(cost.recipes()["smooth"])
     blocks = cost._blocks(plan, 3)
     families = [plan.anatomy(block * plan.dataset.samples_per_anatomy).family for block in blocks]
     assert sorted(families) == [0, 0, 1]

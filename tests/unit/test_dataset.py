@@ -359,7 +359,7 @@ def test_the_card_says_where_surfaces_come_from():
 
     assert "No patient's data" in card(tiny())
     values = {"surface.path": str(ROOT / "meshes" / "colon_40mm.ply"), "samples": 6, "samples_per_anatomy": 1}
-    mesh = load_dataset("endoscopy", values)
+    mesh = load_dataset("smooth", values)
     family = mesh.families[0].model_copy(update={"seeds": None, "per_anatomy": {}})
     text = card(mesh.model_copy(update={"families": (family,), "splits": Splits(train=1.0, validation=0.0, test=0.0)}))
     assert "meshes: colon_40mm.ply" in text

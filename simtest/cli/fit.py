@@ -1,0 +1,70 @@
+"""`simtest fit`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from simtest.cli.options import Seed, whole_number
+
+if TYPE_CHECKING:
+    from simtest.realism.fitting.fit import FittedRecipe
+
+
+def fit(
+    frames: list[Path],
+    /,
+    *,
+    recipe: Annotated[str, Parameter(help="A dataset file, or the name of a shipped one, whose ranges are fitted.")],
+    out: Annotated[Path, Parameter(help="TOML file for the fitted recipe; the report stands beside it.")],
+    scene: Annotated[
+        str | None, Parameter(help="Base scene of the family that is fitted; needed where there are several.")
+    ] = None,
+    size: Annotated[int, Parameter(help="Frames that are rendered over the ranges.", converter=whole_number)] = 150,
+    bank: Annotated[
+        Path | None, Parameter(help="Folder that keeps them, for other fits too; default OUT with the suffix .bank.")
+    ] = None,
+    seed: Seed = None,
+) -> None:
+    """Fit the ranges of a dataset recipe to real frames, with intervals, and say what the frames do not tell.
+
+    Parameters
+    ----------
+    frames : list of Path
+        Real colour frames of at least three scenes: pictures, films, or folders of pictures. A film is one scene, and
+        so is a folder whose name ends in .film; any other picture is a scene of its own.
+    """
+    from simtest.cli.progress import progress_bar
+    from simtest.realism.fitting.fit import fit as fitted_to
+    from simtest.realism.fitting.outcome import check_out, write_fit
+    from simtest.realism.fitting.parameters import one_family
+    from simtest.realism.frame_sets import open_frames
+    from simtest.spec.dataset_recipe import load_dataset
+
+    check_out(out)
+    dataset = one_family(load_dataset(recipe), scene)
+    with progress_bar("writing") as progress:
+        found = fitted_to(open_frames(frames), dataset, bank or out.with_suffix(".bank"), size, seed or 0, progress)
+    paths = write_fit(found, out)
+    _print_table(found)
+    print(*paths, sep="\n")
+
+
+def _print_table(found: "FittedRecipe") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("parameter", "key", "centre", "95 % interval", "of its range", "told")
+    for number, parameter in enumerate(found.parameters):
+        share = found.fitted.interval[number]
+        low, high = parameter.from_unit(share)
+        centre = parameter.from_unit(found.fitted.centre[number])
+        told = "yes" if found.fitted.told[number] else "not told"
+        table.add_row(parameter.kind, parameter.key, f"{centre:.3g}", f"{low:.3g} to {high:.3g}",
+                      f"{share[1] - share[0]:.0%}", told)  # fmt: skip
+    console = Console(width=140)
+    console.print(table)
+    for note in found.notes():
+        console.print(f"note: {note}", highlight=False)
+    for name, reason in found.left_out.items():
+        console.print(f"left out: {name}: {reason}", highlight=False)
