@@ -182,11 +182,9 @@ class _Rendered:
         # Imported here: sets of files need no renderer.
         from simtest.dataset.maker import colour_variant
         from simtest.rendering import Session
-        from simtest.simulation.camera_chain import to_uint8
+        from simtest.simulation.camera_chain import displayed
         from simtest.simulation.rendered_view import render_picture
 
         scene = varied(self.base, number)
         self.session = self.session or Session(scene, colour_variant())
-        made = render_picture(self.session, scene)
-        values = np.clip(made, 0, 1) if scene.sensor.encodes else to_uint8(made).astype(np.float32) / 255
-        return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)
+        return displayed(render_picture(self.session, scene), scene.sensor)

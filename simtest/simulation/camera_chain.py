@@ -224,3 +224,9 @@ def to_uint8(frame: Image) -> Picture:
     """Return the sRGB-encoded 8-bit picture of a linear frame, clipped to [0, 1]."""
     linear = np.clip(np.nan_to_num(frame, nan=0.0), 0, 1)
     return np.asarray(np.round(255 * srgb_encode(linear)), dtype=np.uint8)
+
+
+def displayed(frame: Image, sensor: Sensor) -> Image:
+    """Return a frame as a screen gets it, shape (H, W, 3), float32: as the sensor encoded it, or sRGB of 8 bits."""
+    values = np.clip(frame, 0, 1) if sensor.encodes else to_uint8(frame).astype(np.float32) / 255
+    return np.asarray(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2), dtype=np.float32)

@@ -103,18 +103,23 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
 
 
 def render_picture(session: Session, scene: Scene) -> Image:
-    """Move a session to a scene and return the sensor's frame: that of `render_view`, without its highlights.
-
-    They are searched only where they set the exposure.
-    """
+    """Move a session to a scene and return the sensor's frame: that of `render_view`, without its highlights."""
     session.update(scene)
-    radiance, exposure = session.radiance(), scene.sensor.exposure
+    return expose_picture(session, scene, session.radiance())
+
+
+def expose_picture(session: Session, scene: Scene, radiance: Radiance) -> Image:
+    """Return the sensor's frame of a radiance.
+
+    The session stands at a scene that differs from this one in nothing but its sensor. Highlights are searched only
+    where they set the exposure.
+    """
     light = collect(radiance.total, scene.sensor, session.camera)
-    mean, seen = _mean(light), session.camera.seen
+    exposure, seen = scene.sensor.exposure, session.camera.seen
     if exposure.full_scale is exposure.average is exposure.percentile is None:
         full_scale = _judged(session, radiance, light)[1]
     else:
-        full_scale = _full_scale(scene, mean, [], [], seen)
+        full_scale = _full_scale(scene, _mean(light), [], [], seen)
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
@@ -136,20 +141,6 @@ def may_show(session: Session, scene: Scene, least: int) -> bool:
     """
     session.update(scene)
     return sum(may_be_isolated(point) for point in session.highlights()) >= least
-
-
-def unlabelled_view(session: Session, scene: Scene, radiance: Radiance) -> RenderedView:
-    """Expose a radiance for its picture alone: a view without highlights.
-
-    The session stands at a scene that differs from this one in nothing but its sensor. Highlights are searched where
-    the exposure follows the brightest isolated one.
-    """
-    exposure = scene.sensor.exposure
-    if exposure.full_scale is None and exposure.average is None and exposure.percentile is None:
-        return render_view(session, scene, radiance)
-    light = collect(radiance.total, scene.sensor, session.camera)
-    full_scale = _full_scale(scene, _mean(light), [], [], session.camera.seen)
-    return RenderedView(scene, radiance, light, [], [], full_scale, scene.calibration(None))
 
 
 def shows_isolated(session: Session, scene: Scene, least: int) -> bool:

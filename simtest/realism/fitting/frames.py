@@ -3,15 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
 from pydantic import JsonValue
 
+from simtest.dataset.maker import colour_variant
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.runtime.seeds import Stage, generator, integer
-from simtest.simulation.rendered_view import unlabelled_view
+from simtest.simulation.camera_chain import displayed
+from simtest.simulation.rendered_view import expose_picture
 from simtest.spec import Scene, apply_settings
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.sensor import Sensor
@@ -62,7 +63,7 @@ class FrameMaker:
     def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
         self.dataset = dataset
         self.plan = Plan(dataset)
-        self._variant = variant
+        self._variant = colour_variant(variant)
         self._session: Session | None = None
         self._anatomy: Anatomy | None = None
 
@@ -87,8 +88,8 @@ class FrameMaker:
         radiance = session.radiance()
         for chain in range(chains):
             values, scene = (drawn.values, drawn.scene) if chain == 0 else self._redrawn(index, chain, drawn)
-            view = unlabelled_view(session, scene, radiance)
-            yield DrawnFrame(index, chain, drawn.anatomy, values, _coloured(view.frame(scene.sensor.seed)))
+            picture = displayed(expose_picture(session, scene, radiance), scene.sensor)
+            yield DrawnFrame(index, chain, drawn.anatomy, values, picture)
 
     def _redrawn(self, index: int, chain: int, drawn: Drawn) -> tuple[dict[str, JsonValue], Scene]:
         """Draw the sensor's values again, with other noise."""
@@ -116,7 +117,3 @@ class FrameMaker:
             self._session, self._anatomy = Session(scene, self._variant), anatomy
         self._session.update(scene)
         return self._session
-
-
-def _coloured(picture: Image) -> Image:
-    return np.asarray(picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2), dtype=np.float32)
