@@ -107,7 +107,8 @@ def test_the_tile_of_a_zero_is_chosen_and_far_ones_are_not(x, y, turn, holes):
         w[:, holes // 30 % 22, holes % 30] = np.nan
     chosen = glints.tiles_near_zeros(w).tolist()
     assert [int(x) // 4 * 4, int(y) // 4 * 4] in chosen
-    assert len(chosen) < 25
+    # Zeros of the two components that run along each other pass through many tiles together.
+    assert len(chosen) < 25 or abs(np.cos(turn) + 0.3 * np.sin(turn)) < 0.3
     assert len(glints.tiles_near_zeros(far)) == 0
     assert len(glints.tiles_near_zeros(np.full_like(w, np.nan))) == 0
 

@@ -112,7 +112,7 @@ def kernel_hits(session):
     """Height of the tissue, mm, and fine and base normals at the pixels' centres, as the kernel has them."""
     tracer = session._tracer()
     lanes = session.sightlines.lanes(0, SIZE * SIZE, False, 0)
-    _, _, hit = tracer._hit(*session.sightlines.centre(lanes))
+    _, _, hit = tracer.hit(*session.sightlines.centre(lanes))
     fine, base = (np.array(si.sh_frame.n, dtype=float).T for si in (hit.fine, hit.base))
     return np.array(hit.jets.height, dtype=float), fine, base
 
@@ -173,7 +173,7 @@ def test_normals_that_face_away_give_no_light_and_no_nan():
     session = Session(scene(FILM, relief, tilt_deg=85.0, lights=lights))
     tracer = session._tracer()
     lanes = session.sightlines.lanes(0, SIZE * SIZE, False, 0)
-    _, _, hit = tracer._hit(*session.sightlines.centre(lanes))
+    _, _, hit = tracer.hit(*session.sightlines.centre(lanes))
     away = (np.array(hit.fine.wi.z) <= 0).reshape(SIZE, SIZE) & (np.array(hit.base.t) < 1e6).reshape(SIZE, SIZE)
     assert away.sum() > 50
     radiance = session.radiance()
