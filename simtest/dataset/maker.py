@@ -12,7 +12,7 @@ from simtest.dataset.fields import INSTRUMENT, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
-from simtest.errors import Failure
+from simtest.errors import Failure, InputError
 from simtest.estimators import load_estimators
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
@@ -29,6 +29,9 @@ from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
 from simtest.validation.rough_truth import rough_truth
+
+UNPLACED = 100
+"""Draws that cannot be rendered, beyond the tries, before a sample is given up."""
 
 MAX_INSTANCES = 255
 
@@ -92,18 +95,34 @@ class Maker:
         return Sample(meta, images)
 
     def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
-        """Draw until the frame shows enough isolated highlights; the last draw is taken as it is."""
+        """Draw until the frame shows enough isolated highlights; the last draw is taken as it is.
+
+        A draw that cannot be rendered counts as one that shows too few; up to `UNPLACED` more follow the last.
+        """
         dataset = self.plan.dataset
         attempt, last = 0, dataset.tries - 1 if dataset.highlights else 0
         while True:
-            drawn = self.plan.draw(index, attempt)
-            if attempt == last or self._promises(drawn):
-                session = self._at(drawn)
-                frame = session.frame()
-                view = render_view(session, drawn.scene, frame.radiance)
-                if attempt == last or has_quick_look(drawn.scene) or view.isolated >= dataset.highlights:
-                    return drawn, attempt, view, frame
+            try:
+                chosen = self._tried(self.plan.draw(index, attempt), attempt >= last)
+            except InputError:
+                # A drawn camera, light or instrument may stand in tissue or in one another.
+                if attempt >= last + UNPLACED:
+                    raise
+                self._session, chosen = None, None
+            if chosen is not None:
+                drawn, view, frame = chosen
+                return drawn, attempt, view, frame
             attempt += 1
+
+    def _tried(self, drawn: Drawn, is_last: bool) -> tuple[Drawn, RenderedView, Frame] | None:
+        """Render a draw; None where it shows too few isolated highlights and is not the last."""
+        if not (is_last or self._promises(drawn)):
+            return None
+        session = self._at(drawn)
+        frame = session.frame()
+        view = render_view(session, drawn.scene, frame.radiance)
+        least = self.plan.dataset.highlights
+        return (drawn, view, frame) if is_last or has_quick_look(drawn.scene) or view.isolated >= least else None
 
     def _promises(self, drawn: Drawn) -> bool:
         """Return whether a draw is worth its frame: by a quick look, or, where that saves nothing, by geometry."""

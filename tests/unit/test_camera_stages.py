@@ -351,6 +351,17 @@ def test_brighter_highlights_leave_the_tissue_at_its_level():
     assert levels[0] == pytest.approx(levels[1], abs=0.005)
 
 
+@pytest.mark.parametrize("shape", [(60, 80), (60, 80, 3)])
+def test_where_no_surface_is_seen_does_not_count(shape):
+    """A liver before an empty background is exposed as it is where it fills the picture."""
+    light = 0.2 + 0.1 * picture(shape)
+    told = sensor(response={"type": "srgb"})
+    surrounded = np.zeros((180, 160, *shape[2:]), dtype=light.dtype)
+    surrounded[20:80, 30:110] = light
+    own, within = (camera_chain.full_scale_of_average(v, 0.4, told) for v in (light, surrounded))
+    assert within == pytest.approx(own, rel=1e-6)
+
+
 def test_stages_come_in_physical_order():
     """The whole chain equals its stages called one by one, in the order of the sensor's docstring."""
     told = sensor(mosaic={}, colour=WARM, full_well=4000, read_noise=3.0, noise_sigma=0.005, response={"type": "srgb"},
