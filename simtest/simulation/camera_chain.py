@@ -182,9 +182,9 @@ def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.rando
 def full_scale_of_average(light: Image, average: float, sensor: Sensor) -> float:
     """Return the radiance at full scale for which the mean of the clipped, encoded light is `average`.
 
-    `light` is noise-free, any shape; at least one value is positive. Values of 0 do not count: no surface is seen there,
-    and a real scene has one everywhere. Where even the smallest full scale leaves the mean below `average`, since most
-    of the light falls on few pixels, it is the smallest.
+    `light` is noise-free, any shape; at least one value is positive. Values of 0 do not count: no surface is seen
+    there, and a real scene has one everywhere. Where even the smallest full scale leaves the mean below `average`,
+    since most of the light falls on few pixels, it is the smallest.
     """
     response, peak = sensor.response.model(), float(light.max())
     # An automatic exposure measures fields, not single pixels.
