@@ -1,5 +1,7 @@
 """Reads and writes OpenEXR files with Mitsuba's own image library."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,23 @@ def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
     """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
     mi = backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
-    bitmap.write(str(path))
+    with _two_threads():
+        bitmap.write(str(path))
+
+
+@contextmanager
+def _two_threads() -> Iterator[None]:
+    """Give Dr.Jit's pool a second thread where it has one: OpenEXR waits for a task of that pool, for ever with one."""
+    import drjit
+
+    threads = drjit.thread_count()
+    if threads < 2:
+        drjit.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if threads < 2:
+            drjit.set_thread_count(threads)
 
 
 def read_bitmap(path: Path, variant: str | None = None) -> Image:
@@ -27,7 +45,8 @@ def read_bitmap(path: Path, variant: str | None = None) -> Image:
     """
     mi = backend.load(variant)
     try:
-        bitmap = mi.Bitmap(str(path))
+        with _two_threads():
+            bitmap = mi.Bitmap(str(path))
     except RuntimeError as error:
         raise InputError(f"{shown(path)}: cannot be read ({shown(str(error).splitlines()[-1], 120)})") from None
     return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32), dtype=np.float32)

@@ -363,3 +363,18 @@ def test_nothing_is_set_or_loaded_at_import():
         "assert not {'mitsuba', 'drjit'} & set(sys.modules), 'loaded'\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_one_thread_writes_a_picture(tmp_path):
+    """OpenEXR once waited for ever for a second thread."""
+    code = (
+        "import sys, numpy as np; from pathlib import Path\n"
+        "from simtest.rendering.bitmap import read_bitmap, write_exr\n"
+        "write_exr(Path(sys.argv[1]), np.ones((8, 9), dtype=np.float32))\n"
+        "import drjit; print(read_bitmap(Path(sys.argv[1])).shape, drjit.thread_count())"
+    )
+    environment = {**os.environ, "SIMTEST_THREADS": "1"}
+    command = [sys.executable, "-c", code, str(tmp_path / "a.exr")]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split(")")[1].strip() == "1"
