@@ -6,6 +6,8 @@ Reconstruction of a picture needs no other distribution, and loading SciPy's tak
 import math
 from functools import lru_cache
 
+from simtest.geometry.quantiles import check_quantile, first_not_below
+
 
 def survival(x: float, freedom: int) -> float:
     """Return the probability that a chi-squared variable exceeds x > 0, by its finite sums [AS, 26.4.4, 26.4.5].
@@ -40,17 +42,7 @@ def quantile(share: float, freedom: int) -> float:
     ValueError
         If `share` is not inside (0, 1), or `freedom` is below 1.
     """
-    if not 0 < share < 1 or freedom < 1:
-        raise ValueError(f"share = {share}, freedom = {freedom}: must be inside (0, 1), and at least 1")
+    check_quantile(share, freedom)
     if freedom == 2:
         return -2 * math.log1p(-share)
-    # Bisection until two neighbouring numbers are left: the survival falls with x.
-    low, high = 0.0, float(freedom)
-    while survival(high, freedom) > 1 - share:
-        low, high = high, 2 * high
-    while low < (middle := (low + high) / 2) < high:
-        if survival(middle, freedom) > 1 - share:
-            low = middle
-        else:
-            high = middle
-    return high
+    return first_not_below(lambda x: survival(x, freedom) > 1 - share, float(freedom))

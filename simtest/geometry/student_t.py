@@ -8,6 +8,8 @@ import math
 from functools import lru_cache
 from statistics import NormalDist
 
+from simtest.geometry.quantiles import check_quantile, first_not_below
+
 _MANY = 1000
 """Degrees of freedom above which the expansion about the normal distribution is exact to rounding."""
 
@@ -41,23 +43,13 @@ def quantile(share: float, freedom: int) -> float:
     ValueError
         If `share` is not inside (0, 1), or `freedom` is below 1.
     """
-    if not 0 < share < 1 or freedom < 1:
-        raise ValueError(f"share = {share}, freedom = {freedom}: must be inside (0, 1), and at least 1")
+    check_quantile(share, freedom)
     if share < 0.5:
         return -quantile(1 - share, freedom)
     if freedom > _MANY:
         return _expanded(NormalDist().inv_cdf(share), freedom)
-    # Bisection until two neighbouring numbers are left: `within` rises with t.
     wanted = 2 * share - 1
-    low, high = 0.0, 2.0
-    while within(high, freedom) < wanted:
-        low, high = high, 2 * high
-    while low < (middle := (low + high) / 2) < high:
-        if within(middle, freedom) < wanted:
-            low = middle
-        else:
-            high = middle
-    return high
+    return first_not_below(lambda x: within(x, freedom) < wanted, 2.0)
 
 
 def _expanded(z: float, freedom: int) -> float:

@@ -107,7 +107,7 @@ def _render(found: Comparison, against: str, command: str, distance: "Chart", co
 
 
 def _counted(held: SetOfFrames) -> str:
-    """Say how many scenes and frames a side has."""
+    """Return how many scenes and frames a side has, in words."""
     scenes, frames = len(held.scenes), held.frames
     text = f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} {'frame' if frames == 1 else 'frames'}"
     return text + (f", {held.without_highlights} without a highlight" if held.without_highlights else "")

@@ -22,7 +22,7 @@ def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
 
 @contextmanager
 def _two_threads() -> Iterator[None]:
-    """Give Dr.Jit's pool a second thread where it has one: OpenEXR waits for a task of that pool, for ever with one."""
+    """Run with two threads at least: OpenEXR waits for a task of Dr.Jit's pool, for ever where that has one."""
     import drjit
 
     threads = drjit.thread_count()
