@@ -7,6 +7,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Distribution, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
+from simtest.estimators.budget import Budget
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.protocol import Estimate
@@ -61,7 +62,7 @@ class Bisector:
             look_px=camera.project(sightline),
             axis_ratio=family.axis_ratio,
             isophotes=family.isophotes,
-            covariance=_covariance(family, order[0], distance, normal),
+            budget=_budget(family, order[0], distance, normal),
             flags=flags,
         )
 
@@ -92,13 +93,14 @@ def _normal(family: IsophoteFamily, light: Array, distance: float, turn: Array |
     return bisect(distance * sightline, light), sightline
 
 
-def _covariance(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Array | None:
-    """Return the covariance of the normal by noise and by the distance's uncertainty, shape (2, 2)."""
-    if family.peak_covariance is None:
+def _budget(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Budget | None:
+    """Return the budget of the normal: that of the axis at the peak, and the distance."""
+    if family.peak_budget is None:
         return None
     across = basis_across(normal)
     turned = [_normal(family, light, distance.mean, STEP * unit)[0] for unit in np.eye(2)]
     J = across @ (np.array(turned) - normal).T / STEP
     farther, _ = _normal(family, light, distance.mean * (1 + STEP))
     by_distance = across @ (farther - normal) / (STEP * distance.mean) * distance.sd
-    return np.asarray(J @ family.peak_covariance @ J.T + np.outer(by_distance, by_distance))
+    own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
+    return {**own, "distance": np.outer(by_distance, by_distance)}

@@ -41,7 +41,7 @@ class ConeAxis:
             look_px=camera.project(family.axis),
             axis_ratio=family.axis_ratio,
             isophotes=family.isophotes,
-            covariance=family.axis_covariance,
+            budget=family.axis_budget,
             flags=family.flags,
         )
         return add_light_offset_uncertainty(estimate, priors)

@@ -54,16 +54,16 @@ class Curved:
         if isinstance(found, Failure):
             return found
         curvature, is_round = found
-        axis, covariance = family.axis, family.axis_covariance
+        axis, budget = family.axis, family.axis_budget
         if family.drift_is_real:
-            axis, covariance = family.peak_axis, family.peak_covariance
+            axis, budget = family.peak_axis, family.peak_budget
         estimate = Estimate(
             normal=-axis,
             candidates=-axis[None],
             look_px=camera.project(axis),
             axis_ratio=curvature.axis_ratio,
             isophotes=family.isophotes,
-            covariance=covariance,
+            budget=budget,
             flags=(*family.flags, "round") if is_round else family.flags,
             curvature=curvature,
         )

@@ -8,6 +8,7 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.errors import Failure, Reason
+from simtest.estimators.budget import total
 from simtest.estimators.protocol import AnyEstimator, BatchEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Array, Camera, Patch
 
@@ -148,6 +149,9 @@ def _checked(result: object, camera: Camera, peak_px: Array | None = None) -> Es
 
 def _malformed(estimate: Estimate) -> Failure | None:
     """Return what is wrong with the shape, type or value of an estimate's parts, or None."""
+    # the budget before its sum
+    if (wrong := _malformed_budget(estimate)) is not None:
+        return wrong
     # shapes and finite values
     shapes = (
         ("normal", estimate.normal, (3,)),
@@ -175,6 +179,21 @@ def _malformed(estimate: Estimate) -> Failure | None:
         return Failure(Reason.ESTIMATOR_ERROR, "the first candidate must be the proposed normal")
     if not isinstance(estimate.flags, tuple) or not all(isinstance(flag, str) for flag in estimate.flags):
         return Failure(Reason.ESTIMATOR_ERROR, "flags: must be a tuple of text")
+    return None
+
+
+def _malformed_budget(estimate: Estimate) -> Failure | None:
+    """Return what is wrong with the parts of an estimate's budget or with its target, or None."""
+    if estimate.target not in ("fine", "base"):
+        return Failure(Reason.ESTIMATOR_ERROR, f"target {estimate.target!r}: must be fine or base")
+    budget = estimate.budget or {}
+    for name, part in budget.items():
+        if not isinstance(part, np.ndarray) or part.shape != (2, 2):
+            return Failure(Reason.ESTIMATOR_ERROR, f"budget {name}: must be an array of shape (2, 2)")
+        if not np.isfinite(part).all():
+            return Failure(Reason.NOT_FINITE, f"budget {name} holds NaN or infinity")
+    if estimate.covariance is not None and not np.allclose(total(budget), estimate.covariance, rtol=1e-6, atol=1e-18):
+        return Failure(Reason.ESTIMATOR_ERROR, "covariance: must be the sum of the budget's parts")
     return None
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure, Reason
+from simtest.estimators.budget import Budget
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_crossings import FamilyCrossings
 from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
@@ -227,14 +228,15 @@ class IsophoteFamily:
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @property
-    def axis_covariance(self) -> Array | None:
-        """Covariance of the mean axis in the basis, rad^2, shape (2, 2): noise, and drift that may be more than it."""
+    def axis_budget(self) -> Budget | None:
+        """Budget of the mean axis in the basis: noise, and shape where the drift may be more than noise."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
         if self._drift_chi2 <= SUSPECT_CHI2:
-            return covariance[:2, :2]
-        return np.asarray(covariance[:2, :2] + MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error)
+            return {"noise": covariance[:2, :2]}
+        shape = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
+        return {"noise": covariance[:2, :2], "shape": shape}
 
     @property
     def drift_excess(self) -> float:
@@ -245,15 +247,15 @@ class IsophoteFamily:
         return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
 
     @property
-    def peak_covariance(self) -> Array | None:
-        """Covariance of the axis at the peak in the basis, rad^2, shape (2, 2): noise, and a straight line's error."""
+    def peak_budget(self) -> Budget | None:
+        """Budget of the axis at the peak in the basis: noise, and shape where a straight line misses the drift."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
         noise = np.asarray(both @ covariance @ both.T)
         # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
-        return noise + self._line_error if self.drift_is_real else noise
+        return {"noise": noise, "shape": self._line_error} if self.drift_is_real else {"noise": noise}
 
     @property
     def _line_error(self) -> Array:

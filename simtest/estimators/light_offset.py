@@ -35,7 +35,7 @@ def add_light_offset_uncertainty(estimate: Estimate, priors: Priors) -> Estimate
         return estimate
     flagged = replace(estimate, flags=(*estimate.flags, "light_offset"))
     if priors.distance_mm is None:
-        return replace(flagged, covariance=None)
+        return flagged.without_uncertainty()
     # bias of each light at the surface point
     position = -priors.distance_mm.mean * estimate.normal
     moved = np.array([tangent_coordinates(estimate.normal, bisect(position, light)) for light in priors.lights])
@@ -44,4 +44,4 @@ def add_light_offset_uncertainty(estimate: Estimate, priors: Priors) -> Estimate
         return flagged
     if np.trace(squares) < NEGLIGIBLE * np.trace(estimate.covariance):
         return estimate
-    return replace(flagged, covariance=estimate.covariance + squares)
+    return flagged.with_parts(light_offset=squares)

@@ -95,7 +95,7 @@ class Photometric:
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            covariance=covariance + MISFIT_SHARE * excess * np.eye(2),
+            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)},
             flags=flags,
         )
         return add_light_offset_uncertainty(estimate, priors)
@@ -154,7 +154,7 @@ class PhotometricPlane:
             look_px=camera.project(best.model.foot),
             isophotes=start.isophotes,
             choice_margin=margin,
-            covariance=_turned(best.covariance[:2, :2], normals[0], basis_across(normals[0])),
+            budget={"noise": _turned(best.covariance[:2, :2], normals[0], basis_across(normals[0]))},
         )
 
     def _start(self, patch: Patch, camera: Camera) -> Estimate | Failure:

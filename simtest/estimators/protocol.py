@@ -1,16 +1,19 @@
 """Estimator protocols, and the estimate that an estimator returns."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure
+from simtest.estimators.budget import STATED, Budget, total
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.pose_region import PoseRegion
+
+Target = Literal["fine", "base"]
 
 
 @dataclass(frozen=True)
@@ -57,13 +60,18 @@ class Estimate:
     choice_margin : float, optional
         How clearly the proposed candidate won, in standard deviations.
     covariance : ndarray, shape (2, 2), optional
-        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
+        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2; default the budget's sum.
     flags : tuple of str
         Warnings.
     curvature : EstimatedCurvature, optional
         Of the surface.
     region : PoseRegion, optional
         Instead of a covariance, where the normals that the data allow are no ellipse about the proposed one.
+    budget : mapping of str to ndarray, optional
+        The parts of the covariance by name (`simtest.estimators.budget`). A covariance without a budget is one part.
+    target : {"fine", "base"}
+        Which surface's normal is stated: that of the fine one with its relief, or of the base without (theory.md
+        section 7).
     """
 
     normal: Array
@@ -76,6 +84,25 @@ class Estimate:
     flags: tuple[str, ...] = field(default=())
     curvature: EstimatedCurvature | None = None
     region: PoseRegion | None = None
+    budget: Budget | None = None
+    target: Target = "fine"
+
+    def __post_init__(self) -> None:
+        if self.budget is not None and self.covariance is None:
+            object.__setattr__(self, "covariance", total(self.budget))
+        elif self.budget is None and self.covariance is not None:
+            object.__setattr__(self, "budget", {STATED: self.covariance})
+
+    def with_parts(self, **parts: Array) -> "Estimate":
+        """Return the estimate with more parts in its budget, rad^2; one that is there already is added to."""
+        own = dict(self.budget or {})
+        for name, part in parts.items():
+            own[name] = own[name] + part if name in own else part
+        return replace(self, budget=own, covariance=None)
+
+    def without_uncertainty(self) -> "Estimate":
+        """Return the estimate without covariance and budget: it states no uncertainty."""
+        return replace(self, budget=None, covariance=None)
 
     def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
         """Return the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""

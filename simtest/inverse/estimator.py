@@ -7,6 +7,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisect
+from simtest.estimators.budget import Budget
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
@@ -90,7 +91,7 @@ class InverseRendering:
             look_px=camera.project(found.sightline),
             axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
             isophotes=start.isophotes,
-            covariance=_covariance(fitted, priors),
+            budget=_budget(fitted, priors),
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
@@ -141,8 +142,8 @@ def _lit(priors: Priors) -> tuple[float, Array, Array]:
     return priors.distance_mm.mean, priors.lights.mean(axis=0), priors.lights
 
 
-def _covariance(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Array:
-    """Return the covariance of the normal in its tangent basis, by noise and distance, shape (2, 2)."""
+def _budget(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Budget:
+    """Return the budget of the normal: noise and distance."""
     model = fitted.model
     across = basis_across(model.normal)
     steps = [model.moved(np.append(STEP * unit, np.zeros(len(fitted.covariance) - 2))).normal for unit in np.eye(2)]
@@ -151,7 +152,7 @@ def _covariance(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Array:
     if priors.distance_mm is not None and priors.distance_mm.sd > 0:
         farther = bisect(model.distance * (1 + STEP) * model.sightline, model.light)
         by_distance = across @ (farther - model.normal) / (STEP * model.distance) * priors.distance_mm.sd
-    return np.asarray(J @ fitted.covariance[:2, :2] @ J.T + np.outer(by_distance, by_distance))
+    return {"noise": J @ fitted.covariance[:2, :2] @ J.T, "distance": np.outer(by_distance, by_distance)}
 
 
 def _curvature(model: RenderedQuadric, priors: Priors) -> EstimatedCurvature:

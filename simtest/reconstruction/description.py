@@ -252,7 +252,9 @@ def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonO
         "look_px": [float(v) if np.isfinite(v) else None for v in result.look_px],
         "axis_ratio": result.axis_ratio,
         "isovalues": [isophote.isovalue for isophote in result.isophotes],
+        "target": result.target,
         "covariance": result.covariance,
+        "budget": result.budget,
         "curvature": None,
         "flags": result.flags,
     }
@@ -269,7 +271,9 @@ def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonO
 def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
     if entry["status"] != "ok":
         return Failure(Reason(entry["status"]), entry["detail"])
-    covariance = None if entry["covariance"] is None else np.array(entry["covariance"])
     normal, candidates, look_px = (np.array(entry[key], dtype=float) for key in ("normal", "candidates", "look_px"))
     margin, flags = entry["choice_margin"], tuple(entry["flags"])
-    return Estimate(normal, candidates, look_px, entry["axis_ratio"], (), margin, covariance, flags)
+    budget = entry["budget"] and {name: np.array(part) for name, part in entry["budget"].items()}
+    return Estimate(
+        normal, candidates, look_px, entry["axis_ratio"], (), margin, flags=flags, budget=budget, target=entry["target"]
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.estimators.budget import deviations
 from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import Specularity
@@ -18,7 +19,7 @@ from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.results_table import FINE, ResultRow
+from simtest.validation.results_table import ResultRow
 from simtest.validation.rough_truth import RoughTruth
 
 MISSED = "missed"
@@ -93,8 +94,8 @@ def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> 
     # Scene.
     row = replace(
         common,
-        # All estimators state the fine surface's normal.
-        target=FINE,
+        # What was not answered would have been of the fine surface.
+        target="fine",
         surface=scene.surface.label,
         reflectance=scene.reflectance.type,
         noise_sigma=scene.sensor.noise_sigma,
@@ -147,6 +148,8 @@ def _estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
         cov_11=None if covariance is None else covariance[0, 0],
         cov_12=None if covariance is None else covariance[0, 1],
         cov_22=None if covariance is None else covariance[1, 1],
+        target=estimate.target,
+        budget={f"budget_{name}_deg": float(np.degrees(sd)) for name, sd in deviations(estimate.budget or {}).items()},
         gain_1=None if gains is None else float(gains[0]),
         gain_2=None if gains is None else float(gains[1]),
     )
@@ -183,16 +186,17 @@ def _error_row(
 
     `look_normal` is the true normal where the estimate looks, None where there is no surface.
     """
-    to_truth = angle_deg(estimate.candidates, truth.normal)
+    # The headline errors are those against the surface whose normal is stated.
+    stated = truth.normal if estimate.target == "fine" else truth.normal_base
+    to_truth = angle_deg(estimate.candidates, stated)
     error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
-    error_fine_deg = float(angle_deg(estimate.normal, truth.normal))
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
     return replace(
         row,
         axis_ratio_seen_law=axis_ratio_seen(scene, estimate, truth, smoothing_px),
-        error_deg=error_fine_deg,
-        error_fine_deg=error_fine_deg,
+        error_deg=float(to_truth[0]),
+        error_fine_deg=float(angle_deg(estimate.normal, truth.normal)),
         error_base_deg=float(angle_deg(estimate.normal, truth.normal_base)),
         error_oracle_deg=float(to_truth.min()),
         error_look_deg=error_look_deg,
@@ -200,7 +204,7 @@ def _error_row(
         error_look_law_deg=look_law_deg(scene, estimate, truth),
         error_base_law_deg=base_law_deg(scene),
         rank_correct=int(to_truth.argmin()),
-        mahalanobis2=mahalanobis2(estimate, truth.normal),
+        mahalanobis2=mahalanobis2(estimate, stated),
         gain_error=curvature.gain_error,
         gain_oracle_error=curvature.gain_oracle_error,
         direction_error_deg=curvature.direction_error_deg,

@@ -5,11 +5,14 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
+from simtest.estimators.budget import PARTS, STATED
+from simtest.estimators.protocol import Target
+
 Value = bool | int | float | str | None
 """What a column of results holds."""
 
-FINE = "fine"
-"""Target of an estimate that states the fine surface's normal, with the relief."""
+BUDGET_COLUMNS = tuple(f"budget_{part}_deg" for part in (*PARTS, STATED))
+"""Standard deviations of the parts of an estimate's budget: the square root of each part's trace, deg."""
 
 SCHEMA: dict[str, pl.DataType] = {
     "experiment": pl.String(), "label": pl.String(), "surface": pl.String(), "reflectance": pl.String(),
@@ -34,7 +37,7 @@ SCHEMA: dict[str, pl.DataType] = {
     "radius_law_px": pl.Float64(), "cloud_glints": pl.Int64(), "cloud_glints_law": pl.Float64(),
     "cloud_visible": pl.Int64(), "cloud_error_deg": pl.Float64(), "cloud_error_law_deg": pl.Float64(),
     "cloud_kd_min": pl.Float64(), "cloud_kd_max": pl.Float64(), "cloud_cov_11": pl.Float64(),
-    "cloud_cov_12": pl.Float64(), "cloud_cov_22": pl.Float64(),
+    "cloud_cov_12": pl.Float64(), "cloud_cov_22": pl.Float64(), **{name: pl.Float64() for name in BUDGET_COLUMNS},
 }  # fmt: skip
 """Columns that always exist, in order; the swept parameters follow by their own names."""
 
@@ -44,7 +47,8 @@ class ResultRow:
     """One estimator at one detected or missed highlight.
 
     Fields are named like the columns and stand in the order in which they become known; None where there is none.
-    docs/experiments.md describes them. `swept` holds the swept and drawn parameters by key path.
+    docs/experiments.md describes them. `swept` holds the swept and drawn parameters by key path, `budget`
+    the columns of `BUDGET_COLUMNS` that an estimate has.
     """
 
     # Realisation.
@@ -54,7 +58,7 @@ class ResultRow:
     setting: str | None = None
     seed: int | None = None
     laws: str | None = None
-    target: str | None = None
+    target: Target | None = None
     swept: Mapping[str, Value] = field(default_factory=dict)
     # Scene.
     surface: str | None = None
@@ -118,6 +122,7 @@ class ResultRow:
     cov_11: float | None = None
     cov_12: float | None = None
     cov_22: float | None = None
+    budget: Mapping[str, float] = field(default_factory=dict)
     gain_1: float | None = None
     gain_2: float | None = None
     # Estimate against truth.
@@ -138,8 +143,8 @@ class ResultRow:
 
     def to_row(self) -> dict[str, Value]:
         """Return the value of each column; a swept parameter gives way to a column of the same name."""
-        row = {**self.swept, **vars(self)}
-        del row["swept"]
+        row = {**self.swept, **vars(self), **self.budget}
+        del row["swept"], row["budget"]
         return row
 
 

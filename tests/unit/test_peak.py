@@ -74,10 +74,12 @@ def test_weights_sum_to_one_and_leave_a_common_axis():
 def test_what_a_drift_adds_and_where_it_adds_nothing():
     plain = fit_isophote_family(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
     assert not plain.drift_is_real
-    np.testing.assert_array_equal(plain.axis_covariance, plain.axes_covariance[:2, :2])
+    assert list(plain.axis_budget) == ["noise"]
+    np.testing.assert_array_equal(plain.axis_budget["noise"], plain.axes_covariance[:2, :2])
     family = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
     assert family.drift_is_real
-    added = family.axis_covariance - family.axes_covariance[:2, :2]
+    np.testing.assert_array_equal(family.axis_budget["noise"], family.axes_covariance[:2, :2])
+    added = family.axis_budget["shape"]
     along = family.drift / np.linalg.norm(family.drift)
     across = np.array([-along[1], along[0]])
     # What the line to the peak leaves open lies in all directions; that the mean axis is not the peak's, along the run.
@@ -85,7 +87,8 @@ def test_what_a_drift_adds_and_where_it_adds_nothing():
     assert along @ added @ along == pytest.approx(left_open + MEAN_SHARE * family.drift @ family.drift, rel=1e-6)
     assert np.sqrt(left_open) > np.radians(0.08 * PIXEL_DEG)
     noise = np.hstack([np.eye(2)] * 2) @ family.axes_covariance @ np.vstack([np.eye(2)] * 2)
-    np.testing.assert_allclose(family.peak_covariance - noise, left_open * np.eye(2), rtol=1e-2, atol=1e-10)
+    np.testing.assert_allclose(family.peak_budget["noise"], noise, rtol=1e-9)
+    np.testing.assert_allclose(family.peak_budget["shape"], left_open * np.eye(2), rtol=1e-2, atol=1e-10)
 
 
 def test_noise_alone_drifts_as_often_as_is_said():

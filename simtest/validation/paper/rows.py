@@ -17,7 +17,7 @@ from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
-from simtest.validation.results_table import FINE, SCHEMA, ResultRow, Value
+from simtest.validation.results_table import SCHEMA, ResultRow, Value
 
 SURFACE = "published plane"
 
@@ -37,7 +37,7 @@ def paper_rows(
     truth_x, truth_y, truth_z = setting.normal.tolist()
     shared = replace(
         common, surface=SURFACE, reflectance="phong", noise_sigma=setting.sigma, n_lights=1, truth_x=truth_x,
-        truth_y=truth_y, truth_z=truth_z, specularity=0, true_id=0, target=FINE,
+        truth_y=truth_y, truth_z=truth_z, specularity=0, true_id=0, target="fine",
     )  # fmt: skip
     bias = smoothing_bias(setting)
     tables = []

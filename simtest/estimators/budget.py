@@ -1,0 +1,59 @@
+"""An estimate's uncertainty as a budget: named parts, each a covariance of the normal, and their sum.
+
+A part is the covariance of the normal distribution whose 95 % region holds 95 % of the errors of that kind. For errors
+that are normal this is their covariance; for a prior with heavy tails, such as that of a light somewhere beside the
+camera, it is a little more (`equivalent_covariance`).
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from simtest.geometry import Array, chi_squared
+
+PARTS = ("noise", "resolution", "shape", "light_offset", "camera", "distance", "response", "relief")
+"""Names of the parts.
+
+noise: the sensor's. resolution: pixel, smoothing, point spread, demosaicing and coding, as seen in the residuals.
+shape: the drift over isovalues, where curvature changes inside the highlight. light_offset: a light beside the camera,
+where it is not told. camera: focal length, centre and distortion, where they are guesses. distance: of the surface from
+the camera. response: sharpening, encoding and falloff that nobody told. relief: its slope, where the base's normal is
+stated from a single highlight.
+"""
+
+STATED = "stated"
+"""Name of the one part of an estimate that states a covariance without a budget, as other packages' may."""
+
+CONFIDENCE = 0.95
+
+Budget = Mapping[str, Array]
+"""Covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``."""
+
+
+def total(budget: Budget) -> Array:
+    """Return the sum of the parts, shape (2, 2), rad^2."""
+    return np.sum(list(budget.values()), axis=0) if budget else np.zeros((2, 2))
+
+
+def dominant(budget: Budget) -> str:
+    """Return the name of the largest part, by its trace."""
+    return max(budget, key=lambda name: float(np.trace(budget[name])))
+
+
+def deviations(budget: Budget) -> dict[str, float]:
+    """Return the standard deviation of each part, rad: the square root of its trace."""
+    return {name: float(np.sqrt(max(np.trace(part), 0.0))) for name, part in budget.items()}
+
+
+def equivalent_covariance(moves: Array) -> Array:
+    """Return the covariance whose 95 % region about 0 holds 95 % of moves of the normal, shape (N, 2), rad.
+
+    It has the shape of their mean square.
+    """
+    square = moves.T @ moves / len(moves)
+    # Moves along one line have a singular mean square.
+    floor = 1e-9 * float(np.trace(square))
+    if floor <= 0:
+        return np.zeros((2, 2))
+    distances = np.einsum("ni,ni->n", moves, np.linalg.solve(square + floor * np.eye(2), moves.T).T)
+    return np.asarray(square * (float(np.quantile(distances, CONFIDENCE)) / chi_squared.quantile(CONFIDENCE, 2)))
