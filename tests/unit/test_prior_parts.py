@@ -101,7 +101,7 @@ def test_the_light_s_part_is_in_the_budget_where_none_is_told_alone():
 
 
 @pytest.mark.parametrize(
-    "prior", [CameraPrior(focal_sd=0.1), CameraPrior(centre_sd_px=12.8), CameraPrior(0.1, 12.8, 0.05)]
+    "prior", [CameraPrior(focal_sd=0.1), CameraPrior(centre_sd_px=12.8), CameraPrior(0.1, 12.8, 0.02)]
 )
 @pytest.mark.parametrize("pixel", [(330.0, 250.0), (480.0, 300.0), (600.0, 60.0)])
 def test_a_guessed_camera_is_covered(prior, pixel):
