@@ -73,9 +73,9 @@ class Photometric:
         """Estimate the normal (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
-        and ``misfit`` where the residuals hold so much more structure than the frame's noise that the stated error grows
-        by half or more: the covariance includes how far the normal moves when only the pixels around the peak are
-        fitted. It also includes the drift of the isophotes' axis where that is more than noise.
+        and ``misfit`` where the residuals hold more structure than the frame's noise and the stated error is larger by
+        half or more for it: the covariance then includes how far the normal moves when only the pixels around the peak
+        are fitted. It also includes the drift of the isophotes' axis where that is more than noise.
         """
         family = fit_isophote_family(patch, camera, CONE_AXIS_ISOVALUES)
         if isinstance(family, Failure):
