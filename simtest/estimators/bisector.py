@@ -1,5 +1,6 @@
 """`bisector`: with the light's position known, the normal bisects the directions to light and camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from simtest.calibration import NO_PRIORS, Distribution, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
@@ -34,17 +35,22 @@ class Bisector:
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, self.isovalues)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`); lights and distance must be known.
 
         The candidates are those of the lights that may have made the highlight, the proposed one first. With several
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``. Fails as `cone_axis` does, and with ``not_known``
-        without lights or distance.
+        without lights or distance. In a highlight too small for isophotes s is the sightline of its centre, flagged
+        ``unresolved``, and no axis ratio is stated.
         """
         if not priors.lights_mm or priors.distance_mm is None:
             return Failure(Reason.NOT_KNOWN, "needs the lights' places and a distance")
-        family = fit_isophote_family(patch, camera, self.isovalues)
+        family = fit_highlight(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
         lights, distance, flags = priors.lights, priors.distance_mm, family.flags
@@ -77,7 +83,7 @@ def bisect(position: Array, light: Array) -> Array:
     return np.asarray(both / np.linalg.norm(both))
 
 
-def _normal(family: IsophoteFamily, light: Array, distance: float, turn: Array | None = None) -> tuple[Array, Array]:
+def _normal(family: HighlightAxis, light: Array, distance: float, turn: Array | None = None) -> tuple[Array, Array]:
     """Return normal and sightline of the BP; `turn`, rad in the family's basis, moves the measured sightline."""
     sightline = family.peak_axis if turn is None else family.peak_axis + turn @ family.basis
     sightline = sightline / np.linalg.norm(sightline)
@@ -93,7 +99,7 @@ def _normal(family: IsophoteFamily, light: Array, distance: float, turn: Array |
     return bisect(distance * sightline, light), sightline
 
 
-def _budget(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Budget | None:
+def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal: Array) -> Budget | None:
     """Return the budget of the normal: that of the axis at the peak, and the distance."""
     if family.peak_budget is None:
         return None

@@ -1,5 +1,6 @@
 """`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,14 @@ from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
+from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.protocol import Estimate
+from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
 
@@ -65,17 +68,24 @@ class Photometric:
     Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
     """
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
         and ``misfit`` where the residuals hold more structure than the frame's noise; the covariance then includes how
         far the normal moves when only the pixels around the peak are fitted. It also includes the drift of the
-        isophotes' axis where that is more than noise.
+        isophotes' axis where that is more than noise. A highlight too small for isophotes gets the normal of its
+        centre, flagged ``unresolved``.
         """
-        family = fit_isophote_family(patch, camera, CONE_AXIS_ISOVALUES)
+        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
         if isinstance(family, Failure):
             return family
+        if isinstance(family, SmallSpot):
+            return add_light_offset_uncertainty(family.estimate(), priors)
         pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in family.isophotes))
         if isinstance(pixels, Failure):
             return pixels
