@@ -2,8 +2,8 @@
 
     python -m studies.folded_tube [FIRST] [COUNT] [FOLDER]
 
-The surface is r(z) = r0 less a ring of Gaussian profile every `fold_spacing_mm`, exact, rendered with the light at the
-camera. FOLDER keeps the frames of an earlier run, so that nothing is rendered twice.
+The surface is that of a generated colon whose centreline is straight, exact, rendered with the light at the camera.
+FOLDER keeps the frames of an earlier run, so that nothing is rendered twice.
 """
 
 import sys
@@ -12,8 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measuring import print_markdown
 from simtest.calibration import Calibration
 from simtest.estimators.protocol import Estimate
+from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.description import best_of
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
@@ -22,6 +24,7 @@ from simtest.runtime.arrays import Array, Image
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import load_scene
 from simtest.validation.matching import match
+from simtest.validation.metrics import mahalanobis2
 
 SHOWN = tuple(dict.fromkeys((*DEFAULT_ESTIMATORS, "curved", "photometric")))
 NOISE = 0.01
@@ -32,27 +35,32 @@ TUBE = {
     "surface.recipe.bend_deg": 0.0,
     "surface.recipe.sway_deg": 0.0,
     "surface.recipe.taenia_mm": 0.0,
-    # three folds make a ring
-    "surface.recipe.fold_depth_mm": 1.6,
-    "surface.recipe.fold_edge_mm": 9.0,
+    "surface.recipe.fold_depth_mm": 6.0,
+    "surface.recipe.fold_edge_mm": 3.0,
     "surface.recipe.fold_spacing_mm": 15.0,
-    "surface.recipe.fold_concentration": 0.0,
-    "surface.recipe.irregularity": 0.0,
-    "reflectance.exponent": 50.0,
     "sensor.noise_sigma": NOISE,
 }
-"""Folds of 4.8 mm, 15 mm apart, on a tube of 40 mm."""
+"""Folds 6 mm high with edges of 3 mm, 15 mm apart, in a straight tube of 40 mm."""
+
+EXPONENTS = (50.0, 20.0)
+"""Of the Phong lobe: the wider a highlight is, the more the curvature changes inside it."""
+
+BEST = "best of the defaults"
+
+Measured = tuple[float, float | None]
+"""Error, deg, and squared Mahalanobis distance of the truth, where an uncertainty is stated."""
 
 View = tuple[Image, Calibration, Array, Array]
 """A frame, its calibration, and pixels and normals of the true isolated highlights, shapes (N, 2) and (N, 3)."""
 
 
-def views(first: int, count: int, folder: Path | None) -> Iterator[View]:
+def views(exponent: float, first: int, count: int, folder: Path | None) -> Iterator[View]:
     """Yield the frames of some viewpoints, rendered or kept."""
     session = None
     for viewpoint in range(first, first + count):
-        scene = load_scene("anatomy", {**TUBE, "surface.viewpoint": viewpoint, "sensor.seed": viewpoint})
-        path = None if folder is None else folder / f"folded_tube_{viewpoint}.npz"
+        own = {"reflectance.exponent": exponent, "surface.viewpoint": viewpoint, "sensor.seed": viewpoint}
+        scene = load_scene("anatomy", {**TUBE, **own})
+        path = None if folder is None else folder / f"folded_tube_{exponent:g}_{viewpoint}.npz"
         if path is None or not path.exists():
             session = session or Session(scene)
             seen = render_view(session, scene)
@@ -68,31 +76,40 @@ def views(first: int, count: int, folder: Path | None) -> Iterator[View]:
         yield frame, scene.calibration(None), pixels, normals
 
 
-def errors(first: int, count: int, folder: Path | None) -> dict[str, list[float | None]]:
-    """Return each estimator's errors, deg, at the highlights that were found; None where it has no result."""
-    made: dict[str, list[float | None]] = {name: [] for name in (*SHOWN, "best of the defaults")}
-    for frame, calibration, pixels, normals in views(first, count, folder):
+def errors(exponent: float, first: int, count: int, folder: Path | None) -> dict[str, list[Measured | None]]:
+    """Return each estimator's errors at the highlights that were found; None where it has no result."""
+    made: dict[str, list[Measured | None]] = {name: [] for name in (*SHOWN, BEST)}
+    for frame, calibration, pixels, normals in views(exponent, first, count, folder):
         found = reconstruct(frame, calibration, SHOWN)
         for i, j in match(found, list(pixels)).items():
             estimates = found[i].estimates
             best = best_of({name: estimates[name] for name in DEFAULT_ESTIMATORS})
-            answers = {**estimates, "best of the defaults": None if best is None else estimates[best]}
+            answers = {**estimates, BEST: None if best is None else estimates[best]}
             for name, of_name in made.items():
                 answer = answers[name]
-                of_name.append(float(angle_deg(answer.normal, normals[j])) if isinstance(answer, Estimate) else None)
+                if not isinstance(answer, Estimate):
+                    of_name.append(None)
+                    continue
+                of_name.append((float(angle_deg(answer.normal, normals[j])), mahalanobis2(answer, normals[j])))
     return made
 
 
 def main() -> None:
-    """Print a row for each estimator."""
-    first, count = (int(v) for v in (*sys.argv[1:3], *("0", "60")[len(sys.argv[1:3]) :]))
+    """Print a row for each estimator and exponent."""
+    first, count = (int(v) for v in (*sys.argv[1:3], *("1000", "60")[len(sys.argv[1:3]) :]))
     folder = Path(sys.argv[3]) if len(sys.argv) > 3 else None
     print(f"viewpoints {first} to {first + count - 1}; deg")
-    print("| estimator | highlights | answered | median | RMS | p95 |\n| --- | --- | --- | --- | --- | --- |")
-    for name, all_errors in errors(first, count, folder).items():
-        own = np.array([e for e in all_errors if e is not None])
-        figures = f"{np.median(own):.3f} | {np.sqrt(np.mean(own**2)):.3f} | {np.percentile(own, 95):.3f}"
-        print(f"| {name} | {len(all_errors)} | {len(own)} | {figures} |")
+    rows = [("exponent", "estimator", "highlights", "answered", "median", "RMS", "p95", "in the 95 % region, %")]
+    for exponent in EXPONENTS:
+        for name, measured in errors(exponent, first, count, folder).items():
+            answered = [each for each in measured if each is not None]
+            own = np.array([error for error, _ in answered])
+            stated = np.array([squared for _, squared in answered if squared is not None])
+            median, rms, p95 = np.median(own), np.sqrt(np.mean(own**2)), np.percentile(own, 95)
+            covered = f"{100 * np.mean(stated <= chi_squared.quantile(0.95, 2)):.0f}" if len(stated) else ""
+            figures = (f"{median:.3f}", f"{rms:.3f}", f"{p95:.3f}", covered)
+            rows.append((f"{exponent:g}", name, str(len(measured)), str(len(own)), *figures))
+    print_markdown(rows)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.isophote_family import HOLDS_OTHERS, IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes_of_each
 from simtest.geometry import Camera, CirclePose, Patch, circle_poses
 
@@ -49,7 +49,7 @@ def _of_one(family: IsophoteFamily, least: int) -> IsophoteFamily:
     first = int(np.max(np.flatnonzero(residuals > allowed), initial=-1)) + 1
     if first == 0 or len(residuals) - first < least:
         return family
-    held = [Failure(Reason.NOT_AN_ELLIPSE, f"t = {i.isovalue:g} holds others too") for i in family.isophotes[:first]]
+    held = [Failure(Reason.NOT_AN_ELLIPSE, f"t = {i.isovalue:g} {HOLDS_OTHERS}") for i in family.isophotes[:first]]
     kept, poses = family.isophotes[first:], family.poses[first:]
     return IsophoteFamily(family.patch, family.camera, kept, poses, (*family.failures, *held))
 

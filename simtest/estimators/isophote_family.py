@@ -41,6 +41,9 @@ of the generated colon, on viewpoints that no published figure uses."""
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
 
+HOLDS_OTHERS = "holds other highlights"
+"""End of the detail of a Failure of an isophote that was left out for it."""
+
 MIN_CLIPPED_PX = 3
 """Fewer clipped pixels change a smoothed peak by less than its noise."""
 
@@ -240,7 +243,7 @@ class IsophoteFamily:
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        budget = {"noise": covariance[:2, :2], **self._clipping}
+        budget = {"noise": covariance[:2, :2], **self.clipping}
         if self._drift_chi2 <= SUSPECT_CHI2:
             return budget
         return {**budget, "shape": MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error}
@@ -260,13 +263,13 @@ class IsophoteFamily:
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        budget = {"noise": np.asarray(both @ covariance @ both.T), **self._clipping}
+        budget = {"noise": np.asarray(both @ covariance @ both.T), **self.clipping}
         # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
         return {**budget, "shape": self._line_error} if self.drift_is_real else budget
 
     @cached_property
-    def _clipping(self) -> dict[str, Array]:
-        """The part of a clipped peak, which the isophotes below do not show; empty where nothing is clipped."""
+    def clipping(self) -> dict[str, Array]:
+        """Part of the budget for a clipped peak, which the isophotes below do not show; empty if none is clipped."""
         area = plateau_area_px(self.patch, float(self._crossings.isovalues.min()))
         if area < MIN_CLIPPED_PX:
             return {}
@@ -281,6 +284,12 @@ class IsophoteFamily:
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         return self._crossings.tangents(points).T
+
+    @property
+    def least(self) -> float:
+        """Isovalue below which the isophotes hold other highlights too; 0 where none does."""
+        others = any(failure.detail.endswith(HOLDS_OTHERS) for failure in self.failures)
+        return self.isophotes[0].isovalue if others else 0.0
 
     @property
     def residuals(self) -> Array:

@@ -86,7 +86,7 @@ class Photometric:
             return family
         if isinstance(family, SmallSpot):
             return add_light_offset_uncertainty(family.estimate(), priors)
-        pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in family.isophotes))
+        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
         if isinstance(pixels, Failure):
             return pixels
         fitted = fit_lobe(_quadric(family, pixels.rays), pixels.observed, pixels.clipped)
@@ -105,7 +105,7 @@ class Photometric:
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)},
+            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2), **family.clipping},
             flags=flags,
         )
         return add_light_offset_uncertainty(estimate, priors)
@@ -180,9 +180,10 @@ class PhotometricPlane:
 photometric, photometric_plane = Photometric(), PhotometricPlane()
 
 
-def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> HighlightPixels | Failure:
-    """Gather the pixels of the first region that closes; for a cut highlight, those that are seen."""
-    closed = (t for t in REGIONS if not isinstance(patch.crossings(t), Failure))
+def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: float = 0.0) -> HighlightPixels | Failure:
+    """Gather the pixels of the first region from isovalue `least` on that closes; for a cut highlight, those seen."""
+    tried = (t for t in (*REGIONS, least) if t > 0 and t >= least)
+    closed = (t for t in tried if not isinstance(patch.crossings(t), Failure))
     t = next(closed, CUT_REGION if cut else None)
     if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")

@@ -134,7 +134,7 @@ def test_isophotes_that_hold_another_highlight_are_left_out():
     patch = patch_of(image)
     family = fit_isophote_family(patch, CAMERA, ISOVALUES)
     assert 2 <= len(family.isophotes) < len(ISOVALUES)
-    assert any("holds others" in failure.detail for failure in family.failures)
+    assert any("holds other highlights" in failure.detail for failure in family.failures)
     assert float(angle_deg(family.axis, CAMERA.unproject(CENTRE))) < 0.2
 
 
