@@ -17,7 +17,7 @@ from simtest.calibration import Calibration
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.description import best_of
+from simtest.reconstruction.ranking import best_of
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
@@ -83,7 +83,7 @@ def errors(exponent: float, first: int, count: int, folder: Path | None) -> dict
         found = reconstruct(frame, calibration, SHOWN)
         for i, j in match(found, list(pixels)).items():
             estimates = found[i].estimates
-            best = best_of({name: estimates[name] for name in DEFAULT_ESTIMATORS})
+            best, _ = best_of({name: estimates[name] for name in DEFAULT_ESTIMATORS})
             answers = {**estimates, BEST: None if best is None else estimates[best]}
             for name, of_name in made.items():
                 answer = answers[name]

@@ -11,7 +11,7 @@ from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily
-from simtest.estimators.light_offset import add_light_offset_uncertainty
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Patch
@@ -33,7 +33,7 @@ class Curved:
     which have a quarter of the noise. Where c is not known, m is known up to scale and the 2 m of the falloff is
     neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
 
-    Of the priors, the lobe's curvature is used, and the lights as by `cone_axis`.
+    Of the priors, the lobe's curvature is used; what they leave open is added to the budget as by `cone_axis`.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Curved:
         if isinstance(family, Failure):
             return family
         if isinstance(family, SmallSpot):
-            return add_light_offset_uncertainty(family.estimate(), priors)
+            return add_untold_parts(family.estimate(), camera, priors, family)
         found = _curvature(family, None if priors.lobe_curvature is None else priors.lobe_curvature.mean)
         if isinstance(found, Failure):
             return found
@@ -77,7 +77,7 @@ class Curved:
             flags=(*family.flags, "round") if is_round else family.flags,
             curvature=curvature,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 curved = Curved()

@@ -13,9 +13,9 @@ from simtest.estimators.goodness import excess_of_misfit, is_misfit
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
@@ -65,7 +65,7 @@ class Photometric:
     degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
-    Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
+    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
@@ -85,7 +85,7 @@ class Photometric:
         if isinstance(family, Failure):
             return family
         if isinstance(family, SmallSpot):
-            return add_light_offset_uncertainty(family.estimate(), priors)
+            return add_untold_parts(family.estimate(), camera, priors, family)
         pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
         if isinstance(pixels, Failure):
             return pixels
@@ -108,7 +108,7 @@ class Photometric:
             budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2), **family.clipping},
             flags=flags,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 @dataclass(frozen=True)
