@@ -138,7 +138,7 @@ def test_malformed_keys_are_named(tmp_path, text, said):
 
 @pytest.mark.parametrize("target", ["fine", "base"])
 def test_a_picture_of_which_nothing_is_told(tmp_path, target):
-    options = Options(fov_deg=53.0, encoding="linear", target=target)
+    options = Options(fov_deg=53.0, estimators=("cone_axis",), encoding="linear", target=target)
     calibration, _ = read_calibration(options, spot())
     record = reconstruct_values("spot", spot(), calibration, options)
     write_json(tmp_path / "normals.json", record)

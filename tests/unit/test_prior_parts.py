@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import InputError
 from simtest.estimators.budget import equivalent_variance, line_covariance
-from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.prior_parts import (
     SPOT_ONSET,
     SPOT_SPREAD,
