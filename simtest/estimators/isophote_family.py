@@ -21,6 +21,7 @@ from simtest.estimators.family_crossings import FamilyCrossings
 from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
+from simtest.estimators.ripples import excess
 from simtest.geometry import Array, Camera, CirclePose, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
@@ -40,6 +41,10 @@ PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
 """Variance of the axis at the peak over the squared drift, and a constant added to it, px^2, where there is a drift:
 terms of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE were fitted to 614 highlights
 of the generated colon, on viewpoints that no published figure uses."""
+
+MEAN_RIPPLES, PEAK_RIPPLES = 11.0, 17.0
+"""Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`); fitted
+to random fields of glints that no published figure uses (docs/uncertainty.md)."""
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
@@ -227,16 +232,34 @@ class IsophoteFamily:
         """Return the widening at each level, px^2."""
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
+    @cached_property
+    def ripple_error(self) -> Array:
+        """Covariance of a centre that ripples as the isophotes do beyond noise, shape (2, 2), rad^2.
+
+        The isophotes are combined as in the axis at the peak, which weights what differs between them; the noise must
+        be known.
+        """
+        covariance, ellipse = self.axes_covariance, np.asarray(self._tangent_moments.mean(axis=0))
+        assert covariance is not None
+        size_px2 = float(np.sqrt(np.linalg.det(ellipse) / np.linalg.det(self._px2)))
+        radius2 = size_px2 / self.patch.smoothing_px**2 if self.patch.smoothing_px > 0 else np.inf
+        by_noise = float(np.trace(np.linalg.solve(ellipse, _summed(covariance)))) / 2
+        weights = self._weights if self.can_extrapolate else np.ones(1)
+        return np.asarray(excess(self._crossings.ripples, weights, self.levels, by_noise, radius2) * ellipse)
+
     @property
     def axis_budget(self) -> Budget | None:
-        """Budget of the mean axis in the basis: noise, and shape where the drift may be more than noise."""
+        """Budget of the mean axis in the basis.
+
+        Noise; resolution, where the isophotes ripple by more than noise; shape, where the drift may be more than noise.
+        """
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        if self._drift_chi2 <= SUSPECT_CHI2:
-            return {"noise": covariance[:2, :2]}
-        shape = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
-        return {"noise": covariance[:2, :2], "shape": shape}
+        parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error}
+        if self._drift_chi2 > SUSPECT_CHI2:
+            parts["shape"] = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
+        return _present(parts)
 
     @property
     def drift_excess(self) -> float:
@@ -248,14 +271,14 @@ class IsophoteFamily:
 
     @property
     def peak_budget(self) -> Budget | None:
-        """Budget of the axis at the peak in the basis: noise, and shape where a straight line misses the drift."""
+        """Budget of the axis at the peak in the basis, of the same parts: shape is what a straight line misses."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        both = np.hstack([np.eye(2), np.eye(2)])
-        noise = np.asarray(both @ covariance @ both.T)
-        # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
-        return {"noise": noise, "shape": self._line_error} if self.drift_is_real else {"noise": noise}
+        parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error}
+        if self._drift_chi2 > SUSPECT_CHI2:
+            parts["shape"] = self._line_error
+        return _present(parts)
 
     @property
     def _line_error(self) -> Array:
@@ -341,6 +364,17 @@ def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]
             return failures[0]
         failures = failed
     return IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures))
+
+
+def _summed(covariance: Array) -> Array:
+    """Return the covariance of the sum of two pairs from that of both, shape (4, 4)."""
+    both = np.hstack([np.eye(2), np.eye(2)])
+    return np.asarray(both @ covariance @ both.T)
+
+
+def _present(parts: dict[str, Array]) -> dict[str, Array]:
+    """Return the parts of a budget that are not 0; noise is always stated."""
+    return {name: part for name, part in parts.items() if name == "noise" or part.any()}
 
 
 def _with_poses(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.calibration import Calibration, Priors, Uniform
+from simtest.calibration import Calibration, CameraPrior, Priors, Uniform
 from simtest.errors import InputError
 from simtest.geometry import Array, Patch
 from simtest.runtime.files import write_atomically
@@ -74,7 +74,8 @@ def calibration_of(number: int, row: Row, span_mm: tuple[float, float]) -> Calib
         return replace(calibration, priors=priors)
     off = max(1 + PRIOR_FOCAL_SD * float(rng_of(number, "focal").standard_normal()), 0.6)
     camera = calibration.camera
-    return replace(calibration, camera=replace(camera, fx=camera.fx * off, fy=camera.fy * off), priors=priors)
+    told = replace(priors, camera=CameraPrior(focal_sd=PRIOR_FOCAL_SD))
+    return replace(calibration, camera=replace(camera, fx=camera.fx * off, fy=camera.fy * off), priors=told)
 
 
 def save(path: Path, cases: list[Case]) -> None:
