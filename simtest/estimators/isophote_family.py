@@ -7,7 +7,6 @@ extrapolated to the peak by a straight line (theory.md section 3, items 3 and 4;
 isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.extrapolation`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,18 +15,16 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
+from simtest.estimators.clipping import hidden_peak_moments, plateau_area_px
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_crossings import FamilyCrossings
-from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
 from simtest.estimators.ripples import excess
-from simtest.geometry import Array, Camera, CirclePose, Patch, circle_poses, cone_axes
+from simtest.geometry import Array, Camera, CirclePose, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
-
-MIN_ISOPHOTES = 2
-"""One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
 """Squared Mahalanobis distances beyond which the axis's drift is more than noise, or may be: 0.1 % and 20 % of normal
@@ -43,11 +40,17 @@ terms of higher order, pixels and, in renders of meshes, triangles. These and ME
 of the generated colon, on viewpoints that no published figure uses."""
 
 MEAN_RIPPLES, PEAK_RIPPLES = 11.0, 17.0
-"""Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`); fitted
-to random fields of glints that no published figure uses (docs/uncertainty.md)."""
+"""Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`);
+fitted to random fields of glints that no published figure uses (docs/uncertainty.md)."""
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
+
+HOLDS_OTHERS = "holds other highlights"
+"""End of the detail of a Failure of an isophote that was left out for it."""
+
+MIN_CLIPPED_PX = 3
+"""Fewer clipped pixels change a smoothed peak by less than its noise."""
 
 NOISE_FACTOR = 2.0
 """Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
@@ -117,7 +120,7 @@ class IsophoteFamily:
     def _weights(self) -> Array:
         """Weights of the cones' axes in the axis at the peak, shape (K,)."""
         crossings = self._crossings
-        return weights_of_axes(crossings.conics, crossings.isovalues, self._px2, self.patch.smoothing_px)
+        return weights_of_axes(crossings.conics, crossings.isovalues, self.px2, self.patch.smoothing_px)
 
     @property
     def can_extrapolate(self) -> bool:
@@ -140,6 +143,11 @@ class IsophoteFamily:
     def drift_is_real(self) -> bool:
         """Whether the drift is more than noise; False where the noise is not known."""
         return self._drift_chi2 > DRIFT_CHI2
+
+    @property
+    def drift_is_suspect(self) -> bool:
+        """Whether the drift may be more than noise."""
+        return self._drift_chi2 > SUSPECT_CHI2
 
     @cached_property
     def _drift_chi2(self) -> float:
@@ -169,9 +177,14 @@ class IsophoteFamily:
         """The same without extrapolation, shape (2, 2): less noisy, with the same principal directions."""
         return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
 
+    @property
+    def smoothed_moments(self) -> Array:
+        """The same of the lobe as smoothing leaves it, shape (2, 2)."""
+        return np.asarray(self._tangent_moments.mean(axis=0) / (2 * self.levels.mean()))
+
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
-        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)
+        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self.px2)
 
     @cached_property
     def _tangent_moments(self) -> Array:
@@ -184,7 +197,7 @@ class IsophoteFamily:
         return np.asarray((across * squares[:, None]) @ across.transpose(0, 2, 1))
 
     @cached_property
-    def _px2(self) -> Array:
+    def px2(self) -> Array:
         """1 px^2 about the axis's pixel in the basis, rad^2, shape (2, 2)."""
         pixel = self.camera.project(self.axis)
         steps = np.array([[0.5, 0.0], [0.0, 0.5]])
@@ -215,6 +228,13 @@ class IsophoteFamily:
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
         return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
+    def at(self, isovalue: float) -> "IsophoteFamily | None":
+        """Return the family of one of the isophotes alone, if it is whole."""
+        for isophote, pose in zip(self.isophotes, self.poses, strict=True):
+            if isophote.isovalue == isovalue and not isophote.cut:
+                return IsophoteFamily(self.patch, self.camera, (isophote,), (pose,), ())
+        return None
+
     def conic(self, k: int) -> Array:
         """Return (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
         return self._crossings.conics[k]
@@ -226,7 +246,7 @@ class IsophoteFamily:
 
     def widening(self, k: int = 0) -> Array:
         """Return what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
-        return self._added_px2(self.levels)[k] * self._px2
+        return self._added_px2(self.levels)[k] * self.px2
 
     def _added_px2(self, levels: Array) -> Array:
         """Return the widening at each level, px^2."""
@@ -241,23 +261,24 @@ class IsophoteFamily:
         """
         covariance, ellipse = self.axes_covariance, np.asarray(self._tangent_moments.mean(axis=0))
         assert covariance is not None
-        size_px2 = float(np.sqrt(np.linalg.det(ellipse) / np.linalg.det(self._px2)))
-        radius2 = size_px2 / self.patch.smoothing_px**2 if self.patch.smoothing_px > 0 else np.inf
+        size_px2 = float(np.sqrt(np.linalg.det(ellipse) / np.linalg.det(self.px2)))
         by_noise = float(np.trace(np.linalg.solve(ellipse, _summed(covariance)))) / 2
         weights = self._weights if self.can_extrapolate else np.ones(1)
-        return np.asarray(excess(self._crossings.ripples, weights, self.levels, by_noise, radius2) * ellipse)
+        beyond = excess(self._crossings.ripples, weights, self.levels, by_noise, size_px2, self.patch.smoothing_px)
+        return np.asarray(beyond * ellipse)
 
     @property
     def axis_budget(self) -> Budget | None:
         """Budget of the mean axis in the basis.
 
-        Noise; resolution, where the isophotes ripple by more than noise; shape, where the drift may be more than noise.
+        Noise; resolution, where the peak is clipped, or the isophotes ripple by more than noise; shape, where the drift
+        may be more than noise.
         """
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error}
-        if self._drift_chi2 > SUSPECT_CHI2:
+        parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error + self.clipping}
+        if self.drift_is_suspect:
             parts["shape"] = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
         return _present(parts)
 
@@ -265,7 +286,7 @@ class IsophoteFamily:
     def drift_excess(self) -> float:
         """Squared drift beyond noise, rad^2; 0 where it may be noise, or the noise is not known."""
         covariance = self.axes_covariance
-        if covariance is None or self._drift_chi2 <= SUSPECT_CHI2:
+        if covariance is None or not self.drift_is_suspect:
             return 0.0
         return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
 
@@ -275,19 +296,40 @@ class IsophoteFamily:
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error}
-        if self._drift_chi2 > SUSPECT_CHI2:
+        parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error + self.clipping}
+        # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
+        if self.drift_is_real:
             parts["shape"] = self._line_error
         return _present(parts)
+
+    @cached_property
+    def clipping(self) -> Array:
+        """Covariance for a clipped peak, which the isophotes below do not show; 0 where none is clipped."""
+        area = plateau_area_px(self.patch, float(self._crossings.isovalues.min()))
+        if area < MIN_CLIPPED_PX:
+            return np.zeros((2, 2))
+        innermost = float(self.residuals[-1])
+        return hidden_peak_moments(area, self._tangent_moments.sum(axis=0), self.px2, innermost)
 
     @property
     def _line_error(self) -> Array:
         """Covariance of the peak of a lopsided highlight beyond noise, rad^2, shape (2, 2)."""
-        return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self._px2)
+        return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self.px2)
 
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         return self._crossings.tangents(points).T
+
+    @property
+    def least(self) -> float:
+        """Isovalue below which the isophotes hold other highlights too; 0 where none does."""
+        others = any(failure.detail.endswith(HOLDS_OTHERS) for failure in self.failures)
+        return self.isophotes[0].isovalue if others else 0.0
+
+    @property
+    def residuals(self) -> Array:
+        """RMS distance of each isophote's points from its conic, over its mean radius, shape (K,)."""
+        return self._crossings.residuals
 
     @cached_property
     def is_bent(self) -> bool:
@@ -298,7 +340,7 @@ class IsophoteFamily:
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
-        return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
+        return bool((self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -341,31 +383,6 @@ class IsophoteFamily:
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
 
 
-def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
-    """Fit the isophotes of one highlight.
-
-    Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
-    fitted too; with fewer than 2 of either kind the result is the first one's Failure.
-    """
-    # whole isophotes
-    fitted, failures = fit_isophotes(patch, camera, isovalues)
-    kept, poses, failures = _with_poses(fitted, failures)
-    least = min(MIN_ISOPHOTES, len(isovalues))
-    if len(poses) < least:
-        # too few: add arcs of those that the border or the view cuts
-        whole = {isophote.isovalue for isophote in kept}
-        arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in whole]
-        cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
-        if len(kept) + len(cut) < least:
-            return failures[0]
-        failed = [arc for arc in arcs if isinstance(arc, Failure)]
-        kept, poses, failed = _with_poses(sorted([*kept, *cut], key=lambda i: i.isovalue), failed)
-        if len(poses) < least:
-            return failures[0]
-        failures = failed
-    return IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures))
-
-
 def _summed(covariance: Array) -> Array:
     """Return the covariance of the sum of two pairs from that of both, shape (4, 4)."""
     both = np.hstack([np.eye(2), np.eye(2)])
@@ -375,22 +392,3 @@ def _summed(covariance: Array) -> Array:
 def _present(parts: dict[str, Array]) -> dict[str, Array]:
     """Return the parts of a budget that are not 0; noise is always stated."""
     return {name: part for name, part in parts.items() if name == "noise" or part.any()}
-
-
-def _with_poses(
-    fitted: list[FittedIsophote], failures: list[Failure]
-) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
-    """Return the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
-    if not fitted:
-        return [], [], failures
-    found = circle_poses(
-        np.array([isophote.cone for isophote in fitted]), np.array([isophote.sightline for isophote in fitted])
-    )
-    kept, poses = [], []
-    for isophote, pose in zip(fitted, (found[i] for i in range(len(fitted))), strict=True):
-        if isinstance(pose, Failure):
-            failures = [*failures, pose]
-        else:
-            kept.append(isophote)
-            poses.append(pose)
-    return kept, poses, failures

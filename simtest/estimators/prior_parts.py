@@ -12,7 +12,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
 from simtest.estimators.budget import CONFIDENCE, equivalent_variance
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
@@ -35,7 +35,7 @@ SHARES = (np.arange(64) + 0.5) / 64
 
 
 def add_untold_parts(
-    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
     """Add what nobody told to the budget of a normal that is a reversed sightline.
 
@@ -53,8 +53,8 @@ def add_untold_parts(
         Calibration.
     priors : Priors
         What is told.
-    family : IsophoteFamily, optional
-        The highlight's isophotes: their moments say how far a falloff moves the peak.
+    family : IsophoteFamily or SmallSpot, optional
+        The highlight's isophotes or spot: their moments say how far a falloff moves the peak.
     """
     if priors.lights_mm:
         estimate = _with_told_lights(estimate, priors)
@@ -64,7 +64,7 @@ def add_untold_parts(
 
 
 def add_camera_and_falloff(
-    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
     """Add the parts ``camera`` and ``response`` to the budget of an estimate that has one."""
     if estimate.budget is None:
@@ -100,7 +100,7 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     return np.nan_to_num(J @ in_pixels @ J.T)
 
 
-def falloff_part(normal: Array, family: IsophoteFamily, power: Distribution) -> Array:
+def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:
     """Return the covariance of the normal by a falloff cos^k that is left in the frame, shape (2, 2), rad^2.
 
     Its slope, k tan(phi) towards the optical axis, moves the peak by the lobe's moments 1/H times the slope (theory.md

@@ -1,9 +1,9 @@
 """Ripples: how isophotes depart from their ellipses, and what that says of an error of their centre.
 
 Whatever disturbs a highlight's pixels, noise that demosaicing, coding or sharpening has correlated, a neighbour, a
-texture or a relief below it, moves its isophotes in all harmonics of the direction phi from the centre alike, as far as
-smoothing leaves them. Harmonics 0 to 2 are size, centre and ellipse, which a fit takes for the highlight's own. The next
-ones remain: they are seen, and say how far the centre may be off, whatever the disturbance is.
+texture or a relief below it, moves its isophotes in all harmonics of the direction phi from the centre alike, as far
+as smoothing leaves them. Harmonics 0 to 2 are size, centre and ellipse, which a fit takes for the highlight's own. The
+next ones remain: they are seen, and say how far the centre may be off, whatever the disturbance is.
 
 Radii are relative to the ellipse's, so that a ripple of variance v in one direction stands for a covariance v E of the
 centre, E the ellipse's second moments (its boundary is w^T E^-1 w = 1).
@@ -22,6 +22,9 @@ HARMONICS = np.array([4, 5, 6])
 BY_CHANCE = 2.0
 """Ripples of less than so many times the power that the sensor's noise makes say nothing: 6 % of highlights with noise
 alone exceed it."""
+
+BY_PIXELS = 3e-4
+"""Power that linear interpolation between pixels leaves in a harmonic, times the fourth power of the radius in px."""
 
 LARGEST_GAP = 3.0
 """A point of a cut isophote stands for so many mean distances between points at most."""
@@ -76,7 +79,9 @@ def ripples(tangents: Array, conics: Array, counts: Index) -> AnyArray:
     return np.asarray(np.add.reduceat(weighted * np.array([fourth, fourth * turn, fourth * square]), starts, axis=1).T)
 
 
-def excess(each: AnyArray, weights: Array, levels: Array, by_noise: float, radius2: float) -> float:
+def excess(
+    each: AnyArray, weights: Array, levels: Array, by_noise: float, size_px2: float, smoothing_px: float
+) -> float:
     """Return the variance of a combined centre that ripples beyond noise stand for, relative to the mean ellipse.
 
     Parameters
@@ -89,18 +94,23 @@ def excess(each: AnyArray, weights: Array, levels: Array, by_noise: float, radiu
         -ln t of each.
     by_noise : float
         Variance of the combined centre by the sensor's noise, relative to the mean ellipse.
-    radius2 : float
-        Squared radius of the mean ellipse over the squared width of the smoothing; inf where nothing was smoothed.
+    size_px2 : float
+        Squared mean radius of the mean ellipse, px^2.
+    smoothing_px : float
+        Standard deviation of the smoothing, px.
     """
     # A contour's radius is relative to its own ellipse, whose size goes with the root of the level.
     share = np.sqrt(np.maximum(levels / levels.mean(), 0.0))
     power = np.abs((weights * share) @ each) ** 2 / 2
-    seen = float(np.mean(power - BY_CHANCE * by_noise * spectrum(radius2)))
-    return max(seen, 0.0)
+    radius2 = size_px2 / smoothing_px**2 if smoothing_px > 0 else np.inf
+    known = BY_CHANCE * by_noise * spectrum(radius2) + BY_PIXELS / size_px2**2
+    return max(float(np.mean(power - known)), 0.0)
 
 
 def spectrum(radius2: float) -> Array:
     """Return the power of white noise in the harmonics over that in the first one, shape (3,).
+
+    `radius2` is the squared radius over the squared width of the smoothing; inf where nothing was smoothed.
 
     Smoothed by a Gaussian of width s, noise on a circle of radius r has the correlation exp(-z (1 - cos phi)) with
     z = r^2 / 2 s^2. Its Fourier series are modified Bessel functions, I_m(z) / I_1(z).

@@ -20,11 +20,12 @@ from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
+from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
-DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
 SMOOTHING_BY_COLOUR_PX = 1.0
@@ -139,7 +140,8 @@ def reconstruct_colour(
     Returns
     -------
     Reconstruction
-        Estimates of highlights that smoothing has made rounder have the flag ``small``.
+        Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
+        to have a shape ``unresolved``.
     """
     return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
 
@@ -297,7 +299,8 @@ def _flagged(
         (x, y), (height, width) = patch.origin_px, patch.values.shape
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    flags = ("small",) if small else ()
+    # An unresolved highlight states no shape that smoothing could have changed.
+    flags = ("small",) if small and UNRESOLVED not in result.flags else ()
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
