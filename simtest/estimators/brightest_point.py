@@ -3,15 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES, HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
-from simtest.estimators.family_fit import fit_isophote_family
+from simtest.estimators.budget import Budget
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights, fit_small
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera, Patch
+from simtest.geometry import Array, Camera, Patch
+
+PIXEL_PX2 = 0.024
+"""Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""
+
+DRIFT_SHARE, RIPPLES = 0.15, 12.5
+"""Variances of the peak over the squared drift of the isophotes' axis and over the ripples (`IsophoteFamily`). All
+three were fitted to random fields of glints that no published figure uses (docs/uncertainty.md)."""
+
+LEAST_SMOOTHING_PX = 0.5
+"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
 
 
 @dataclass(frozen=True)
@@ -30,27 +42,52 @@ class BrightestPoint:
 
         The estimate has one candidate and looks at the peak. It has the flags of `cone_axis` for the isophote at
         t = 0.5: where that runs into the border the peak itself may be cut off, and along a streak it may lie anywhere.
-        In a highlight too small for isophotes it looks at the fitted centre instead, flagged ``unresolved``.
+        In a highlight too small for isophotes it looks at the fitted centre instead, flagged ``unresolved``. The budget
+        follows from the isophotes; without any, no uncertainty is stated.
         """
         if (spot := fit_small([patch], camera)[0]) is not None:
             return add_untold_parts(spot.estimate(), camera, priors, spot)
         normal = -camera.unproject(patch.peak_px)
-        family = _half_height(patch, camera)
-        estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(family))
-        return add_untold_parts(estimate, camera, priors, None if isinstance(family, Failure) else family)
+        whole = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
+        family = whole if isinstance(whole, IsophoteFamily) else None
+        budget = None if family is None else _budget(family)
+        estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera, family), budget=budget)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
-def _half_height(patch: Patch, camera: Camera) -> IsophoteFamily | Failure:
-    """Return the isophote at t = 0.5, which is one of those that the other estimators use."""
-    whole = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-    own = whole.at(HIGHLIGHT_ISOVALUE) if isinstance(whole, IsophoteFamily) else None
-    return own or fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
+def _flags(patch: Patch, camera: Camera, family: IsophoteFamily | None) -> tuple[str, ...]:
+    # The isophote is one of those that the other estimators use.
+    if family is not None and (own := family.at(HIGHLIGHT_ISOVALUE)) is not None:
+        return own.flags
+    alone = fit_highlight(patch, camera, (HIGHLIGHT_ISOVALUE,))
+    if isinstance(alone, Failure):
+        return ("partial_arc",) if alone.reason == Reason.NO_CLOSED_ISOPHOTE else ()
+    return () if not isinstance(alone, IsophoteFamily) else alone.flags
 
 
-def _flags(family: IsophoteFamily | Failure) -> tuple[str, ...]:
-    if isinstance(family, Failure):
-        return ("partial_arc",) if family.reason == Reason.NO_CLOSED_ISOPHOTE else ()
-    return family.flags
+def _budget(family: IsophoteFamily) -> Budget | None:
+    """Return the budget of the peak in the family's basis, which differs from the peak's by a few degrees at most."""
+    if family.axes_covariance is None:
+        return None
+    resolution = PIXEL_PX2 * family.px2 + RIPPLES * family.ripple_error + family.clipping
+    parts = {"noise": _noise(family), "resolution": resolution}
+    if family.drift_is_suspect:
+        parts["shape"] = DRIFT_SHARE * np.outer(family.drift, family.drift)
+    return parts
+
+
+def _noise(family: IsophoteFamily) -> Array:
+    """Return the covariance of the peak by the sensor's noise, shape (2, 2), rad^2.
+
+    Noise sigma, smoothed by s, has a slope of variance sigma^2 / (8 pi s^4) an axis. The peak lies where it balances
+    that of the lobe, I0 / V, with V the second moments of the smoothed lobe.
+    """
+    patch = family.patch
+    known = patch.noise
+    sigma = float(known[patch.peak_pixel[::-1]]) if isinstance(known, np.ndarray) else float(known or 0.0)
+    slope = sigma / (np.sqrt(8 * np.pi) * max(patch.smoothing_px, LEAST_SMOOTHING_PX) ** 2 * patch.peak_value)
+    lobe = family.smoothed_moments
+    return np.asarray(slope**2 * lobe @ np.linalg.solve(family.px2, lobe))
 
 
 brightest_point = BrightestPoint()

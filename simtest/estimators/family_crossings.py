@@ -11,8 +11,10 @@ import numpy as np
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue
 from simtest.estimators.propagation import Rows, conics_by_crossings, raw_moves
+from simtest.estimators.ripples import ripples
 from simtest.geometry import Array, Camera, Index, Mask, Patch
 from simtest.geometry.level_sets import Crossings
+from simtest.runtime.arrays import AnyArray
 
 STEP_PX = 0.1
 """Step of the central differences of a distorting lens's sightlines."""
@@ -77,6 +79,11 @@ class FamilyCrossings:
         mean = np.add.reduceat(squares, [part.start for part in self._parts]) / self._counts
         a, b, c = self.conics.T[:3]
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
+
+    @cached_property
+    def ripples(self) -> AnyArray:
+        """Harmonics of each isophote's radius about its ellipse, shape (K, 3), complex (`ripples.ripples`)."""
+        return ripples(self._point_tangents, self.conics, self._counts)
 
     def moved_by_noise(self, by_conic: Array, by_level: tuple[Array, PeakValue] | None = None) -> Rows:
         """Return how far one standard deviation of noise in each raw pixel moves Q quantities, shape (Q, P).

@@ -21,6 +21,7 @@ from simtest.estimators.family_crossings import FamilyCrossings
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
+from simtest.estimators.ripples import excess
 from simtest.geometry import Array, Camera, CirclePose, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
@@ -37,6 +38,10 @@ PEAK_SHARE, PEAK_PX2 = 0.02, 0.008
 """Variance of the axis at the peak over the squared drift, and a constant added to it, px^2, where there is a drift:
 terms of higher order, pixels and, in renders of meshes, triangles. These and MEAN_SHARE were fitted to 614 highlights
 of the generated colon, on viewpoints that no published figure uses."""
+
+MEAN_RIPPLES, PEAK_RIPPLES = 11.0, 17.0
+"""Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`);
+fitted to random fields of glints that no published figure uses (docs/uncertainty.md)."""
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
@@ -115,7 +120,7 @@ class IsophoteFamily:
     def _weights(self) -> Array:
         """Weights of the cones' axes in the axis at the peak, shape (K,)."""
         crossings = self._crossings
-        return weights_of_axes(crossings.conics, crossings.isovalues, self._px2, self.patch.smoothing_px)
+        return weights_of_axes(crossings.conics, crossings.isovalues, self.px2, self.patch.smoothing_px)
 
     @property
     def can_extrapolate(self) -> bool:
@@ -138,6 +143,11 @@ class IsophoteFamily:
     def drift_is_real(self) -> bool:
         """Whether the drift is more than noise; False where the noise is not known."""
         return self._drift_chi2 > DRIFT_CHI2
+
+    @property
+    def drift_is_suspect(self) -> bool:
+        """Whether the drift may be more than noise."""
+        return self._drift_chi2 > SUSPECT_CHI2
 
     @cached_property
     def _drift_chi2(self) -> float:
@@ -176,9 +186,14 @@ class IsophoteFamily:
         levels = -np.log([isophote.isovalue for isophote in self.isophotes])
         return np.asarray(self._tangent_moments.sum(axis=0) / (2 * levels.sum()))
 
+    @property
+    def smoothed_moments(self) -> Array:
+        """The same of the lobe as smoothing leaves it, shape (2, 2)."""
+        return np.asarray(self._tangent_moments.mean(axis=0) / (2 * self.levels.mean()))
+
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
-        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)
+        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self.px2)
 
     @cached_property
     def _tangent_moments(self) -> Array:
@@ -191,7 +206,7 @@ class IsophoteFamily:
         return np.asarray((across * squares[:, None]) @ across.transpose(0, 2, 1))
 
     @cached_property
-    def _px2(self) -> Array:
+    def px2(self) -> Array:
         """1 px^2 about the axis's pixel in the basis, rad^2, shape (2, 2)."""
         pixel = self.camera.project(self.axis)
         steps = np.array([[0.5, 0.0], [0.0, 0.5]])
@@ -240,55 +255,75 @@ class IsophoteFamily:
 
     def widening(self, k: int = 0) -> Array:
         """Return what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
-        return self._added_px2(self.levels)[k] * self._px2
+        return self._added_px2(self.levels)[k] * self.px2
 
     def _added_px2(self, levels: Array) -> Array:
         """Return the widening at each level, px^2."""
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
+    @cached_property
+    def ripple_error(self) -> Array:
+        """Covariance of a centre that ripples as the isophotes do beyond noise, shape (2, 2), rad^2.
+
+        The isophotes are combined as in the axis at the peak, which weights what differs between them; the noise must
+        be known.
+        """
+        covariance, ellipse = self.axes_covariance, np.asarray(self._tangent_moments.mean(axis=0))
+        assert covariance is not None
+        size_px2 = float(np.sqrt(np.linalg.det(ellipse) / np.linalg.det(self.px2)))
+        by_noise = float(np.trace(np.linalg.solve(ellipse, _summed(covariance)))) / 2
+        weights = self._weights if self.can_extrapolate else np.ones(1)
+        beyond = excess(self._crossings.ripples, weights, self.levels, by_noise, size_px2, self.patch.smoothing_px)
+        return np.asarray(beyond * ellipse)
+
     @property
     def axis_budget(self) -> Budget | None:
-        """Budget of the mean axis in the basis: noise, shape where the drift may be more, resolution if clipped."""
+        """Budget of the mean axis in the basis.
+
+        Noise; resolution, where the peak is clipped, or the isophotes ripple by more than noise; shape, where the drift
+        may be more than noise.
+        """
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        budget = {"noise": covariance[:2, :2], **self.clipping}
-        if self._drift_chi2 <= SUSPECT_CHI2:
-            return budget
-        return {**budget, "shape": MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error}
+        parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error + self.clipping}
+        if self.drift_is_suspect:
+            parts["shape"] = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
+        return _present(parts)
 
     @property
     def drift_excess(self) -> float:
         """Squared drift beyond noise, rad^2; 0 where it may be noise, or the noise is not known."""
         covariance = self.axes_covariance
-        if covariance is None or self._drift_chi2 <= SUSPECT_CHI2:
+        if covariance is None or not self.drift_is_suspect:
             return 0.0
         return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
 
     @property
     def peak_budget(self) -> Budget | None:
-        """Budget of the axis at the peak in the basis: noise, shape where a line misses the drift, resolution."""
+        """Budget of the axis at the peak in the basis, of the same parts: shape is what a straight line misses."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
-        both = np.hstack([np.eye(2), np.eye(2)])
-        budget = {"noise": np.asarray(both @ covariance @ both.T), **self.clipping}
+        parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error + self.clipping}
         # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
-        return {**budget, "shape": self._line_error} if self.drift_is_real else budget
+        if self.drift_is_real:
+            parts["shape"] = self._line_error
+        return _present(parts)
 
     @cached_property
-    def clipping(self) -> dict[str, Array]:
-        """Part of the budget for a clipped peak, which the isophotes below do not show; empty if none is clipped."""
+    def clipping(self) -> Array:
+        """Covariance for a clipped peak, which the isophotes below do not show; 0 where none is clipped."""
         area = plateau_area_px(self.patch, float(self._crossings.isovalues.min()))
         if area < MIN_CLIPPED_PX:
-            return {}
+            return np.zeros((2, 2))
         innermost = float(self.residuals[-1])
-        return {"resolution": hidden_peak_moments(area, self._tangent_moments.sum(axis=0), self._px2, innermost)}
+        return hidden_peak_moments(area, self._tangent_moments.sum(axis=0), self.px2, innermost)
 
     @property
     def _line_error(self) -> Array:
         """Covariance of the peak of a lopsided highlight beyond noise, rad^2, shape (2, 2)."""
-        return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self._px2)
+        return np.asarray(PEAK_SHARE * self.drift_excess * np.eye(2) + PEAK_PX2 * self.px2)
 
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
@@ -355,3 +390,14 @@ class IsophoteFamily:
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
+
+
+def _summed(covariance: Array) -> Array:
+    """Return the covariance of the sum of two pairs from that of both, shape (4, 4)."""
+    both = np.hstack([np.eye(2), np.eye(2)])
+    return np.asarray(both @ covariance @ both.T)
+
+
+def _present(parts: dict[str, Array]) -> dict[str, Array]:
+    """Return the parts of a budget that are not 0; noise is always stated."""
+    return {name: part for name, part in parts.items() if name == "noise" or part.any()}

@@ -103,13 +103,16 @@ class Photometric:
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
+        budget = {"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)}
+        if family.clipping.any():
+            budget["resolution"] = family.clipping
         estimate = Estimate(
             normal=fitted.model.normal,
             candidates=fitted.model.normal[None],
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2), **family.clipping},
+            budget=budget,
             flags=family.flags,
         )
         estimate = add_untold_parts(estimate, camera, priors, family)

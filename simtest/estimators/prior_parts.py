@@ -62,8 +62,8 @@ def add_untold_parts(
         Calibration.
     priors : Priors
         What is told.
-    family : HighlightAxis, optional
-        The highlight's isophotes: their moments say how far a falloff moves the peak.
+    family : IsophoteFamily or SmallSpot, optional
+        The highlight's isophotes or spot: their moments say how far a falloff moves the peak.
     """
     if priors.lights_mm:
         return add_camera_and_falloff(_with_told_lights(estimate, priors), camera, priors, family)

@@ -65,11 +65,11 @@ def test_on_a_base_the_axis_runs_with_the_area():
 
 def test_weights_sum_to_one_and_leave_a_common_axis():
     family = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
-    weights = weights_of_axes(family._crossings.conics, family._crossings.isovalues, family._px2, 2.0)
+    weights = weights_of_axes(family._crossings.conics, family._crossings.isovalues, family.px2, 2.0)
     assert weights.sum() == pytest.approx(1)
     assert angle_deg(family.peak_axis, family.axis) < 0.01 * PIXEL_DEG
     one = family._crossings
-    assert weights_of_axes(one.conics[:1], one.isovalues[:1], family._px2, 2.0) == pytest.approx([1])
+    assert weights_of_axes(one.conics[:1], one.isovalues[:1], family.px2, 2.0) == pytest.approx([1])
 
 
 def test_what_a_drift_adds_and_where_it_adds_nothing():
