@@ -35,22 +35,22 @@ class BrightestPoint:
         if (spot := fit_small([patch], camera)[0]) is not None:
             return add_untold_parts(spot.estimate(), camera, priors, spot)
         normal = -camera.unproject(patch.peak_px)
-        family = _half_height(patch, camera)
-        estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(family))
-        return add_untold_parts(estimate, camera, priors, None if isinstance(family, Failure) else family)
+        family, flags = _family(patch, camera)
+        estimate = Estimate(normal, normal[None], patch.peak_px, flags=flags)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
-def _half_height(patch: Patch, camera: Camera) -> IsophoteFamily | Failure:
-    """Return the isophote at t = 0.5, which is one of those that the other estimators use."""
+def _family(patch: Patch, camera: Camera) -> tuple[IsophoteFamily | None, tuple[str, ...]]:
+    """Return the highlight's isophotes, and the flags of that at t = 0.5."""
+    # It is one of those that the other estimators use.
     whole = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-    own = whole.at(HIGHLIGHT_ISOVALUE) if isinstance(whole, IsophoteFamily) else None
-    return own or fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
-
-
-def _flags(family: IsophoteFamily | Failure) -> tuple[str, ...]:
+    flags = whole.flags_at(HIGHLIGHT_ISOVALUE) if isinstance(whole, IsophoteFamily) else None
+    if isinstance(whole, IsophoteFamily) and flags is not None:
+        return whole, flags
+    family = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
     if isinstance(family, Failure):
-        return ("partial_arc",) if family.reason == Reason.NO_CLOSED_ISOPHOTE else ()
-    return family.flags
+        return None, ("partial_arc",) if family.reason == Reason.NO_CLOSED_ISOPHOTE else ()
+    return family, family.flags
 
 
 brightest_point = BrightestPoint()
