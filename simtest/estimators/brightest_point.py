@@ -9,6 +9,7 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES, HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
+from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights, fit_small
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
@@ -57,12 +58,12 @@ class BrightestPoint:
 
 def _flags(patch: Patch, camera: Camera, family: IsophoteFamily | None) -> tuple[str, ...]:
     # The isophote is one of those that the other estimators use.
-    if family is not None and (own := family.at(HIGHLIGHT_ISOVALUE)) is not None:
-        return own.flags
-    alone = fit_highlight(patch, camera, (HIGHLIGHT_ISOVALUE,))
+    if family is not None and (flags := family.flags_at(HIGHLIGHT_ISOVALUE)) is not None:
+        return flags
+    alone = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
     if isinstance(alone, Failure):
         return ("partial_arc",) if alone.reason == Reason.NO_CLOSED_ISOPHOTE else ()
-    return () if not isinstance(alone, IsophoteFamily) else alone.flags
+    return alone.flags
 
 
 def _budget(family: IsophoteFamily) -> Budget | None:
@@ -86,7 +87,7 @@ def _noise(family: IsophoteFamily) -> Array:
     known = patch.noise
     sigma = float(known[patch.peak_pixel[::-1]]) if isinstance(known, np.ndarray) else float(known or 0.0)
     slope = sigma / (np.sqrt(8 * np.pi) * max(patch.smoothing_px, LEAST_SMOOTHING_PX) ** 2 * patch.peak_value)
-    lobe = family.smoothed_moments
+    lobe = family.seen_moments
     return np.asarray(slope**2 * lobe @ np.linalg.solve(family.px2, lobe))
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
-from simtest.estimators.highlight_fit import fit_small
-from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
+from simtest.estimators.highlight_fit import fit_small, isophote_of_each
+from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_poses
@@ -100,7 +100,7 @@ class CirclePoseEstimator:
         """Estimate several normals at once, many times faster than one by one where regions are left out."""
         small = fit_small(patches, camera)
         resolved = [patch if spot is None else spot.no_shape for patch, spot in zip(patches, small, strict=True)]
-        fitted = fit_isophote_of_each(resolved, camera, self.isovalue)
+        fitted = isophote_of_each(resolved, camera, self.isovalue)
         pairs = zip(patches, fitted, strict=True)
         pending = [(patch, isophote) for patch, isophote in pairs if not isinstance(isophote, Failure)]
         posed = zip(pending, _pose(pending, camera), strict=True)
@@ -164,7 +164,7 @@ def _pooled(choice: _Choice, patches: Sequence[Patch], poses: CirclePoses, camer
         asked = np.flatnonzero(~(choice.margin >= CLEAR_MARGIN))
         if not len(asked):
             break
-        fitted = fit_isophote_of_each([patches[i] for i in asked.tolist()], camera, isovalue)
+        fitted = isophote_of_each([patches[i] for i in asked.tolist()], camera, isovalue)
         sound = [(i, found) for i, found in zip(asked.tolist(), fitted, strict=True) if not isinstance(found, Failure)]
         if not sound:
             continue

@@ -57,14 +57,20 @@ def run_each(
     results: Sequence[Estimate | Failure] | None = None
     if isinstance(estimator, BatchEstimator) and len(sound) > 1:
         results = _batch(estimator, sound, camera, priors)
-    elif isinstance(estimator, PreparedEstimator) and len(sound) > 1:
-        # What fails here fails again, with its reason, at the highlight that it comes from.
-        with contextlib.suppress(Exception):
-            estimator.prepare(sound, camera)
     if results is None:
         results = [run(estimator, patch, camera, priors) for patch in sound]
     following = iter(results)  # failures keep their positions among the patches
     return [patch if isinstance(patch, Failure) else next(following) for patch in patches]
+
+
+def prepare(estimators: Sequence[AnyEstimator], patches: Sequence[Patch | Failure], camera: Camera) -> None:
+    """Let estimators fit what they share to several patches at once (`PreparedEstimator`)."""
+    sound = [patch for patch in patches if not isinstance(patch, Failure)]
+    for estimator in estimators:
+        if isinstance(estimator, PreparedEstimator) and len(sound) > 1:
+            # What fails here fails again, with its reason, at the highlight that it comes from.
+            with contextlib.suppress(Exception):
+                estimator.prepare(sound, camera)
 
 
 def _batch(

@@ -30,6 +30,8 @@ def fit_isophote_families(
     Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
     fitted too; with fewer than 2 of either kind the result is the first one's Failure.
     """
+    if not patches:
+        return []
     # whole isophotes
     posed = _with_poses(fit_isophotes_of_each(patches, camera, isovalues))
     least = min(MIN_ISOPHOTES, len(isovalues))

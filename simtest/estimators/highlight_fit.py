@@ -2,9 +2,11 @@
 
 from collections.abc import Hashable, Sequence
 
+from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
 from simtest.estimators.family_fit import fit_isophote_families
 from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
 from simtest.estimators.small_spot import SmallSpot, fit_small_spots, is_small
 from simtest.geometry import Camera, Patch
 
@@ -33,6 +35,24 @@ def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence
     for patch, family in zip(pending, fit_isophote_families(pending, camera, isovalues), strict=True):
         _keep(patch, name, camera, family)
     return [spot or _family(patch, name, camera) for patch, spot in zip(patches, small, strict=True)]
+
+
+def isophote_of_each(
+    patches: Sequence[Patch | Failure], camera: Camera, isovalue: float
+) -> list[FittedIsophote | Failure]:
+    """Fit the isophote at the same value of several patches, unless one was fitted with the others of its family."""
+    known = [None if isinstance(patch, Failure) else _kept_isophote(patch, camera, isovalue) for patch in patches]
+    pending = [patch for patch, isophote in zip(patches, known, strict=True) if isophote is None]
+    fitted = iter(fit_isophote_of_each(pending, camera, isovalue))
+    return [next(fitted) if isophote is None else isophote for isophote in known]
+
+
+def _kept_isophote(patch: Patch, camera: Camera, isovalue: float) -> FittedIsophote | None:
+    family = _recall(patch, CONE_AXIS_ISOVALUES, camera)
+    if not isinstance(family, IsophoteFamily):
+        return None
+    whole = (isophote for isophote in family.isophotes if not isophote.cut)
+    return next((isophote for isophote in whole if isophote.isovalue == isovalue), None)
 
 
 def fit_small(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot | None]:

@@ -22,7 +22,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
 from simtest.estimators.ripples import excess
-from simtest.geometry import Array, Camera, CirclePose, Patch, cone_axes
+from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
 
@@ -186,11 +186,6 @@ class IsophoteFamily:
         levels = -np.log([isophote.isovalue for isophote in self.isophotes])
         return np.asarray(self._tangent_moments.sum(axis=0) / (2 * levels.sum()))
 
-    @property
-    def smoothed_moments(self) -> Array:
-        """The same of the lobe as smoothing leaves it, shape (2, 2)."""
-        return np.asarray(self._tangent_moments.mean(axis=0) / (2 * self.levels.mean()))
-
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
         return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self.px2)
@@ -236,13 +231,6 @@ class IsophoteFamily:
         step = 1e-4
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
         return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
-
-    def at(self, isovalue: float) -> "IsophoteFamily | None":
-        """Return the family of one of the isophotes alone, if it is whole."""
-        for isophote, pose in zip(self.isophotes, self.poses, strict=True):
-            if isophote.isovalue == isovalue and not isophote.cut:
-                return IsophoteFamily(self.patch, self.camera, (isophote,), (pose,), ())
-        return None
 
     def conic(self, k: int) -> Array:
         """Return (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
@@ -341,15 +329,15 @@ class IsophoteFamily:
         return self._crossings.residuals
 
     @cached_property
-    def is_bent(self) -> bool:
-        """Whether an isophote differs from an ellipse by more than a point highlight's does, noise included."""
+    def is_bent(self) -> Mask:
+        """Whether each isophote differs from an ellipse by more than a point highlight's does, noise included, (K,)."""
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
-        return bool((self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
+        return np.asarray(self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise))
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -365,9 +353,17 @@ class IsophoteFamily:
             "missing_isovalues": bool(self.failures),
             "partial_arc": missing or any(isophote.cut for isophote in self.isophotes),
             "streak": self.axis_ratio < STREAK_RATIO,
-            "not_elliptic": self.is_bent,
+            "not_elliptic": bool(self.is_bent.any()),
         }
         return tuple(flag for flag, holds in conditions.items() if holds)
+
+    def flags_at(self, isovalue: float) -> tuple[str, ...] | None:
+        """Return the flags of one of the isophotes alone; None if it is not among the whole ones."""
+        for isophote, pose, bent in zip(self.isophotes, self.poses, self.is_bent, strict=True):
+            if isophote.isovalue == isovalue and not isophote.cut:
+                conditions = {"streak": pose.axis_ratio < STREAK_RATIO, "not_elliptic": bool(bent)}
+                return tuple(flag for flag, holds in conditions.items() if holds)
+        return None
 
     @property
     def _by_linear(self) -> Array:

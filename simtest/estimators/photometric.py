@@ -201,7 +201,7 @@ def _with_misfit_told(estimate: Estimate, added: float) -> Estimate:
 def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: float = 0.0) -> HighlightPixels | Failure:
     """Gather the pixels of the first region from isovalue `least` on that closes; for a cut highlight, those seen."""
     tried = (t for t in (*REGIONS, least) if t > 0 and t >= least)
-    closed = (t for t in tried if not isinstance(patch.crossings(t), Failure))
+    closed = (t for t in tried if patch.area_px(t) is not None)
     t = next(closed, CUT_REGION if cut else None)
     if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")

@@ -214,6 +214,11 @@ class Patch:
         mask[y : y + height, x : x + width] = found.inside
         return mask
 
+    def area_px(self, isovalue: float) -> int | None:
+        """Return how many pixels an isophote encloses; None where it does not close."""
+        found = self._isophotes.closed(isovalue)
+        return None if isinstance(found, Failure) else int(np.count_nonzero(found.inside))
+
     def saturated_share(self, isovalue: float) -> float | None:
         """Return the share of the pixels inside an isophote that are clipped; None where that is not known."""
         if self.saturated is None:

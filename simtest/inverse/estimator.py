@@ -10,6 +10,7 @@ from simtest.estimators.bisector import DISTANCES
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
+from simtest.estimators.highlight_fit import fit_small
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
 from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
@@ -67,13 +68,15 @@ class InverseRendering:
 
         The estimate has one candidate. Its covariance is that of the Gauss-Newton matrix and of the distance's
         uncertainty. Where the lobe is known, the hypotheses of `curvature` are what the picture's second order allows,
-        as in `curved`, the fitted one first.
+        as in `curved`, the fitted one first. Fails with ``unresolved`` where a highlight is too small for a shape.
 
         Raises
         ------
         BackendError
             If the rendering backend cannot be used.
         """
+        if (spot := fit_small([patch], camera)[0]) is not None:
+            return spot.no_shape
         start = cone_axis.estimate(patch, camera)
         if isinstance(start, Failure):
             return start

@@ -17,7 +17,7 @@ from simtest.detection.peaks import PeakDetector
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
-from simtest.estimators.dispatch import run_in_frame
+from simtest.estimators.dispatch import prepare, run_in_frame
 from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
@@ -250,6 +250,7 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]))
         for i, patch in enumerate(cut)
     ]
+    prepare(list(estimators.values()), patches, frame.calibration.camera)
     made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
     # Flags that depend on the frame are added behind those of the estimators.
     limited = frame.corrected.limited
