@@ -16,12 +16,13 @@ from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
 
-PIXEL_PX2 = 0.024
+PIXEL_PX2 = 0.005
 """Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""
 
-DRIFT_SHARE, RIPPLES = 0.15, 12.5
-"""Variances of the peak over the squared drift of the isophotes' axis and over the ripples (`IsophoteFamily`). All
-three were fitted to random fields of glints that no published figure uses (docs/uncertainty.md)."""
+GAP_SHARE, RIPPLES = 0.95, 4.5
+"""Variances of the peak over its squared gap from the isophotes' axis followed to t -> 1, which is usually nearer to
+the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
+no published figure uses (docs/uncertainty.md)."""
 
 LEAST_SMOOTHING_PX = 0.5
 """What the parabola through three pixels amounts to, where the frame is not smoothed."""
@@ -70,11 +71,12 @@ def _budget(family: IsophoteFamily) -> Budget | None:
     """Return the budget of the peak in the family's basis, which differs from the peak's by a few degrees at most."""
     if family.axes_covariance is None:
         return None
-    resolution = PIXEL_PX2 * family.px2 + RIPPLES * family.ripple_error + family.clipping
-    parts = {"noise": _noise(family), "resolution": resolution}
-    if family.drift_is_suspect:
-        parts["shape"] = DRIFT_SHARE * np.outer(family.drift, family.drift)
-    return parts
+    gap = family.basis @ (family.peak_axis - family.camera.unproject(family.patch.peak_px))
+    return {
+        "noise": _noise(family),
+        "resolution": PIXEL_PX2 * family.px2 + RIPPLES * family.ripple_error + family.clipping,
+        "shape": GAP_SHARE * np.outer(gap, gap),
+    }
 
 
 def _noise(family: IsophoteFamily) -> Array:

@@ -11,7 +11,8 @@ import argparse
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import polars as pl
@@ -26,6 +27,9 @@ from studies.hard.rows import ROWS, Row
 from studies.hard.scenes import SPLITS, kind_of
 from studies.hard.table import lines, text
 
+MOST = 8
+"""Highlights of one frame that are judged."""
+
 ESTIMATORS = ("brightest_point", "cone_axis", "curved", "photometric", "circle_pose", "bisector")
 
 
@@ -36,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--split", choices=list(SPLITS), default="test")
     parser.add_argument("--scenes", type=int, default=48)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--judged-from", type=int, default=0, help="scenes before this one are not judged")
     parser.add_argument("--row", action="append", dest="rows")
     parser.add_argument("--estimator", action="append", dest="estimators")
     given = parser.parse_args(arguments)
@@ -48,8 +53,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     estimators = {name: each for name, each in loaded.items() if isinstance(each, Estimator)}
     records: list[Record] = []
     for file in sorted(given.out.glob(f"{given.split}_*.npz")):
-        number = SPLITS[given.split] + int(file.stem.rpartition("_")[2])
-        records += [answer for case in load(file) for answer in _answers(number, case, rows, estimators)]
+        number = int(file.stem.rpartition("_")[2])
+        if number >= given.judged_from:
+            kept = _first_of_each_row(load(file))
+            of_scene = SPLITS[given.split] + number
+            records += [answer for case in kept for answer in _answers(of_scene, case, rows, estimators)]
     if records:
         table = pl.DataFrame(records, infer_schema_length=None)
         table.write_parquet(given.out / f"{given.split}.parquet")
@@ -71,6 +79,15 @@ def _render(number: int, file: Path) -> None:
             print(f"scene {number}, {row.name}: {error}", file=sys.stderr)
     save(file, cases)
     print(f"scene {number}: {len(cases)} highlights, {time.process_time() - started:.0f} s", file=sys.stderr)
+
+
+def _first_of_each_row(cases: Iterable[Case]) -> Iterator[Case]:
+    """Leave out highlights beyond the first of a row, the brightest: one frame must not outweigh the others."""
+    count: Counter[str] = Counter()
+    for case in cases:
+        count[case.row] += case.normal is not None
+        if count[case.row] <= MOST:
+            yield case
 
 
 def _answers(number: int, case: Case, rows: Sequence[Row], estimators: Mapping[str, Estimator]) -> list[Record]:

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,7 @@ def scene_of(number: int, row: Row) -> tuple[Tables, Scene]:
     return {name: value for name, value in tables.items() if name != "sensor"}, scene
 
 
+@lru_cache(maxsize=64)
 def calibration_of(number: int, row: Row, span_mm: tuple[float, float]) -> Calibration:
     """Return what reconstruction is told of a row of a scene."""
     calibration = scene_of(number, row)[1].calibration()

@@ -34,7 +34,7 @@ class Told:
     vignetting: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """A row of the corpus.
 

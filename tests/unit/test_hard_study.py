@@ -1,0 +1,70 @@
+"""The corpus `hard`: drawn from seeds, kept in files, and its table's figures."""
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.errors import Failure, Reason
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Patch
+from studies.hard.cases import Case, calibration_of, load, save, scene_of
+from studies.hard.measure import record
+from studies.hard.rows import ROWS
+from studies.hard.scenes import KINDS, SPLITS, base_scene
+from studies.hard.table import CHI2_95, lines, text, wilson
+
+
+def a_case(**changes):
+    values = np.random.default_rng(0).random((12, 15)).astype(np.float32)
+    values[6, 7] = 3.0
+    patch = Patch.cut(values, (0, 0, 15, 12), raw=values / 2, noise=0.01, smoothing_px=1.0, saturated=values > 2)
+    normal = np.array([0.0, 0.6, -0.8])
+    return replace(Case("JPEG 80", patch, normal, normal[[1, 0, 2]], 1, 3.5, (10.0, 20.0)), **changes)
+
+
+def test_scenes_follow_their_number_and_the_splits_share_none():
+    assert base_scene(3) == base_scene(3)
+    surfaces = {split: [repr(base_scene(first + i)["surface"]) for i in range(12)] for split, first in SPLITS.items()}
+    assert not set(surfaces["train"]) & set(surfaces["test"])
+
+
+@pytest.mark.parametrize("number", range(2 * len(KINDS)))
+def test_every_row_of_every_kind_is_a_scene(number):
+    for row in ROWS:
+        _, scene = scene_of(number, row)
+        assert scene.sensor.vignetting_known == row.told.vignetting
+        priors = calibration_of(number, row, (10.0, 20.0)).priors
+        assert bool(priors.lights_mm) == row.told.light
+        assert priors.camera.is_exact == row.told.focal
+
+
+def test_cases_are_read_as_they_were_written(tmp_path):
+    cases = [a_case(), a_case(normal=None, normal_base=None, holds=0, radius_px=float("nan"), row="vessels")]
+    save(tmp_path / "kept.npz", cases)
+    for read, written in zip(load(tmp_path / "kept.npz"), cases, strict=True):
+        for name in ("row", "holds", "span_mm"):
+            assert getattr(read, name) == getattr(written, name)
+        np.testing.assert_array_equal(read.radius_px, written.radius_px)
+        assert (read.normal is None) == (written.normal is None)
+        for name in ("values", "raw", "saturated", "peak_px", "noise"):
+            np.testing.assert_array_equal(getattr(read.patch, name), getattr(written.patch, name))
+        assert read.patch.peak_pixel == written.patch.peak_pixel
+
+
+def test_the_table_counts_what_is_covered_silent_and_failed():
+    case, normal = a_case(), a_case().normal
+    made = [record(0, "plane", case, "e", Failure(Reason.NO_CLOSED_ISOPHOTE, ""))]
+    for sd in (0.1, 0.1, 0.1, 1e-4):
+        turned = normal + np.array([1e-3, 0, 0])
+        turned /= np.linalg.norm(turned)
+        flags = () if sd < 0.01 else ("saturated",)
+        estimate = Estimate(turned, turned[None], np.zeros(2), covariance=sd**2 * np.eye(2), flags=flags)
+        made.append(record(0, "plane", case, "e", estimate))
+    line = lines(pl.DataFrame(made, infer_schema_length=None), ["JPEG 80"])[0]
+    assert (line.answers, line.stated, line.failures, line.covered) == (4, 4, 1, 75.0)
+    assert line.silent == 0  # the case's pixels are clipped, and that is said
+    assert "JPEG 80" in text([line])
+    assert wilson(95, 100)[0] < 0.95 < wilson(95, 100)[1]
+    assert pytest.approx(5.991, abs=1e-3) == CHI2_95
