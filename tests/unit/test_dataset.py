@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.card import make_card
-from simtest.dataset.index import TABLES
+from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.manifest import NAME, FileEntry, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
@@ -324,6 +324,28 @@ def test_shards_that_the_manifest_lacks_after_a_kill_are_not_made_again(copy, ma
     monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
     write_dataset(tiny(**SIX), copy, make_engine())
     assert contents(copy) == contents(made)
+
+
+def test_tables_from_the_rows_of_workers_are_those_from_the_shards(copy):
+    plan = read_manifest(copy).plan()
+    before = contents(copy)
+    for shard in plan.shards:
+        write_shard_tables(plan, copy, shard)
+    parts = sorted(path.name for path in copy.glob("*.part"))
+    assert len(parts) == len(TABLES) * len(plan.shards)
+    # one cut short, one missing: both are made from their shard
+    (copy / parts[0]).write_bytes((copy / parts[0]).read_bytes()[:50])
+    (copy / parts[1]).unlink()
+    for name in TABLES:
+        (copy / name).unlink()
+    write_tables(plan, copy)
+    assert {name: digest for name, digest in contents(copy).items() if name in before} == before
+    # Negative control: the rows of the workers are what is joined.
+    told = pl.read_parquet(copy / parts[-1])
+    told.clear().write_parquet(copy / parts[-1])
+    write_tables(plan, copy)
+    changed = {name for name, digest in contents(copy).items() if before.get(name, digest) != digest}
+    assert changed == {name for name in TABLES if name in parts[-1]}
 
 
 def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
