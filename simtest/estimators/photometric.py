@@ -1,5 +1,6 @@
 """`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,14 @@ from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
+from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
+from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
 
@@ -62,8 +65,12 @@ class Photometric:
     degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
-    Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
+    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
+
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`).
@@ -71,12 +78,15 @@ class Photometric:
         The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
         and ``misfit`` where the residuals hold more structure than the frame's noise; the covariance then includes how
         far the normal moves when only the pixels around the peak are fitted. It also includes the drift of the
-        isophotes' axis where that is more than noise.
+        isophotes' axis where that is more than noise. A highlight too small for isophotes gets the normal of its
+        centre, flagged ``unresolved``.
         """
-        family = fit_isophote_family(patch, camera, CONE_AXIS_ISOVALUES)
+        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
         if isinstance(family, Failure):
             return family
-        pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in family.isophotes))
+        if isinstance(family, SmallSpot):
+            return add_untold_parts(family.estimate(), camera, priors, family)
+        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
         if isinstance(pixels, Failure):
             return pixels
         fitted = fit_lobe(_quadric(family, pixels.rays), pixels.observed, pixels.clipped)
@@ -95,10 +105,10 @@ class Photometric:
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)},
+            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2), **family.clipping},
             flags=flags,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 @dataclass(frozen=True)
@@ -170,9 +180,10 @@ class PhotometricPlane:
 photometric, photometric_plane = Photometric(), PhotometricPlane()
 
 
-def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> HighlightPixels | Failure:
-    """Gather the pixels of the first region that closes; for a cut highlight, those that are seen."""
-    closed = (t for t in REGIONS if not isinstance(patch.crossings(t), Failure))
+def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: float = 0.0) -> HighlightPixels | Failure:
+    """Gather the pixels of the first region from isovalue `least` on that closes; for a cut highlight, those seen."""
+    tried = (t for t in (*REGIONS, least) if t > 0 and t >= least)
+    closed = (t for t in tried if not isinstance(patch.crossings(t), Failure))
     t = next(closed, CUT_REGION if cut else None)
     if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")

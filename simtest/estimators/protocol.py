@@ -146,6 +146,14 @@ class BatchEstimator(Estimator, Protocol):
 
 
 @runtime_checkable
+class PreparedEstimator(Estimator, Protocol):
+    """Estimates the normal at one highlight from fits that it makes of several at once, kept with their patches."""
+
+    def prepare(self, patches: Sequence[Patch], camera: Camera, /) -> None:
+        """Fit patches at once; `estimate` then finds the fit with its patch."""
+
+
+@runtime_checkable
 class FrameEstimator(Protocol):
     """Estimates normals from the whole frame, as clouds of highlights, networks and foreign cores do."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Frame, Response
+from simtest.calibration import Calibration, Frame, Priors, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetection, ColourDetector, detect_colour
@@ -18,11 +18,14 @@ from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
+from simtest.estimators.prior_parts import to_base
+from simtest.estimators.protocol import Target
+from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
-DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
 SMOOTHING_BY_COLOUR_PX = 1.0
@@ -68,6 +71,7 @@ def reconstruct(
     smoothing_px: float = DEFAULT_SMOOTHING_PX,
     isolated: bool = True,
     detector: str | Detector | None = None,
+    target: Target = "fine",
 ) -> list[Specularity]:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -90,6 +94,9 @@ def reconstruct(
         whose shape is that of one point highlight (`simtest.detection.peak_shape`).
     detector : str or Detector, optional
         Name as registered, or the detector itself; default `peaks`, to which alone `isolated` applies.
+    target : {"fine", "base"}
+        Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
+        they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
 
     Returns
     -------
@@ -105,7 +112,7 @@ def reconstruct(
         argument is of the wrong kind or out of range.
     """
     finder = PeakDetector(isolated) if detector is None else detector
-    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px).specularities
+    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px, target).specularities
 
 
 def reconstruct_colour(
@@ -133,7 +140,8 @@ def reconstruct_colour(
     Returns
     -------
     Reconstruction
-        Estimates of highlights that smoothing has made rounder have the flag ``small``.
+        Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
+        to have a shape ``unresolved``.
     """
     return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
 
@@ -181,6 +189,7 @@ def run_pipeline(
     estimators: Sequence[str] | Mapping[str, AnyEstimator],
     roi: tuple[int, int, int, int] | None,
     smoothing_px: float,
+    target: Target = "fine",
 ) -> Reconstruction:
     """Reconstruct the normals of a picture with any detector (see `reconstruct` and `reconstruct_colour`)."""
     calibration = _calibration(camera)
@@ -195,7 +204,8 @@ def run_pipeline(
     # detect
     detection = _detect(load_detector(detector), frame) if box is None else _cut_region(frame, box)
     # estimate
-    return _estimate(detection, chosen)
+    made = _estimate(detection, chosen)
+    return made if target == "fine" else _at_base(made, calibration.priors)
 
 
 def _detect(detector: Detector, frame: Frame) -> Detection:
@@ -254,6 +264,21 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     return result
 
 
+def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
+    """Return a reconstruction whose estimates state the base's normals."""
+    based = [
+        replace(
+            each,
+            estimates={
+                name: result if isinstance(result, Failure) else to_base(result, priors)
+                for name, result in each.estimates.items()
+            },
+        )
+        for each in made.specularities
+    ]
+    return replace(made, specularities=based)
+
+
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
     """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
     height, width = frame.encoded.shape[:2]
@@ -274,7 +299,8 @@ def _flagged(
         (x, y), (height, width) = patch.origin_px, patch.values.shape
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    flags = ("small",) if small else ()
+    # An unresolved highlight states no shape that smoothing could have changed.
+    flags = ("small",) if small and UNRESOLVED not in result.flags else ()
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))

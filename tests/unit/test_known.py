@@ -5,18 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, LogUniform, Normal, Priors, Uniform, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.bisector import bisect, bisector
+from simtest.estimators.bisector import bisector
+from simtest.estimators.budget import dominant
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
 from simtest.estimators.dispatch import run
-from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.vectors import angle_deg
+from simtest.geometry.vectors import angle_deg, bisect, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
@@ -108,9 +109,11 @@ def test_a_calibration_file_says_it(tmp_path):
         "[rig]\nlights_mm = [[4.0, 0.0, 0.0], [-4.0, 0.0, 1.0]]\ndistance_mm = 40.0\ndistance_sd_mm = 8.0\n"
         "[surface]\nphong_exponent = 50.0\n"
     )
-    assert load_calibration(path).priors == Priors(
-        ((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0)
-    )
+    told = Priors(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0))
+    assert load_calibration(path).priors == told
+    # A falloff that is stated, even as none, is no prior any more.
+    path.write_text(path.read_text() + '[emission]\ntype = "cosine"\npower = 0.0\n')
+    assert load_calibration(path).priors == replace(told, falloff_power=None)
     path.write_text(path.read_text().replace("distance_mm = 40.0", ""))
     with pytest.raises(InputError, match="distance_sd_mm"):
         load_calibration(path)
@@ -123,19 +126,22 @@ def test_a_scene_says_it():
     assert (priors.distance_mm.mean, priors.distance_mm.sd) == (pytest.approx(8.0), pytest.approx(0.8))
     assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
-    assert silent.calibration(10.0).priors == Priors()
+    assert silent.calibration(10.0).priors == Priors(falloff_power=None)
+    unknown = scene_from_dict({"surface": surface, "sensor": {"vignetting_known": False}})
+    assert unknown.calibration().priors.falloff_power == Priors().falloff_power
     with pytest.raises(InputError, match="exclude each other"):
         scene_from_dict({"surface": surface, "known": {"distance_mm": 5.0, "distance_error": 0.0}})
 
 
-def test_without_a_rig_or_a_distance_the_bisector_says_so():
-    for priors in (Priors(), Priors(distance_mm=exactly(5.0)), Priors(((0.0, 0.0, 0.0),))):
+def test_without_a_rig_the_bisector_says_so():
+    for priors in (Priors(), Priors(distance_mm=exactly(5.0))):
         result = bisector.estimate(lobe(), CAMERA, priors)
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
-    light_at_camera = bisector.estimate(lobe(), CAMERA, Priors(((0.0, 0.0, 0.0),), exactly(10.0)))
     axis = fit_isophote_family(lobe(), CAMERA, ISOVALUES).peak_axis
-    np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
+    for priors in (Priors(((0.0, 0.0, 0.0),), exactly(10.0)), LIGHT_AT_CAMERA):
+        light_at_camera = bisector.estimate(lobe(), CAMERA, priors)
+        np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
 
 
 def test_the_bisector_halves_the_angle():
@@ -313,3 +319,35 @@ def test_branch_point_and_look():
     assert laws.branch_point_error(1e-4) == pytest.approx(laws.circle_pose_error(1e-3, 1e-3 * (1 - 1e-4)), rel=1e-3)
     assert laws.look_error([0.01, 0.0], 1.0, 3.0) == pytest.approx(0.02)
     assert laws.look_error([0.0, 0.01], 1.0, 3.0) == pytest.approx(0.04)
+
+
+# What the bisector makes of a distance that nobody told ------------------------------------------------------------
+
+
+def test_an_untold_distance_is_the_working_range():
+    light = (3.0, -1.0, 0.0)
+    told = [
+        bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d), falloff_power=None)) for d in (5.0, 80.0)
+    ]
+    vague = bisector.estimate(lobe(0.01), CAMERA, Priors((light,), falloff_power=None))
+    # Between the two ends, whose normals lie within twice its region.
+    ends = [tangent_coordinates(vague.normal, each.normal) for each in told]
+    assert ends[0] @ ends[1] < 0
+    assert dominant(vague.budget) == "distance"
+    assert set(told[0].budget) == {"noise", "distance"}
+    assert np.trace(told[0].budget["distance"]) == 0
+    # The share of the working range whose normals lie in the region.
+    distances = np.linspace(5.0, 80.0, 151)
+    normals = [bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d))).normal for d in distances[::5]]
+    moves = np.array([tangent_coordinates(vague.normal, normal) for normal in normals])
+    covariance = vague.covariance
+    inside = np.einsum("ni,ni->n", moves, np.linalg.solve(covariance, moves.T).T) <= 5.99
+    assert 0.9 <= inside.mean() < 1
+
+
+def test_lights_that_are_not_told_apart_are_in_the_budget():
+    lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+    found = bisector.estimate(lobe(0.01), CAMERA, Priors(lights, exactly(20.0), falloff_power=None))
+    assert "ambiguous_light" in found.flags
+    half = np.arctan(4.0 / 20.0) / 2
+    assert np.trace(found.budget["light_offset"]) == pytest.approx(half**2, rel=0.05)
