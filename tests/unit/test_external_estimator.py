@@ -120,7 +120,7 @@ with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     load_estimators(["other_plain"])
 seen = Frame(frame, Calibration(camera), 2.0)
-asked = Options(fov_deg=60.0, detector="other_middle")
+asked = Options(fov_deg=60.0, detector="other_middle", estimators=("brightest_point",))
 taken = reconstruct_values("frame", frame, Calibration(camera), asked)
 try:
     Options(fov_deg=60.0, detector="nobody")
