@@ -22,7 +22,7 @@ from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 from simtest.nightly.verdict import verdict_on
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
-from simtest.reconstruction.picture import default_estimators
+from simtest.reconstruction.pipeline import default_estimators
 from simtest.rendering import Session, backend
 from simtest.report import write_report
 from simtest.runtime.resources import find
