@@ -7,19 +7,35 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import MIN_AREA_PX, Highlight, highlights_of
+from simtest.detection.blobs import Highlight, classify
 from simtest.detection.detector import Detection
 from simtest.detection.light_split import SplitLight, split_light
+from simtest.detection.spots import find_spots
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import InputError
-from simtest.geometry import Camera, Image, Mask
+from simtest.geometry import Camera, Image, Mask, smooth
+
+SMOOTHING_PX = 0.35
+"""Smoothing before highlights are told apart and their shape is measured; a wider one makes any small blob an ellipse."""
+
+NOISE_LEFT = 0.8
+"""What this smoothing leaves of white noise, 1 / (2 sqrt(pi) width)."""
 
 NOISE_FACTOR = 4.0
 """Specular light above so many standard deviations is more than noise."""
 
-FAINT_RATIO = 0.6
-"""Highlights are searched for where the specular light is this share of the tissue's; their pixels are those above
-`SPECULAR_DIFFUSE_RATIO`."""
+PEAK_NOISE = 10.0
+"""A highlight's peak stands at least so many standard deviations high."""
+
+FAINT_RATIO = 0.25
+"""At a highlight's peak the specular light is at least this share of the tissue's: a fifth of all light, as for a
+visible highlight (theory.md 7.1b)."""
+
+PLATEAU = 0.97
+"""Channels above this share of the clipped value count as clipped: demosaicing and JPEG round them."""
+
+FOOT = 0.4
+"""Its pixels are searched for down to this share of that."""
 
 LEAST_SPECULAR = 0.01
 """Least specular light, share of full scale: two steps of an 8-bit sRGB picture at mid tones."""
@@ -59,17 +75,37 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
         The pixels inside the view; default all.
     """
     light = split_light(linear, clipped, seen)
-    least = max(LEAST_SPECULAR, NOISE_FACTOR * light.noise)
-    seen_light = light.specular >= least
-    mask = _above_own_peak(seen_light & (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue), light.specular)
-    # A small highlight, blurred by lens and sensor, may nowhere be as bright as the tissue under it.
-    wider = _above_own_peak(seen_light & (light.specular >= FAINT_RATIO * light.tissue), light.specular)
-    return ColourDetection(light, mask, highlights_of(wider, light, linear, clipped, seen))
+    smoothed = smooth(light.specular, SMOOTHING_PX, seen)
+    tissue = smooth(light.tissue, SMOOTHING_PX, seen)
+    noise = NOISE_LEFT * light.noise
+    # candidates: pixels that may belong to a highlight, and what its peak must have
+    floor = max(LEAST_SPECULAR, NOISE_FACTOR * noise)
+    candidates = smoothed >= np.maximum(floor, FOOT * FAINT_RATIO * tissue)
+    if seen is not None:
+        candidates &= seen
+    least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), FAINT_RATIO * tissue)
+    spots = find_spots(smoothed, tissue, candidates, least, noise, _all_clipped(linear, clipped))
+    # pixels that show a highlight
+    bright = (light.specular >= floor) & (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue)
+    shown = np.zeros(bright.shape, dtype=bool)
+    for spot in spots:
+        shown[spot.crop] |= spot.mask
+    mask = _above_own_peak(bright & candidates, light.specular) | shown
+    highlights = classify(spots, smoothed, light, linear, mask, clipped, seen)
+    return ColourDetection(light, mask, highlights)
+
+
+def _all_clipped(linear: Image, clipped: Mask) -> Mask:
+    """Return where all channels are clipped, by the least value that a clipped one has."""
+    if not clipped.any():
+        return clipped
+    most = linear.max(axis=2)
+    return np.asarray(linear.min(axis=2) >= PLATEAU * most[clipped].min())
 
 
 def _above_own_peak(above: Mask, specular: Image) -> Mask:
-    """Remove specks, and pixels far below their highlight's own peak."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
+    """Remove pixels far below their highlight's own peak."""
+    count, labels = cv2.connectedComponents(above.astype(np.uint8), connectivity=8)
     if count < 2:
         return above
     # peak of each connected part
@@ -77,9 +113,8 @@ def _above_own_peak(above: Mask, specular: Image) -> Mask:
     number = labels[rows, columns]
     peaks = np.zeros(count, dtype=np.float32)
     np.maximum.at(peaks, number, specular[rows, columns])
-    # reject small parts and low pixels
-    large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA_PX
-    kept = large[number] & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peaks[number])
+    # reject low pixels
+    kept = specular[rows, columns] >= SPECULAR_PEAK_SHARE * peaks[number]
     mask = np.zeros(above.shape, dtype=bool)
     mask[rows[kept], columns[kept]] = True
     return mask
