@@ -72,10 +72,14 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     tops, basin = np.unique(up, return_inverse=True)
     if not len(tops):
         empty = np.empty(0, dtype=np.int64)
-        return Basins(empty, empty, np.zeros(shape, dtype=np.int64), np.empty((0, 2), np.int64), np.empty((0, 2), np.int64))
+        return Basins(
+            empty, empty, np.zeros(shape, dtype=np.int64), np.empty((0, 2), np.int64), np.empty((0, 2), np.int64)
+        )
     first, second, saddle = _saddles(basin, order, pixels, ends, len(tops))
     total = height + base[rows, columns]
-    owner = _merged(order[tops], (height[tops], total[tops]), (first, second, height[saddle], total[saddle]), keep, noise)
+    owner = _merged(
+        order[tops], (height[tops], total[tops]), (first, second, height[saddle], total[saddle]), keep, noise
+    )
     # summits that stay, the brightest first
     kept = np.unique(owner)
     kept = kept[np.argsort(-order[tops[kept]], kind="stable")]

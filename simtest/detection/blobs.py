@@ -44,7 +44,7 @@ LEAST_AXIS_RATIO = 0.3
 """A longer highlight is a streak: abs(1 + d k) differs so much between its axes that one of them is near 0."""
 
 MIN_CLIPPED_PX = 12
-"""With so many clipped pixels above half height the shape is that of a clipped highlight."""
+"""With so many pixels that are nearly clipped above half height the shape is that of a clipped highlight."""
 
 CLIPPED_SHARE = 0.5
 """With this share of the pixels above half height clipped, and the least that follows, a highlight counts as clipped:
@@ -63,6 +63,13 @@ CLUTTER_PERCENTILE = 90.0
 CLUTTER = 0.2
 """Largest specular light, over the peak's, of nine tenths of the surroundings: instruments, pale folds and glistening
 patches have more."""
+
+PALE, PALE_WIDE, WIDE_PX = 0.6, 0.4, 200
+PALE_PERCENTILE = 75.0
+"""Where the brightest quarter of the surroundings is brighter than this share of a spot that has no highlight's shape
+(the second share from so many pixels on), the spot is pale tissue, unless more than the share that follows is white."""
+
+GLARING = 0.2
 
 LEAK, LEAK_PX = 1.3, 4
 """An isophote at half height that holds more than this share of the spot's pixels, and this number on top, holds
@@ -149,13 +156,14 @@ class _Traced:
     corner: tuple[int, int]
     at_border: bool
     clipped_px: int
+    white_px: int
 
 
 def classify(
     spots: list[Spot], smoothed: Image, light: SplitLight, linear: Image, mask: Mask, clipped: Mask,
-    seen: Mask | None = None,
-) -> list[Highlight]:  # fmt: skip
-    """Classify spots.
+    white: Mask, seen: Mask | None = None,
+) -> list[Highlight | None]:  # fmt: skip
+    """Classify spots; None where one is pale tissue.
 
     Parameters
     ----------
@@ -170,18 +178,20 @@ def classify(
     mask : ndarray of bool, shape (H, W)
         Pixels that show a highlight.
     clipped : ndarray of bool, shape (H, W)
-        Where a channel is clipped.
+        Where all channels are clipped.
+    white : ndarray of bool, shape (H, W)
+        Where they are nearly so.
     seen : ndarray of bool, shape (H, W), optional
         The view; default everywhere.
     """
-    traced = [_traced(spot, smoothed, clipped, seen) for spot in spots]
+    traced = [_traced(spot, smoothed, (clipped, white), seen) for spot in spots]
     # ellipses of all isophotes at once
     fits = _fit([part for one in traced for part in one.sets])
     step = len(NESTED_ISOVALUES)
     return [_classified(one, fits[i * step : (i + 1) * step], linear, mask, light) for i, one in enumerate(traced)]
 
 
-def _traced(spot: Spot, smoothed: Image, clipped: Mask, seen: Mask | None) -> _Traced:
+def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | None) -> _Traced:
     """Trace a spot's isophotes; a cluster and a shoulder have none of their own."""
     height, width = spot.mask.shape
     x, y = spot.corner
@@ -190,14 +200,14 @@ def _traced(spot: Spot, smoothed: Image, clipped: Mask, seen: Mask | None) -> _T
     visible = None if seen is None else seen[crop]
     none: tuple[LevelSet | None, ...] = (None,) * len(NESTED_ISOVALUES)
     sets = none
-    if len(spot.peaks) == 1 and not spot.touches:
+    if (len(spot.peaks) == 1 or spot.melted) and not spot.touches:
         column, row = int(spot.peaks[0, 0]) - left, int(spot.peaks[0, 1]) - top
         sets = tuple(level_set_around(smoothed[crop], (column, row), t * spot.value, visible) for t in NESTED_ISOVALUES)
         # A lower, separate bump may hang on below the mask's pixels: then the isophote is not the spot's own.
         if sets[0] is not None and np.count_nonzero(sets[0].inside) > LEAK * spot.area_px + LEAK_PX:
             sets = none
-    flat = int(np.count_nonzero(clipped[spot.crop] & spot.mask))
-    return _Traced(spot, sets, (left, top), _at_border(spot, smoothed.shape, seen), flat)
+    clipped, white = (int(np.count_nonzero(part[spot.crop] & spot.mask)) for part in full)
+    return _Traced(spot, sets, (left, top), _at_border(spot, smoothed.shape, seen), clipped, white)
 
 
 def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
@@ -212,14 +222,20 @@ def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
     return made
 
 
-def _classified(one: _Traced, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight) -> Highlight:
-    """Return the highlight of a spot with its kind and score."""
+def _classified(
+    one: _Traced, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight
+) -> Highlight | None:
+    """Return the highlight of a spot with its kind and score; None where it is pale tissue."""
     spot, area = one.spot, one.spot.area_px
     # measurements
     outline, box = _outline(one, light.specular.shape)
     axis_ratio, residual, wander = _shape(one, fits)
-    tint, clutter = _around(spot, box, linear, mask, light)
+    tint, clutter, surround = _around(spot, box, linear, mask, light)
     kind = _kind(one, axis_ratio, residual, wander, tint, clutter)
+    glaring = one.white_px >= GLARING * area
+    pale = PALE if area < WIDE_PX else PALE_WIDE
+    if kind not in (*SINGLE, Kind.UNCLEAR) and surround > pale and not glaring:
+        return None
     if kind is not Kind.BORDER and kind in SINGLE and _near_edge(outline, light.specular.shape):
         kind = Kind.BORDER
     # score
@@ -232,7 +248,7 @@ def _classified(one: _Traced, fits: list[FittedConic | None], linear: Image, mas
     column, row = (int(v) for v in spot.peaks[0])
     return Highlight(
         Region(box, (column, row), spot.value), kind, round(score, 4), area, axis_ratio, residual, wander, tint,
-        clutter, outline, spot.peaks, one.clipped_px / area,
+        clutter, outline, spot.peaks if kind is Kind.CLUSTER else spot.peaks[:1], one.clipped_px / area,
     )  # fmt: skip
 
 
@@ -241,7 +257,11 @@ def _kind(
 ) -> Kind:
     """Return the kind of a spot: the first reason against an isolated highlight."""
     area, flat = one.spot.area_px, one.clipped_px
-    if len(one.spot.peaks) > 1:
+    allowed = RESIDUAL_CLIPPED if one.white_px >= MIN_CLIPPED_PX else RESIDUAL
+    fine = residual is not None and residual <= allowed and wander is not None and wander <= WANDER
+    small = area < MIN_SHAPE_PX
+    # One ellipse is one highlight, whatever the outline of its clipped pixels.
+    if len(one.spot.peaks) > 1 and not (one.spot.melted and fine and not small):
         return Kind.CLUSTER
     if one.at_border:
         return Kind.BORDER
@@ -249,20 +269,15 @@ def _kind(
         return Kind.INTER_REFLECTION
     if one.spot.touches or one.sets[0] is None:
         return Kind.MERGED
+    if not small and axis_ratio is not None and axis_ratio < LEAST_AXIS_RATIO:
+        return Kind.ELONGATED
+    if not (small or fine):
+        return Kind.MERGED
     if clutter > CLUTTER:
         return Kind.UNCLEAR
-    clipped = flat >= LEAST_CLIPPED_PX and flat >= CLIPPED_SHARE * area
-    if area >= MIN_SHAPE_PX:
-        allowed = RESIDUAL_CLIPPED if flat >= MIN_CLIPPED_PX else RESIDUAL
-        fine = residual is not None and residual <= allowed and wander is not None and wander <= WANDER
-        long = axis_ratio is not None and axis_ratio < LEAST_AXIS_RATIO
-        if not (fine or long):
-            return Kind.MERGED
-        if long:
-            return Kind.ELONGATED
-    elif not clipped:
-        return Kind.SMALL
-    return Kind.CLIPPED if clipped else Kind.ISOLATED
+    if flat >= LEAST_CLIPPED_PX and flat >= CLIPPED_SHARE * area:
+        return Kind.CLIPPED
+    return Kind.SMALL if small else Kind.ISOLATED
 
 
 def _outline(one: _Traced, shape: tuple[int, ...]) -> tuple[Array, Box]:
@@ -329,8 +344,11 @@ def _shape(one: _Traced, fits: list[FittedConic | None]) -> tuple[float | None, 
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)
 
 
-def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float]:
-    """Return tint and clutter of a highlight (see `Highlight`); the channels are ranked by the tissue around it."""
+def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float, float]:
+    """Return tint and clutter of a highlight (see `Highlight`), and the light of its surroundings over its own.
+
+    The channels are ranked by the tissue around it.
+    """
     x, y, width, height = box
     crop = np.s_[y : y + height, x : x + width]
     values, specular = linear[crop], light.specular[crop]
@@ -338,13 +356,16 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     bright = mask[crop] | (specular > HIGHLIGHT_ISOVALUE * spot.value)
     around = cv2.dilate(bright.astype(np.uint8), _WIDE) == 0
     if np.count_nonzero(around) < MIN_AREA_PX:
-        return 1.0, 0.0
+        return 1.0, 0.0, 0.0
     clutter = float(np.percentile(specular[around], CLUTTER_PERCENTILE)) / spot.value
+    tissue = np.median(values[around], axis=0)
+    own = np.median(linear[spot.crop][spot.mask], axis=0)
+    brighter = float(np.percentile(values[around].mean(axis=1), PALE_PERCENTILE))
+    surround = brighter / max(float(own.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
     shown = (specular >= 0.3 * spot.value) & (values.max(axis=2) < UNCLIPPED)
     if np.count_nonzero(shown) < MIN_AREA_PX:
-        return 1.0, clutter
-    tissue = np.median(values[around], axis=0)
+        return 1.0, clutter, surround
     gain = values[shown].mean(axis=0) - tissue
     weakest, strongest = float(gain[tissue.argmin()]), float(gain[tissue.argmax()])
-    return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter
+    return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter, surround

@@ -21,6 +21,10 @@ RISE = 0.3
 highlights that have melted in it apart."""
 
 
+DEEPEST_PX = 60.0
+"""Farther from the rim it rises no more."""
+
+
 @dataclass(frozen=True)
 class Spot:
     """Connected pixels of one highlight, or of several that touch.
@@ -37,6 +41,8 @@ class Spot:
         Its pixels above half height.
     touches : bool
         Whether it is the shoulder of a brighter one: its isophote at half height runs into that.
+    melted : bool
+        Whether its several peaks are told apart by the outline of clipped light alone.
     """
 
     peaks: Index
@@ -44,6 +50,7 @@ class Spot:
     corner: tuple[int, int]
     mask: Mask
     touches: bool
+    melted: bool
 
     @property
     def area_px(self) -> int:
@@ -79,59 +86,76 @@ def find_spots(
     climbed, base = specular, tissue
     if flat is not None and flat.any():
         # Light that is clipped is the higher the farther from the rim.
-        rise = np.exp(RISE * cv2.distanceTransform(flat.astype(np.uint8), cv2.DIST_L2, 5))
+        depth = cv2.distanceTransform(flat.astype(np.uint8), cv2.DIST_L2, 5)
+        rise = np.exp(RISE * np.minimum(depth, DEEPEST_PX))
         climbed, base = specular * rise, tissue * rise
     basins = find_basins(climbed, mask, base, SADDLE, SADDLE_NOISE * noise)
     peak = specular[basins.rows, basins.columns].astype(np.float64)
     high = peak >= least[basins.rows, basins.columns]
     saddle = specular[basins.saddles[:, 0], basins.saddles[:, 1]].astype(np.float64)
     groups, touching = _groups(peak, basins.pairs, saddle)
-    level = HIGHLIGHT_ISOVALUE * peak
-    number = np.full(len(peak), -1)
+    number, level = np.full(len(peak), -1), HIGHLIGHT_ISOVALUE * peak
     for i, group in enumerate(groups):
         number[group] = i
-    # The members of a cluster hang together above the saddles between them.
+        level[group] = level[group[0]]
+    melted = _melted(basins, specular + tissue, number, len(groups))
+    spots = _cut(specular, basins, level, number, groups, touching, melted)
+    return [spot for spot, group in zip(spots, groups, strict=True) if high[group[0]]]
+
+
+def _groups(peak: Array, pairs: Index, saddle: Array) -> tuple[list[list[int]], list[bool]]:
+    """Group summits, the brightest first, with those that its half-height isophote holds.
+
+    Also return which groups are shoulders: their isophotes at half height run into a brighter group.
+    """
+    near: list[list[tuple[int, float]]] = [[] for _ in peak]
+    for (a, b), height in zip(pairs.tolist(), saddle.tolist(), strict=True):
+        near[a].append((b, height))
+        near[b].append((a, height))
+    taken = np.zeros(len(peak), dtype=bool)
+    groups: list[list[int]] = []
+    touching: list[bool] = []
+    for first in range(len(peak)):
+        if taken[first]:
+            continue
+        level = HIGHLIGHT_ISOVALUE * float(peak[first])
+        group, touches = [first], False
+        taken[first] = True
+        for member in group:
+            for other, height in near[member]:
+                if height < level or other in group:
+                    continue
+                if taken[other]:
+                    touches = True
+                else:
+                    taken[other] = True
+                    group.append(other)
+        groups.append(sorted(group))
+        touching.append(touches)
+    return groups, touching
+
+
+def _melted(basins: Basins, total: Image, number: Index, count: int) -> list[bool]:
+    """Return for each group whether no saddle between its summits lies clearly below them in the light as it is."""
     inside = number[basins.pairs[:, 0]] == number[basins.pairs[:, 1]]
-    pairs, saddles = basins.pairs[inside], saddle[inside]
+    pairs, saddles = basins.pairs[inside], basins.saddles[inside]
+    summit = total[basins.rows, basins.columns]
+    share = total[saddles[:, 0], saddles[:, 1]] / np.minimum(summit[pairs[:, 0]], summit[pairs[:, 1]])
+    best = np.zeros(len(summit))
     for side in (0, 1):
-        joined = saddles >= HIGHLIGHT_ISOVALUE * np.minimum(peak[pairs[:, 0]], peak[pairs[:, 1]])
-        np.minimum.at(level, pairs[joined, side], saddles[joined])
-    return [
-        spot
-        for spot, group in zip(_cut(specular, basins, level, number, groups, touching), groups, strict=True)
-        if high[group].any()
-    ]
-
-
-def _groups(peak: Array, touching: Index, heights: Array) -> tuple[list[list[int]], list[bool]]:
-    """Group summits that half height does not part, the brightest first; also return which are shoulders."""
-    linked = heights >= HIGHLIGHT_ISOVALUE * np.minimum(peak[touching[:, 0]], peak[touching[:, 1]])
-    pairs, saddles = touching[linked].tolist(), heights[linked].tolist()
-    # A summit whose own isophote at half height holds no other stands alone, whatever its shoulders.
-    reached = np.zeros(len(peak), dtype=bool)
-    for (a, b), saddle in zip(pairs, saddles, strict=True):
-        reached[a] |= saddle >= HIGHLIGHT_ISOVALUE * peak[a]
-        reached[b] |= saddle >= HIGHLIGHT_ISOVALUE * peak[b]
-    parent = list(range(len(peak)))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        return i
-
-    for a, b in pairs:
-        if reached[a] and reached[b]:
-            one, other = sorted((root(a), root(b)))
-            parent[other] = one
-    groups: dict[int, list[int]] = {}
-    for i in range(len(peak)):
-        groups.setdefault(root(i), []).append(i)
-    return list(groups.values()), [bool(len(group) == 1 and reached[group[0]]) for group in groups.values()]
+        np.maximum.at(best, pairs[:, side], share)
+    apart = np.bincount(number[best < SADDLE], minlength=count)
+    return [bool(each == 0) for each in apart]
 
 
 def _cut(
-    specular: Image, basins: Basins, level: Array, number: Index, groups: list[list[int]], touching: list[bool]
+    specular: Image,
+    basins: Basins,
+    level: Array,
+    number: Index,
+    groups: list[list[int]],
+    touching: list[bool],
+    melted: list[bool],
 ) -> list[Spot]:
     """Cut the pixels of each group out of the frame."""
     rows, columns = np.nonzero(basins.labels)
@@ -149,5 +173,5 @@ def _cut(
         mask[y - top, x - left] = True
         peaks = np.stack([basins.columns[group], basins.rows[group]], axis=1)
         value = float(specular[basins.rows[group[0]], basins.columns[group[0]]])
-        spots.append(Spot(peaks, value, (left, top), mask, touching[i]))
+        spots.append(Spot(peaks, value, (left, top), mask, touching[i], melted[i] and len(group) > 1))
     return spots

@@ -148,20 +148,21 @@ def score_frame(frame: OutlinedFrame, found: PictureDetection) -> FrameScore:
 def main() -> int:
     """Print the table."""
     scores: dict[str, list[FrameScore]] = {"tuning": [], "figures": []}
-    print(f"{'frame':28} {'split':8} {'covered':>8} {'answered':>9} {'IoU':>6} {'marks':>6} {'clusters':>8} empty  forbidden")
+    heads = ("covered", "answered", "IoU", "marks", "clusters", "empty")
+    print(f"{'frame':28} {'split':8} " + " ".join(f"{head:>8}" for head in heads) + "  forbidden")
     for frame in outlined_frames():
         made = score_frame(frame, detect_in_picture(frame.picture))
         scores[frame.split].append(made)
         where = ", ".join(f"{kind} {number}" for kind, number in made.marks.items() if number) or "none"
         print(
-            f"{frame.name:28} {frame.split:8} {made.covered:8.3f} {made.answered:9.3f} {made.iou:6.3f} "
-            f"{made.count:6d} {made.clusters:8d} {made.empty:5d}  {where}"
+            f"{frame.name:28} {frame.split:8} {made.covered:8.3f} {made.answered:8.3f} {made.iou:8.3f} "
+            f"{made.count:8d} {made.clusters:8d} {made.empty:8d}  {where}"
         )
     every = scores["tuning"] + scores["figures"]
     for name, part in (*scores.items(), ("all", every)):
         if part:
             medians = [np.nanmedian([getattr(s, key) for s in part]) for key in ("covered", "answered", "iou")]
-            print(f"median, {name:20} {'':8} {medians[0]:8.3f} {medians[1]:9.3f} {medians[2]:6.3f}")
+            print(f"median, {name:20} {'':8} {medians[0]:8.3f} {medians[1]:8.3f} {medians[2]:8.3f}")
     return 0 if every else 1
 
 
