@@ -34,7 +34,7 @@ PRIOR_WEIGHT = 2.0
 """A cloud's extent along one direction, rad, and how many spots this prior counts for: the slopes of tissue are 2 to 8
 deg over gains of 0.5 to 3."""
 
-CLUMPING = 1.5
+CLUMPING = 1.1
 """Spots of one relief are not independent: so many of them tell what one independent spot does (theory.md 7.5)."""
 
 LEAST_EXTENT = math.radians(0.3)
