@@ -6,12 +6,13 @@ of one core to itself. No viewpoint of these was used to set what the estimators
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.measuring import Figure, print_figures
-from simtest.calibration import Calibration, Priors, exactly
+from simtest.calibration import Calibration, exactly
 from simtest.errors import Failure
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
@@ -54,7 +55,7 @@ def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list
         _say_so_far(judged)
     light = {"offset_mm": ASIDE_MM, "azimuth_deg": 45.0}
     for patch, calibration, truth in _highlights(aside, (light,)):
-        priors = Priors(calibration.priors.lights_mm, exactly(truth.distance))
+        priors = replace(calibration.priors, distance_mm=exactly(truth.distance))
         judged["bisector"].append((bisector.estimate(patch, calibration.camera, priors), truth))
         _say_so_far(judged)
     return [figure for name, results in judged.items() for figure in _figures(name, results)]

@@ -1,7 +1,8 @@
 """What is known of a camera beside its geometry, and beside a picture: response, falloff, noise, priors.
 
 `calibration` undoes response and falloff; `frame` is a frame on that way, as detectors and estimators see it; `priors`
-holds what is known of lights, distance and lobe, with its uncertainty.
+holds what is known of lights, distance, lobe, camera and relief, and what is assumed where nobody told
+(`distributions`).
 """
 
 from typing import TYPE_CHECKING, Any
@@ -10,10 +11,11 @@ from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.calibration.calibration import Calibration, CorrectedFrame
+    from simtest.calibration.distributions import Distribution, LogUniform, Normal, Uniform, exactly
     from simtest.calibration.frame import Frame
     from simtest.calibration.noise_estimate import estimate_noise
     from simtest.calibration.noise_model import NoiseModel
-    from simtest.calibration.priors import NO_PRIORS, Distribution, LogUniform, Normal, Priors, Uniform, exactly
+    from simtest.calibration.priors import LIGHT_AT_CAMERA, NO_PRIORS, CameraPrior, Priors
     from simtest.calibration.response import Response, srgb_decode, srgb_encode
 
 _HOMES = {
@@ -21,17 +23,21 @@ _HOMES = {
         "Calibration",
         "CorrectedFrame",
     ),
+    "simtest.calibration.distributions": (
+        "Distribution",
+        "LogUniform",
+        "Normal",
+        "Uniform",
+        "exactly",
+    ),
     "simtest.calibration.frame": ("Frame",),
     "simtest.calibration.noise_estimate": ("estimate_noise",),
     "simtest.calibration.noise_model": ("NoiseModel",),
     "simtest.calibration.priors": (
+        "LIGHT_AT_CAMERA",
         "NO_PRIORS",
-        "Distribution",
-        "LogUniform",
-        "Normal",
+        "CameraPrior",
         "Priors",
-        "Uniform",
-        "exactly",
     ),
     "simtest.calibration.response": (
         "Response",
@@ -42,8 +48,10 @@ _HOMES = {
 _named, __dir__ = lazy_names(__name__, _HOMES)
 
 __all__ = [
+    "LIGHT_AT_CAMERA",
     "NO_PRIORS",
     "Calibration",
+    "CameraPrior",
     "CorrectedFrame",
     "Distribution",
     "Frame",
@@ -80,7 +88,8 @@ def _known(
     lobe_curvature: float | None = None,
 ) -> "Priors":
     """Return the priors of bare numbers, as `Known` took them."""
-    from simtest.calibration.priors import Normal, Priors, exactly
+    from simtest.calibration.distributions import Normal, exactly
+    from simtest.calibration.priors import Priors
 
     distance = None if distance_mm is None else Normal(distance_mm, distance_sd_mm)
     return Priors(lights_mm, distance, None if lobe_curvature is None else exactly(lobe_curvature))

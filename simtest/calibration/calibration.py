@@ -1,6 +1,6 @@
 """A camera with what is known of it, and the correction of its frames: response, vignetting and emission undone."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -65,7 +65,8 @@ class Calibration:
     saturation_level : float, optional
         Encoded value at and above which a pixel is clipped; None: not known, and no pixel counts as clipped.
     priors : Priors
-        Of lights, distance and lobe; passed on to the estimators.
+        Of lights, distance, lobe, camera and relief; passed on to the estimators. With a vignetting or emission that is
+        not uniform, none is left in the frame, and the prior on its power is dropped.
 
     Raises
     ------
@@ -91,6 +92,9 @@ class Calibration:
         check_kind("calibration noise", self.noise, NoiseModel)
         if self.saturation_level is not None:
             check_number("saturation_level", self.saturation_level, above=0)
+        # A told falloff is undone, so none that nobody told is left.
+        if not (self.vignetting.is_uniform and self.emission.is_uniform) and self.priors.falloff_power is not None:
+            object.__setattr__(self, "priors", replace(self.priors, falloff_power=None))
 
     @cached_property
     def falloff(self) -> Array | None:

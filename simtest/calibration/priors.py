@@ -1,100 +1,93 @@
-"""Priors: what is known beside the picture of lights, distance and lobe, each with its distribution."""
+"""Priors: what is known beside the picture of lights, distance, lobe, camera and relief, each with its distribution.
+
+What nobody told is not zero: it has a distribution too, which enters the budget of every estimate that depends on it
+(`simtest.estimators.prior_parts`). The defaults are those of an endoscope of which nothing is known.
+"""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from simtest.calibration.distributions import Distribution, Uniform, check_distribution
 from simtest.errors import InputError
 from simtest.geometry import Array
-from simtest.geometry.checks import check_number
+from simtest.geometry.checks import check_kind, check_number
 
 MAX_LIGHTS = 32
 
+UNTOLD_OFFSET_MM = Uniform(0.0, 6.0)
+"""Distance of a light from the camera across the optical axis, mm, where no rig is told; every azimuth is as likely."""
+
+UNTOLD_DISTANCE_MM = Uniform(5.0, 80.0)
+"""Distance of the tissue along the sightline, mm, where none is told: the working range of endoscopes."""
+
+UNTOLD_FALLOFF_POWER = Uniform(0.0, 4.0)
+"""Power k of the falloff cos^k of lens and lights over the angle from the optical axis, where none is told."""
+
+UNTOLD_SLOPE_RAD = Uniform(0.0, math.radians(6.0))
+"""Slope of the relief an axis, rad, where none is told: from smooth organs to strongly rough ones (theory.md 7)."""
+
 
 @dataclass(frozen=True)
-class _Interval:
-    """Two ends, the lower one first; `InputError` where they are not finite or not in order."""
+class CameraPrior:
+    """How far the camera's geometry may be off; the default is an exact calibration.
 
-    low: float
-    high: float
+    Parameters
+    ----------
+    focal_sd : float
+        Standard deviation of the focal length, as a share of it.
+    centre_sd_px : float
+        Standard deviation of the principal point along each axis, px.
+    distortion_sd : float
+        Standard deviation of a radial distortion k1 that is left out: it moves a point at r focal lengths from the
+        principal point by k1 r^3 focal lengths.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or negative.
+    """
+
+    focal_sd: float = 0.0
+    centre_sd_px: float = 0.0
+    distortion_sd: float = 0.0
 
     def __post_init__(self) -> None:
-        for end in fields(self):
-            check_number(f"{type(self).__name__} {end.name}", getattr(self, end.name))
-        if not self.low < self.high:
-            raise InputError(f"{type(self).__name__}({self.low!r}, {self.high!r}): low must be less than high")
-
-
-@dataclass(frozen=True)
-class Uniform(_Interval):
-    """Anywhere from low to high, alike."""
+        for name in ("focal_sd", "centre_sd_px", "distortion_sd"):
+            check_number(name, getattr(self, name), least=0)
 
     @property
-    def mean(self) -> float:
-        """Middle of the interval."""
-        return (self.low + self.high) / 2
-
-    @property
-    def sd(self) -> float:
-        """Standard deviation."""
-        return (self.high - self.low) / math.sqrt(12)
-
-
-@dataclass(frozen=True)
-class LogUniform(_Interval):
-    """From low > 0 to high, the logarithm uniform: a scale of which only the order of magnitude is known."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("LogUniform low", self.low, above=0)
-
-    @property
-    def mean(self) -> float:
-        """Mean."""
-        return (self.high - self.low) / math.log(self.high / self.low)
-
-    @property
-    def sd(self) -> float:
-        """Standard deviation."""
-        square = (self.high**2 - self.low**2) / (2 * math.log(self.high / self.low))
-        return math.sqrt(max(square - self.mean**2, 0.0))
-
-
-@dataclass(frozen=True)
-class Normal:
-    """About mean with the standard deviation sd >= 0; with sd = 0 the value is exact (see `exactly`)."""
-
-    mean: float
-    sd: float
-
-    def __post_init__(self) -> None:
-        check_number("Normal mean", self.mean)
-        check_number("Normal sd", self.sd, least=0)
-
-
-Distribution = Uniform | Normal | LogUniform
-
-
-def exactly(value: float) -> Normal:
-    """Return the distribution of a value that is known exactly."""
-    return Normal(value, 0.0)
+    def is_exact(self) -> bool:
+        """Whether the camera's geometry is exact."""
+        return self.focal_sd == self.centre_sd_px == self.distortion_sd == 0
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What estimators are told beside the picture and the camera; each part may be missing.
+    """What estimators are told beside the picture and the camera, and how what they are not told is distributed.
 
     Parameters
     ----------
     lights_mm : tuple of tuple of float
-        Nominal positions of the lights, camera frame, mm; empty: not known.
+        Nominal positions of the lights, camera frame, mm; empty: nobody told, and `light_offset_mm` holds.
     distance_mm : Uniform, Normal or LogUniform, optional
-        Working distance along the sightline, mm.
+        Working distance along the sightline, mm; None: nobody told, and `UNTOLD_DISTANCE_MM` holds.
     lobe_curvature : Uniform, Normal or LogUniform, optional
         c = -(log f)''(0) of the reflectance f as a function of the angle between normal and view, rad; 4 n for Phong.
         Estimators use its mean.
+    light_offset_mm : Uniform, Normal or LogUniform
+        Distance of a light that nobody told from the camera, mm, across the optical axis, in any direction.
+    camera : CameraPrior
+        How far the camera's geometry may be off.
+    falloff_power : Uniform, Normal or LogUniform, optional
+        k of a falloff cos^k over the angle from the optical axis that is still in the frame; None: there is none, since
+        the falloff of lens and lights is uniform, or told and undone.
+    relief_slope : Uniform, Normal or LogUniform
+        Slope of the relief an axis, rad: how far a single highlight may be off the base's normal (theory.md 7.4).
+    plane : bool
+        Whether the surface is known to be a plane, as `circle_pose` takes it to be.
 
     Raises
     ------
@@ -105,6 +98,11 @@ class Priors:
     lights_mm: tuple[tuple[float, float, float], ...] = ()
     distance_mm: Distribution | None = None
     lobe_curvature: Distribution | None = None
+    light_offset_mm: Distribution = UNTOLD_OFFSET_MM
+    camera: CameraPrior = field(default_factory=CameraPrior)
+    falloff_power: Distribution | None = UNTOLD_FALLOFF_POWER
+    relief_slope: Distribution = UNTOLD_SLOPE_RAD
+    plane: bool = False
 
     def __post_init__(self) -> None:
         if len(self.lights_mm) > MAX_LIGHTS or not all(
@@ -112,21 +110,26 @@ class Priors:
         ):
             raise InputError(f"lights_mm: must be at most {MAX_LIGHTS} positions of three finite numbers, mm")
         for name in ("distance_mm", "lobe_curvature"):
-            prior = getattr(self, name)
-            if prior is None:
-                continue
-            if not isinstance(prior, Distribution):
-                raise InputError(f"{name} = {prior!r}: must be a Uniform, Normal or LogUniform, or exactly({prior!r})")
-            # A Normal has no lower end: its mean must lie above 0.
-            least = prior.mean if isinstance(prior, Normal) else prior.low
-            if not least > 0:
-                raise InputError(f"{name} = {least!r}: must be a finite number > 0")
+            if (prior := getattr(self, name)) is not None:
+                check_distribution(name, prior, above=0)
+        for name in ("light_offset_mm", "falloff_power", "relief_slope"):
+            if (prior := getattr(self, name)) is not None or name != "falloff_power":
+                check_distribution(name, prior, least=0)
+        check_kind("priors camera", self.camera, CameraPrior)
 
     @cached_property
     def lights(self) -> Array:
         """Nominal positions of the lights, shape (L, 3), camera frame, mm."""
         return np.array(self.lights_mm, dtype=float).reshape(-1, 3)
 
+    @property
+    def distance(self) -> Distribution:
+        """The told working distance along the sightline, mm, or else the working range of endoscopes."""
+        return UNTOLD_DISTANCE_MM if self.distance_mm is None else self.distance_mm
+
 
 NO_PRIORS = Priors()
-"""Nothing is known beside the picture and the camera."""
+"""Nothing is told beside the picture and the camera."""
+
+LIGHT_AT_CAMERA = Priors(lights_mm=((0.0, 0.0, 0.0),), falloff_power=None)
+"""The light is at the camera's position, and no falloff is left in the frame."""

@@ -4,18 +4,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Distribution, Priors
+from simtest.calibration import NO_PRIORS, Distribution, Normal, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import Budget
+from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.light_assignment import light_of_highlight
+from simtest.estimators.prior_parts import add_camera_and_falloff
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.vectors import basis_across
+from simtest.geometry.vectors import basis_across, bisect
 
 STEP = 1e-4
 """Step of the differences of the normal, rad, and as a share of the distance."""
+
+DISTANCES = (np.arange(32) + 0.5) / 32
+"""Shares of a prior on the distance at which the normal is computed."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,10 @@ class Bisector:
     falloff with the distance from the light. That falloff has the slope g = -2 grad log|L - P|, so the peak lies g/H
     towards the light; 1/H are the lobe's moments, known from the isophotes.
 
+    A distance that is told with a normal error moves the normal by its derivative. Over any other distribution, such as
+    the working range where no distance is told, the normal is the mean over the distribution, and the part ``distance``
+    of the budget its spread.
+
     Parameters
     ----------
     isovalues : tuple of float
@@ -35,72 +43,97 @@ class Bisector:
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`); lights and distance must be known.
+        """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told.
 
         The candidates are those of the lights that may have made the highlight, the proposed one first. With several
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
-        lights' mean position is used, flagged ``ambiguous_light``. Fails as `cone_axis` does, and with ``not_known``
-        without lights or distance.
+        lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
+        mean square of what the single lights would give. Fails as `cone_axis` does, and with ``not_known`` without
+        lights.
         """
-        if not priors.lights_mm or priors.distance_mm is None:
-            return Failure(Reason.NOT_KNOWN, "needs the lights' places and a distance")
+        if not priors.lights_mm:
+            return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
         family = fit_isophote_family(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
-        lights, distance, flags = priors.lights, priors.distance_mm, family.flags
+        lights, flags = priors.lights, family.flags
         own = light_of_highlight(family, priors)
         order = [*lights] if own is None else [lights[own]]
         if own is None:
             # What is seen is then usually the lights' common lobe.
             order.insert(0, lights.mean(axis=0))
             flags = (*flags, "ambiguous_light")
-        candidates = np.array([_normal(family, light, distance.mean)[0] for light in order])
-        normal, sightline = _normal(family, order[0], distance.mean)
-        return Estimate(
+        found = [_mean_normal(family, light, priors.distance) for light in order]
+        normal, sightline = found[0]
+        candidates = np.array([candidate for candidate, _ in found])
+        budget = _budget(family, order[0], priors.distance, normal)
+        if budget is not None and own is None:
+            moved = (candidates[1:] - normal) @ basis_across(normal).T
+            budget = {**budget, "light_offset": moved.T @ moved / len(moved)}
+        estimate = Estimate(
             normal=normal,
             candidates=candidates,
             look_px=camera.project(sightline),
             axis_ratio=family.axis_ratio,
             isophotes=family.isophotes,
-            budget=_budget(family, order[0], distance, normal),
+            budget=budget,
             flags=flags,
         )
+        return add_camera_and_falloff(estimate, camera, priors, family)
 
 
 bisector = Bisector()
 
 
-def bisect(position: Array, light: Array) -> Array:
-    """Return the unit vector that bisects the directions from a point to the light and to the camera, shape (3,)."""
-    to_light, to_camera = light - position, -position
-    both = to_light / np.linalg.norm(to_light) + to_camera / np.linalg.norm(to_camera)
-    return np.asarray(both / np.linalg.norm(both))
+def _mean_normal(family: IsophoteFamily, light: Array, distance: Distribution) -> tuple[Array, Array]:
+    """Return normal and sightline of the BP: at the distance's mean, or their mean over a distribution of any shape."""
+    if isinstance(distance, Normal):
+        normals, sightlines = _normals(family, light, np.array([distance.mean]))
+    else:
+        normals, sightlines = _normals(family, light, distance.quantile(DISTANCES))
+    normal, sightline = normals.mean(axis=0), sightlines.mean(axis=0)
+    return normal / np.linalg.norm(normal), sightline / np.linalg.norm(sightline)
 
 
-def _normal(family: IsophoteFamily, light: Array, distance: float, turn: Array | None = None) -> tuple[Array, Array]:
-    """Return normal and sightline of the BP; `turn`, rad in the family's basis, moves the measured sightline."""
+def _normals(family: IsophoteFamily, light: Array, distances: Array, turn: Array | None = None) -> tuple[Array, Array]:
+    """Return normals and sightlines of the BP at distances, shape (D,), both (D, 3).
+
+    `turn`, rad in the family's basis, moves the measured sightline.
+    """
     sightline = family.peak_axis if turn is None else family.peak_axis + turn @ family.basis
     sightline = sightline / np.linalg.norm(sightline)
-    position = distance * sightline
+    d = distances[:, None]
+    position = d * sightline
     normal = bisect(position, light)
     # The surface point moves with the image's tangent along the plane perpendicular to the normal.
-    steps = distance * (family.basis - np.outer(family.basis @ normal / (normal @ sightline), sightline))
+    tilts = normal @ family.basis.T / (normal @ sightline)[:, None]
+    steps = distances[:, None, None] * (family.basis - tilts[:, :, None] * sightline)
     to_light = light - position
     # the falloff's slope shifts the peak by g/H
-    slope = 2 * steps @ to_light / (to_light @ to_light)
-    sightline = sightline - (family.moments @ slope) @ family.basis
-    sightline /= np.linalg.norm(sightline)
-    return bisect(distance * sightline, light), sightline
+    slope = 2 * np.einsum("dki,di->dk", steps, to_light) / np.sum(to_light * to_light, axis=1)[:, None]
+    sightlines = sightline - slope @ family.moments @ family.basis
+    sightlines /= np.linalg.norm(sightlines, axis=1)[:, None]
+    return bisect(d * sightlines, light), sightlines
 
 
 def _budget(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Budget | None:
     """Return the budget of the normal: that of the axis at the peak, and the distance."""
     if family.peak_budget is None:
         return None
-    across = basis_across(normal)
-    turned = [_normal(family, light, distance.mean, STEP * unit)[0] for unit in np.eye(2)]
-    J = across @ (np.array(turned) - normal).T / STEP
-    farther, _ = _normal(family, light, distance.mean * (1 + STEP))
-    by_distance = across @ (farther - normal) / (STEP * distance.mean) * distance.sd
+    across, mean = basis_across(normal), np.array([distance.mean])
+    at_mean = _normals(family, light, mean)[0][0]
+    turned = [_normals(family, light, mean, STEP * unit)[0][0] for unit in np.eye(2)]
+    J = across @ (np.array(turned) - at_mean).T / STEP
     own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
-    return {**own, "distance": np.outer(by_distance, by_distance)}
+    return {**own, "distance": _distance_part(family, light, distance, across)}
+
+
+def _distance_part(family: IsophoteFamily, light: Array, distance: Distribution, across: Array) -> Array:
+    """Return the covariance of the normal by the distance, shape (2, 2), rad^2, in the basis `across`."""
+    if isinstance(distance, Normal):
+        near_and_far = distance.mean * np.array([1.0, 1 + STEP])
+        normals = _normals(family, light, near_and_far)[0]
+        by_distance = across @ (normals[1] - normals[0]) / (STEP * distance.mean) * distance.sd
+        return np.outer(by_distance, by_distance)
+    # Moves over a wide range of distances lie all but along one line.
+    return line_covariance(_normals(family, light, distance.quantile(DISTANCES))[0] @ across.T)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
-from simtest.estimators.isophote_family import fit_isophote_family
-from simtest.estimators.light_offset import add_light_offset_uncertainty
+from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 
@@ -15,7 +15,7 @@ from simtest.geometry import Camera, Patch
 class BrightestPoint:
     """The reversed sightline through the peak of the smoothed patch.
 
-    Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
+    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate:
@@ -25,12 +25,12 @@ class BrightestPoint:
         t = 0.5: where that runs into the border the peak itself may be cut off, and along a streak it may lie anywhere.
         """
         normal = -camera.unproject(patch.peak_px)
-        estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera))
-        return add_light_offset_uncertainty(estimate, priors)
+        family = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
+        estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(family))
+        return add_untold_parts(estimate, camera, priors, None if isinstance(family, Failure) else family)
 
 
-def _flags(patch: Patch, camera: Camera) -> tuple[str, ...]:
-    family = fit_isophote_family(patch, camera, (HIGHLIGHT_ISOVALUE,))
+def _flags(family: IsophoteFamily | Failure) -> tuple[str, ...]:
     if isinstance(family, Failure):
         return ("partial_arc",) if family.reason == Reason.NO_CLOSED_ISOPHOTE else ()
     return family.flags

@@ -5,6 +5,7 @@ that are normal this is their covariance; for a prior with heavy tails, such as 
 camera, it is a little more (`equivalent_covariance`).
 """
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -57,3 +58,41 @@ def equivalent_covariance(moves: Array) -> Array:
         return np.zeros((2, 2))
     distances = np.einsum("ni,ni->n", moves, np.linalg.solve(square + floor * np.eye(2), moves.T).T)
     return np.asarray(square * (float(np.quantile(distances, CONFIDENCE)) / chi_squared.quantile(CONFIDENCE, 2)))
+
+
+def equivalent_variance(moves: Array) -> float:
+    """Return the variance of errors along one line, shape (N,), rad, so that the region of a budget holds 95 % of them.
+
+    Across the line the budget's other parts are met by normal errors, which take their share of the region's 95 %: with
+    x the error and v the variance, x^2 / v plus a chi-squared variable of one degree of freedom stays below the
+    quantile. For normal errors v is their variance.
+    """
+    squares = np.square(moves)
+    if not squares.max() > 0:
+        return 0.0
+    limit = chi_squared.quantile(CONFIDENCE, 2)
+    low, high = 0.0, float(squares.max())
+    # Bisection: more variance holds more.
+    for _ in range(60):
+        v = (low + high) / 2
+        left = limit - squares / max(v, 1e-300)
+        held = float(np.mean(_below(left)))
+        low, high = (v, high) if held < CONFIDENCE else (low, v)
+    return high
+
+
+def line_covariance(moves: Array) -> Array:
+    """Return the covariance of moves that lie all but along one line, shape (N, 2), rad (see `equivalent_variance`)."""
+    square = moves.T @ moves / len(moves)
+    values, vectors = np.linalg.eigh(square)
+    along = np.outer(vectors[:, 1], vectors[:, 1])
+    return np.asarray(equivalent_variance(moves @ vectors[:, 1]) * along + square - values[1] * along)
+
+
+_ROOTS = np.linspace(0.0, 4.0, 401)
+_SHARES = np.array([math.erf(root / math.sqrt(2)) for root in _ROOTS.tolist()])
+
+
+def _below(values: Array) -> Array:
+    """Return the probability that a chi-squared variable of one degree of freedom stays below each value."""
+    return np.interp(np.sqrt(np.maximum(values, 0.0)), _ROOTS, _SHARES)

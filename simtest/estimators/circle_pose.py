@@ -73,20 +73,22 @@ class CirclePoseEstimator:
     isovalue : float
         t in (0, 1).
     with_region : bool
-        Whether estimates state a region; it takes longer than all else together.
+        Whether estimates on planes state a region; it takes longer than all else together.
     """
 
     isovalue: float = CIRCLE_POSE_ISOVALUE
     with_region: bool = True
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`); priors are not used.
+        """Estimate the normal (see `simtest.estimators.Estimator`); of the priors `plane` alone is used.
 
         The estimate has two candidates and looks at the projected circle centre. `choice_margin` is the difference of
         the two distances over its standard deviation, where the noise is known. Flags: ``ambiguous`` where that is
         below 2; ``near_degenerate`` where the peak is nearer to the middle than to either centre, or noise hides the
         centres' distance: usually the light is at the camera, and the two-fold model does not apply. `region` holds the
-        normals that the isophote's noise allows: about both candidates, which near the branch point are one region.
+        normals that the isophote's noise allows: about both candidates, which near the branch point are one region. It
+        is stated only where the surface is known to be a plane: on a curved one the isophote is no circle, and the
+        normal is off by tens of degrees (theory.md section 4), whatever the light.
         """
         return self.estimate_batch([patch], camera, priors)[0]
 
@@ -98,12 +100,12 @@ class CirclePoseEstimator:
         pairs = zip(patches, fitted, strict=True)
         pending = [(patch, isophote) for patch, isophote in pairs if not isinstance(isophote, Failure)]
         posed = zip(pending, _pose(pending, camera), strict=True)
-        made = (self._stated(result, patch, camera) for (patch, _), result in posed)
+        made = (self._stated(result, patch, camera, priors) for (patch, _), result in posed)
         return [isophote if isinstance(isophote, Failure) else next(made) for isophote in fitted]
 
-    def _stated(self, result: Estimate | Failure, patch: Patch, camera: Camera) -> Estimate | Failure:
-        """Add the region, where it is wanted."""
-        if isinstance(result, Failure) or not self.with_region:
+    def _stated(self, result: Estimate | Failure, patch: Patch, camera: Camera, priors: Priors) -> Estimate | Failure:
+        """Add the region, where it is wanted and the surface is known to be a plane."""
+        if isinstance(result, Failure) or not self.with_region or not priors.plane:
             return result
         return replace(result, region=pose_region(patch, camera, result.isophotes[0]))
 

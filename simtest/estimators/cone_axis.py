@@ -6,7 +6,7 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
 from simtest.estimators.isophote_family import fit_isophote_family
-from simtest.estimators.light_offset import add_light_offset_uncertainty
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
 
@@ -15,7 +15,7 @@ from simtest.geometry import Camera, Patch
 class ConeAxis:
     """The mean of the cones' axes over several isovalues.
 
-    Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
+    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class ConeAxis:
             budget=family.axis_budget,
             flags=family.flags,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 cone_axis = ConeAxis()

@@ -9,7 +9,7 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily, fit_isophote_family
-from simtest.estimators.light_offset import add_light_offset_uncertainty
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, Patch
 
@@ -30,7 +30,7 @@ class Curved:
     which have a quarter of the noise. Where c is not known, m is known up to scale and the 2 m of the falloff is
     neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
 
-    Of the priors, the lobe's curvature is used, and the lights as by `cone_axis`.
+    Of the priors, the lobe's curvature is used; what they leave open is added to the budget as by `cone_axis`.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Curved:
             flags=(*family.flags, "round") if is_round else family.flags,
             curvature=curvature,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 curved = Curved()

@@ -11,9 +11,9 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
 from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
 from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.light_offset import add_light_offset_uncertainty
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
+from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
@@ -62,7 +62,7 @@ class Photometric:
     degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
-    Of the priors, the lights inflate the covariance (`simtest.estimators.light_offset`).
+    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
@@ -98,7 +98,7 @@ class Photometric:
             budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)},
             flags=flags,
         )
-        return add_light_offset_uncertainty(estimate, priors)
+        return add_untold_parts(estimate, camera, priors, family)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Unit vectors: tangent bases and the difference of two directions."""
+"""Unit vectors: tangent bases, the difference of two directions, and the bisector of light and camera."""
 
 import numpy as np
 
@@ -50,3 +50,14 @@ def tangent_coordinates(normal: Array, other: Array) -> Array:
     sine = float(np.hypot(*across))
     angle = float(np.arctan2(sine, normal @ other))
     return across * (angle / sine) if sine > 0 else across  # 0 stays 0
+
+
+def bisect(position: Array, light: Array) -> Array:
+    """Return the unit vectors that bisect the directions from points, shape (..., 3), to a light and to the camera."""
+    to_light, to_camera = light - position, -position
+    both = to_light / _length(to_light) + to_camera / _length(to_camera)
+    return np.asarray(both / _length(both))
+
+
+def _length(vectors: Array) -> Array:
+    return np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))

@@ -4,17 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Priors
+from simtest.calibration import NO_PRIORS, Normal, Priors
 from simtest.errors import Failure, Reason
-from simtest.estimators.bisector import bisect
-from simtest.estimators.budget import Budget
+from simtest.estimators.bisector import DISTANCES
+from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
+from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.vectors import basis_across
+from simtest.geometry.vectors import basis_across, bisect
 from simtest.inverse.patch_renderer import PatchRenderer
 from simtest.inverse.rendered_quadric import RenderedQuadric
 
@@ -39,8 +40,8 @@ class InverseRendering:
     noise this is the maximum-likelihood estimate. Clipped pixels count as "at least this bright". Pixels are those
     before smoothing.
 
-    With lights and distance known the patch is lit from there; else from the camera, at any distance. The exponent
-    follows from the lobe's curvature.
+    With lights told the patch is lit from there, at the mean of the prior on the distance; else from the camera, at any
+    distance. The exponent follows from the lobe's curvature.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ class InverseRendering:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
         found = fitted.model
         gains = 1 + np.linalg.eigvalsh(found.shape)
-        return Estimate(
+        estimate = Estimate(
             normal=found.normal,
             candidates=found.normal[None],
             look_px=camera.project(found.sightline),
@@ -95,6 +96,7 @@ class InverseRendering:
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
+        return add_camera_and_falloff(estimate, camera, priors)
 
 
 inverse_rendering = InverseRendering()
@@ -136,23 +138,30 @@ def _fitted(start: RenderedQuadric, pixels: HighlightPixels) -> LobeFit[Rendered
 
 
 def _lit(priors: Priors) -> tuple[float, Array, Array]:
-    """Return distance, the highlight's light and all lights; 1 mm and the camera's position where not known."""
-    if not priors.lights_mm or priors.distance_mm is None:
+    """Return distance, the highlight's light and all lights; 1 mm and the camera's position where none is told."""
+    if not priors.lights_mm:
         return 1.0, np.zeros(3), np.zeros((1, 3))
-    return priors.distance_mm.mean, priors.lights.mean(axis=0), priors.lights
+    return priors.distance.mean, priors.lights.mean(axis=0), priors.lights
 
 
 def _budget(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Budget:
-    """Return the budget of the normal: noise and distance."""
+    """Return the budget of the normal: noise, and distance or, where no light is told, the light's offset."""
     model = fitted.model
     across = basis_across(model.normal)
     steps = [model.moved(np.append(STEP * unit, np.zeros(len(fitted.covariance) - 2))).normal for unit in np.eye(2)]
     J = across @ (np.array(steps) - model.normal).T / STEP
-    by_distance = np.zeros(2)
-    if priors.distance_mm is not None and priors.distance_mm.sd > 0:
-        farther = bisect(model.distance * (1 + STEP) * model.sightline, model.light)
-        by_distance = across @ (farther - model.normal) / (STEP * model.distance) * priors.distance_mm.sd
-    return {"noise": J @ fitted.covariance[:2, :2] @ J.T, "distance": np.outer(by_distance, by_distance)}
+    noise = J @ fitted.covariance[:2, :2] @ J.T
+    if not priors.lights_mm:
+        return {"noise": noise, "light_offset": light_offset_part(model.normal, priors)}
+    distances = priors.distance.quantile(DISTANCES)
+    if isinstance(priors.distance, Normal):
+        # The derivative, which the ends of a wide normal distribution would bend.
+        distances = model.distance * np.array([1.0, 1 + STEP])
+    moves = bisect(distances[:, None] * model.sightline, model.light) @ across.T
+    if not isinstance(priors.distance, Normal):
+        return {"noise": noise, "distance": line_covariance(moves)}
+    by_distance = (moves[1] - moves[0]) / (STEP * model.distance) * priors.distance.sd
+    return {"noise": noise, "distance": np.outer(by_distance, by_distance)}
 
 
 def _curvature(model: RenderedQuadric, priors: Priors) -> EstimatedCurvature:

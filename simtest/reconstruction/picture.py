@@ -9,13 +9,15 @@ from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
 from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
-from simtest.geometry import Camera
+from simtest.estimators.protocol import Target
+from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.image_io import is_coloured
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, SMOOTHING_BY_COLOUR_PX, run_pipeline
 from simtest.runtime.arrays import Image
 
 DETECTORS = ("auto", "colour", "peaks")
+TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
 
@@ -44,11 +46,14 @@ class Options:
         pictures that have any and are not linear.
     smoothing_px : float, optional
         Standard deviation of the Gaussian smoothing; default 1 px by colour, else 2 px.
+    target : {"fine", "base"}
+        Which surface's normals are stated: those of the fine one, or of the base without its relief, whose slope is
+        then in the uncertainty.
 
     Raises
     ------
     InputError
-        If the camera is given twice or not at all, or the detector is none of these.
+        If the camera is given twice or not at all, or detector or target is none of these.
     """
 
     camera: Path | None = None
@@ -59,10 +64,13 @@ class Options:
     every: bool = False
     detector: str = "auto"
     smoothing_px: float | None = None
+    target: Target = "fine"
 
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS:
             raise InputError(f"--detector {self.detector}: must be one of {', '.join(DETECTORS)}")
+        if self.target not in TARGETS:
+            raise InputError(f"--target {self.target}: must be one of {', '.join(TARGETS)}")
         if (self.camera is None) == (self.fov_deg is None):
             raise InputError("--camera or --fov: exactly one of them must be given")
 
@@ -79,8 +87,7 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
 def read_calibration(options: Options, picture: Image) -> tuple[Calibration, list[str]]:
     """Return the calibration of pictures of this size, and warnings about it.
 
-    Added is what every picture file has: an encoding, and a largest value, at which it is clipped. Raises `InputError`
-    if the camera's file is malformed, or states the response and the options do too.
+    Raises `InputError` if the camera's file is malformed, or states the response and the options do too.
     """
     if options.camera is not None:
         # Imported here: the models of files are slow to load, and a field of view needs none.
@@ -89,20 +96,23 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
         calibration, cautions = load_calibration(options.camera), []
     else:
         assert options.fov_deg is not None
-        calibration = Calibration(Camera.from_fov(options.fov_deg, picture.shape[1], picture.shape[0]))
+        calibration = calibration_of_view(options.fov_deg, picture.shape[1], picture.shape[0])
         cautions = [f"no calibration: all angles depend on the field of view of {options.fov_deg:g} deg being right"]
     if calibration.response is not None and options.encoding is not None:
         raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
+    return calibration, cautions
+
+
+def _completed(calibration: Calibration, options: Options) -> Calibration:
+    """Add what every picture file has: an encoding, and a largest value, at which it is clipped."""
     response = calibration.response or (Response() if options.encoding == "linear" else Response("srgb"))
     level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
-    return replace(calibration, response=response, saturation_level=level), cautions
+    return replace(calibration, response=response, saturation_level=level)
 
 
 def default_estimators(calibration: Calibration) -> tuple[str, ...]:
     """Return the names of the estimators that the calibration states enough for."""
-    priors = calibration.priors
-    lights = len(priors.lights) > 0 and priors.distance_mm is not None
-    return (*DEFAULT_ESTIMATORS, *(("bisector",) if lights else ()))
+    return (*DEFAULT_ESTIMATORS, *(("bisector",) if calibration.priors.lights_mm else ()))
 
 
 def reconstruct_values(
@@ -113,6 +123,8 @@ def reconstruct_values(
     Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
     the picture.
     """
+    assumed = assumptions(calibration, options.encoding, options.target)
+    calibration = _completed(calibration, options)
     estimators = list(options.estimators or default_estimators(calibration))
     detector = _detector(picture, calibration, options)
     smoothing_px = SMOOTHING_BY_COLOUR_PX if detector == "colour" else DEFAULT_SMOOTHING_PX
@@ -120,7 +132,7 @@ def reconstruct_values(
         smoothing_px = options.smoothing_px
     finder = (ColourDetector if detector == "colour" else PeakDetector)(isolated=not options.every)
     # linear light, detect, estimate
-    made = run_pipeline(picture, calibration, finder, estimators, options.roi, smoothing_px)
+    made = run_pipeline(picture, calibration, finder, estimators, options.roi, smoothing_px, options.target)
     # describe
     return PictureRecord(
         image=name,
@@ -129,8 +141,9 @@ def reconstruct_values(
         detector=detector,
         view=made.detection.view,
         warnings=list(cautions),
-        specularities=describe(made, calibration.camera),
+        specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
+        assumed=assumed,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Frame, Response
+from simtest.calibration import Calibration, Frame, Priors, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetection, ColourDetector, detect_colour
@@ -18,6 +18,8 @@ from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
+from simtest.estimators.prior_parts import to_base
+from simtest.estimators.protocol import Target
 from simtest.geometry import Camera, Patch
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
@@ -68,6 +70,7 @@ def reconstruct(
     smoothing_px: float = DEFAULT_SMOOTHING_PX,
     isolated: bool = True,
     detector: str | Detector | None = None,
+    target: Target = "fine",
 ) -> list[Specularity]:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -90,6 +93,9 @@ def reconstruct(
         whose shape is that of one point highlight (`simtest.detection.peak_shape`).
     detector : str or Detector, optional
         Name as registered, or the detector itself; default `peaks`, to which alone `isolated` applies.
+    target : {"fine", "base"}
+        Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
+        they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
 
     Returns
     -------
@@ -105,7 +111,7 @@ def reconstruct(
         argument is of the wrong kind or out of range.
     """
     finder = PeakDetector(isolated) if detector is None else detector
-    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px).specularities
+    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px, target).specularities
 
 
 def reconstruct_colour(
@@ -181,6 +187,7 @@ def run_pipeline(
     estimators: Sequence[str] | Mapping[str, AnyEstimator],
     roi: tuple[int, int, int, int] | None,
     smoothing_px: float,
+    target: Target = "fine",
 ) -> Reconstruction:
     """Reconstruct the normals of a picture with any detector (see `reconstruct` and `reconstruct_colour`)."""
     calibration = _calibration(camera)
@@ -195,7 +202,8 @@ def run_pipeline(
     # detect
     detection = _detect(load_detector(detector), frame) if box is None else _cut_region(frame, box)
     # estimate
-    return _estimate(detection, chosen)
+    made = _estimate(detection, chosen)
+    return made if target == "fine" else _at_base(made, calibration.priors)
 
 
 def _detect(detector: Detector, frame: Frame) -> Detection:
@@ -252,6 +260,21 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
     result.specularities.extend(undetected)
     return result
+
+
+def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
+    """Return a reconstruction whose estimates state the base's normals."""
+    based = [
+        replace(
+            each,
+            estimates={
+                name: result if isinstance(result, Failure) else to_base(result, priors)
+                for name, result in each.estimates.items()
+            },
+        )
+        for each in made.specularities
+    ]
+    return replace(made, specularities=based)
 
 
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:

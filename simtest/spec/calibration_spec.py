@@ -1,13 +1,41 @@
 """The tables of a calibration file: a camera with its response, vignetting, emission and noise."""
 
+import math
+from typing import Annotated, Self
+
 from pydantic import Field, model_validator
 
-from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
+from simtest.calibration import (
+    Calibration,
+    CameraPrior,
+    Distribution,
+    NoiseModel,
+    Normal,
+    Priors,
+    Response,
+    Uniform,
+    exactly,
+)
+from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.geometry import Camera
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.falloff import CosineProfile, Profile
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
 from simtest.spec.spec_model import Coordinate, Millimetres, Spec
+
+Bound = Annotated[float, Field(ge=0, le=1e6)]
+Interval = tuple[Bound, Bound]
+"""Ends of a uniform distribution; equal ones are an exact value."""
+
+
+def _check_interval(name: str, interval: Interval | float | None, above: float | None = None) -> None:
+    """Raise `ValueError` where the ends of an interval are not in order, or the lower one is not more than `above`."""
+    if not isinstance(interval, tuple):
+        return
+    low, high = interval
+    if low > high or (above is not None and low <= above):
+        least = "" if above is None else f" above {above:g}"
+        raise ValueError(f"{name} = [{low:g}, {high:g}]: must be a lower and an upper end{least}, in this order")
 
 
 class SensorCalibration(Spec):
@@ -36,18 +64,61 @@ class RigCalibration(Spec):
         None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
     )
     distance_sd_mm: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the true distance, mm")
+    distance_range_mm: Interval | None = Field(
+        None, description="instead of distance_mm: the working distance lies anywhere in between, mm; default [5, 80]"
+    )
+    light_offset_mm: Interval | None = Field(
+        None,
+        description="where lights_mm is not known: a light lies this far from the camera, anywhere in between, across "
+        "the optical axis, mm; default [0, 6]",
+    )
 
     @model_validator(mode="after")
-    def _about_a_distance(self) -> "RigCalibration":
+    def _about_a_distance(self) -> Self:
         if self.distance_sd_mm > 0 and self.distance_mm is None:
             raise ValueError(f"distance_sd_mm = {self.distance_sd_mm:g}: needs distance_mm")
+        if self.distance_range_mm is not None and self.distance_mm is not None:
+            raise ValueError("distance_range_mm and distance_mm exclude each other; give one of them")
+        if self.light_offset_mm is not None and self.lights_mm:
+            raise ValueError("light_offset_mm and lights_mm exclude each other; give one of them")
+        _check_interval("distance_range_mm", self.distance_range_mm, above=0.0)
+        _check_interval("light_offset_mm", self.light_offset_mm)
+        return self
+
+
+class UncertaintyCalibration(Spec):
+    """How far what the other tables state may be off."""
+
+    focal_sd: float = Field(0.0, ge=0, le=1, description="standard deviation of the focal length, share of it")
+    centre_sd_px: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the principal point an axis, px")
+    distortion_sd: float = Field(
+        0.0, ge=0, le=10, description="standard deviation of a radial distortion k1 that the camera leaves out"
+    )
+    falloff_power: Interval | None = Field(
+        None,
+        description="a falloff cos^k over the angle from the optical axis is left in the frame, k anywhere in between; "
+        "default [0, 4] where neither vignetting nor emission is stated, else none",
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        _check_interval("falloff_power", self.falloff_power)
         return self
 
 
 class SurfaceCalibration(Spec):
-    """What is known of the surface's lobe."""
+    """What is known of the surface's lobe and relief."""
 
     phong_exponent: float | None = Field(None, gt=0, le=1e5, description="roughness exponent n; default not known")
+    relief_slope_deg: Annotated[float, Field(ge=0, le=45)] | Interval | None = Field(
+        None,
+        description="slope of the relief an axis, deg: a number, or the interval that it lies in; default [0, 6]",
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        _check_interval("relief_slope_deg", self.relief_slope_deg)
+        return self
 
 
 class CalibrationSpec(Spec):
@@ -64,6 +135,7 @@ class CalibrationSpec(Spec):
     sensor: SensorCalibration = SensorCalibration()
     rig: RigCalibration = RigCalibration()
     surface: SurfaceCalibration = SurfaceCalibration()
+    uncertainty: UncertaintyCalibration = UncertaintyCalibration()
 
     def calibration(self, camera: Camera) -> Calibration:
         """Return a camera with all that the file states beside it; the camera's own table has been read before."""
@@ -75,13 +147,35 @@ class CalibrationSpec(Spec):
         return Calibration(camera, response, *falloff, noise, sensor.saturation_level, self.priors())
 
     def priors(self) -> Priors:
-        """Return the priors on lights, distance and lobe."""
-        rig, exponent = self.rig, self.surface.phong_exponent
-        distance = None if rig.distance_mm is None else Normal(rig.distance_mm, rig.distance_sd_mm)
-        if exponent is None:
-            return Priors(rig.lights_mm, distance)
-        # Imported here: the reflectances are slower to load than the whole calibration.
-        from simtest.spec.reflectance import PhongReflectance
+        """Return the priors on lights, distance, lobe, camera, falloff and relief."""
+        rig, surface, told = self.rig, self.surface, self.uncertainty
+        distance = _distribution(rig.distance_range_mm)
+        if rig.distance_mm is not None:
+            distance = Normal(rig.distance_mm, rig.distance_sd_mm)
+        # A falloff that neither table states is still in the frame.
+        states_falloff = bool(self.model_fields_set & {"vignetting", "emission"})
+        lobe = None
+        if surface.phong_exponent is not None:
+            # Imported here: the reflectances are slower to load than the whole calibration.
+            from simtest.spec.reflectance import PhongReflectance
 
-        lobe = exactly(PhongReflectance(exponent=exponent).lobe_curvature)
-        return Priors(rig.lights_mm, distance, lobe)
+            lobe = exactly(PhongReflectance(exponent=surface.phong_exponent).lobe_curvature)
+        slope = surface.relief_slope_deg
+        slopes = (slope, slope) if isinstance(slope, float) else slope
+        return Priors(
+            rig.lights_mm,
+            distance,
+            lobe,
+            light_offset_mm=_distribution(rig.light_offset_mm) or UNTOLD_OFFSET_MM,
+            camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd),
+            falloff_power=_distribution(told.falloff_power) or (None if states_falloff else UNTOLD_FALLOFF_POWER),
+            relief_slope=_distribution(slopes, math.radians(1.0)) or UNTOLD_SLOPE_RAD,
+        )
+
+
+def _distribution(interval: Interval | None, unit: float = 1.0) -> Distribution | None:
+    """Return the uniform distribution over an interval, or the exact value of one without length."""
+    if interval is None:
+        return None
+    low, high = interval
+    return exactly(low * unit) if low == high else Uniform(low * unit, high * unit)

@@ -18,7 +18,7 @@ from simtest.spec.toml_files import read_toml
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface"})
+NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface", "uncertainty"})
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
 
 OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")

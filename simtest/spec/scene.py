@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
+from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import SceneCamera
@@ -158,10 +159,14 @@ class Scene(Spec):
         curvature = None
         if self.known.lobe and isinstance(self.reflectance, PhongReflectance | TissueReflectance):
             curvature = self.reflectance.lobe_curvature
+        # A falloff that they are not told is still in the frame.
+        emitted = self.rig.known_emission() is not None or all(light.is_isotropic for light in self.rig.lights)
+        told = self.sensor.vignetting_known and self.rig.emission_known and emitted
         return Priors(
             tuple(light.nominal_mm for light in self.rig.lights) if self.known.lights else (),
             None if mean is None else Normal(mean, mean * self.known.distance_sd),
             None if curvature is None else exactly(curvature),
+            falloff_power=None if told else UNTOLD_FALLOFF_POWER,
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.calibration import Calibration, Priors, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Priors, exactly
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection import detect
 from simtest.estimators.bisector import bisector
@@ -29,7 +29,7 @@ ALPHA = 0.01
 
 D, SIGMA = 10.0, 0.05
 EXPONENT = 50.0
-LOBE = Priors(lobe_curvature=exactly(4 * EXPONENT))
+LOBE = replace(LIGHT_AT_CAMERA, lobe_curvature=exactly(4 * EXPONENT))
 OFFSET = {"offset_mm": 1.0, "azimuth_deg": 45.0}
 
 
@@ -194,7 +194,9 @@ RIG = ((float(np.cos(np.pi / 4)), float(np.sin(np.pi / 4)), 0.0),)
 
 
 def told(share):
-    return lambda number, true: Priors(RIG, exactly(true.distance * (share if share else _uniform(number))))
+    return lambda number, true: Priors(
+        RIG, exactly(true.distance * (share if share else _uniform(number))), falloff_power=None
+    )
 
 
 def _uniform(number):
@@ -228,7 +230,7 @@ def covered(made, true, key):
 
 
 def check_covariances(bench, shape, count, low, high):
-    exact = lambda number, true: Priors(RIG, exactly(true.distance))  # noqa: E731
+    exact = lambda number, true: Priors(RIG, exactly(true.distance), falloff_power=None)  # noqa: E731
     told = {"cone_axis": cone_axis, "curved": curved, "photometric": photometric}
     made, true = bench.estimates(shape, told, count=count)
     beside, true_beside = bench.estimates(shape, {"bisector": bisector}, exact, count, [OFFSET])

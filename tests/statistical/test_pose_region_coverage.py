@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from simtest.calibration import Priors
 from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.runtime.seeds import from_integer
@@ -22,7 +23,7 @@ def statistics_of(theta, sigma, count, **more):
     found = []
     for seed in range(count):
         patch = pipeline.patch(from_integer(40_000 + seed))
-        estimate = CirclePoseEstimator(setting.isovalue).estimate(patch, setting.camera)
+        estimate = CirclePoseEstimator(setting.isovalue).estimate(patch, setting.camera, Priors(plane=True))
         found.append(float(estimate.region.statistic(setting.normal)))
     return np.array(found)
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, LogUniform, Normal, Priors, Uniform, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.bisector import bisect, bisector
+from simtest.estimators.bisector import bisector
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
@@ -16,7 +16,7 @@ from simtest.estimators.dispatch import run
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.vectors import angle_deg
+from simtest.geometry.vectors import angle_deg, bisect
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
@@ -108,9 +108,11 @@ def test_a_calibration_file_says_it(tmp_path):
         "[rig]\nlights_mm = [[4.0, 0.0, 0.0], [-4.0, 0.0, 1.0]]\ndistance_mm = 40.0\ndistance_sd_mm = 8.0\n"
         "[surface]\nphong_exponent = 50.0\n"
     )
-    assert load_calibration(path).priors == Priors(
-        ((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0)
-    )
+    told = Priors(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0))
+    assert load_calibration(path).priors == told
+    # A falloff that is stated, even as none, is no prior any more.
+    path.write_text(path.read_text() + '[emission]\ntype = "cosine"\npower = 0.0\n')
+    assert load_calibration(path).priors == replace(told, falloff_power=None)
     path.write_text(path.read_text().replace("distance_mm = 40.0", ""))
     with pytest.raises(InputError, match="distance_sd_mm"):
         load_calibration(path)
@@ -123,19 +125,22 @@ def test_a_scene_says_it():
     assert (priors.distance_mm.mean, priors.distance_mm.sd) == (pytest.approx(8.0), pytest.approx(0.8))
     assert (priors.lights_mm, priors.lobe_curvature) == (((0.0, 0.0, 0.0),), exactly(200.0))
     silent = scene_from_dict({"surface": surface, "known": {"lights": False, "lobe": False}})
-    assert silent.calibration(10.0).priors == Priors()
+    assert silent.calibration(10.0).priors == Priors(falloff_power=None)
+    unknown = scene_from_dict({"surface": surface, "sensor": {"vignetting_known": False}})
+    assert unknown.calibration().priors.falloff_power == Priors().falloff_power
     with pytest.raises(InputError, match="exclude each other"):
         scene_from_dict({"surface": surface, "known": {"distance_mm": 5.0, "distance_error": 0.0}})
 
 
-def test_without_a_rig_or_a_distance_the_bisector_says_so():
-    for priors in (Priors(), Priors(distance_mm=exactly(5.0)), Priors(((0.0, 0.0, 0.0),))):
+def test_without_a_rig_the_bisector_says_so():
+    for priors in (Priors(), Priors(distance_mm=exactly(5.0))):
         result = bisector.estimate(lobe(), CAMERA, priors)
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
-    light_at_camera = bisector.estimate(lobe(), CAMERA, Priors(((0.0, 0.0, 0.0),), exactly(10.0)))
     axis = fit_isophote_family(lobe(), CAMERA, ISOVALUES).peak_axis
-    np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
+    for priors in (Priors(((0.0, 0.0, 0.0),), exactly(10.0)), LIGHT_AT_CAMERA):
+        light_at_camera = bisector.estimate(lobe(), CAMERA, priors)
+        np.testing.assert_allclose(light_at_camera.normal, -axis, atol=1e-12)
 
 
 def test_the_bisector_halves_the_angle():

@@ -1,9 +1,11 @@
 """Convex against concave from two views: on rendered pairs, and against the exact geometry of a circle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Normal, Priors, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
@@ -51,7 +53,7 @@ def view():
         truth = min(session.highlights(radiance), key=lambda h: np.linalg.norm(h.position - [0, 0, distance]))
         peak = radiance.total[int(truth.bp_px[1]), int(truth.bp_px[0])]
         frame = radiance.total / peak + sigma * from_integer(seed).standard_normal(radiance.total.shape)
-        priors = Priors(lobe_curvature=exactly(LOBE))
+        priors = replace(LIGHT_AT_CAMERA, lobe_curvature=exactly(LOBE))
         found = reconstruct(
             np.minimum(frame, 1.5).astype(np.float32), Calibration(session.camera, priors=priors),
             {"curved": curved, "cone_axis": cone_axis}, isolated=False,

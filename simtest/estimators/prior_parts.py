@@ -1,0 +1,173 @@
+"""The parts of a budget that no picture shows, from the priors: light, camera, falloff, and the relief of the base.
+
+The picture itself does not show where the light is: on a plane 10 mm away, a light 1 mm beside the camera moves the
+highlight by 2.8 deg and leaves its isophotes ellipses. No test of a fit finds that; only what is told of the rig does,
+and what nobody told is a prior.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from simtest.calibration import CameraPrior, Distribution, Priors
+from simtest.estimators.budget import CONFIDENCE, equivalent_variance
+from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.light_table import light_table
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Array, Camera, chi_squared
+from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
+
+AT_CAMERA_MM = 1e-9
+"""A light nearer than this to the sightline is on it."""
+
+NEAR_SHARE = 0.05
+"""Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
+
+NEGLIGIBLE = 0.1
+"""A squared error below this share of the stated variance is left out."""
+
+STEP_PX = 0.5
+"""Step of the sightline's central differences."""
+
+SHARES = (np.arange(64) + 0.5) / 64
+"""At these shares a prior of one number is sampled."""
+
+
+def add_untold_parts(
+    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+) -> Estimate:
+    """Add what nobody told to the budget of a normal that is a reversed sightline.
+
+    Where no light is told, it lies somewhere beside the camera: part ``light_offset``. Where lights are told, and all
+    at the camera, there is no such part. Where one is told elsewhere, half its angle at the surface is a known error of
+    a reversed sightline, not a random one: the estimate gets the flag ``light_offset`` and states no uncertainty;
+    `bisector` answers instead. Parts ``camera`` and ``response`` follow where the priors leave the camera's geometry or
+    the falloff open.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Without these parts; one without a covariance gets none.
+    camera : Camera
+        Calibration.
+    priors : Priors
+        What is told.
+    family : IsophoteFamily, optional
+        The highlight's isophotes: their moments say how far a falloff moves the peak.
+    """
+    if priors.lights_mm:
+        estimate = _with_told_lights(estimate, priors)
+    elif estimate.budget is not None:
+        estimate = estimate.with_parts(light_offset=light_offset_part(estimate.normal, priors))
+    return add_camera_and_falloff(estimate, camera, priors, family)
+
+
+def add_camera_and_falloff(
+    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+) -> Estimate:
+    """Add the parts ``camera`` and ``response`` to the budget of an estimate that has one."""
+    if estimate.budget is None:
+        return estimate
+    parts = {}
+    if not priors.camera.is_exact:
+        parts["camera"] = camera_part(estimate, camera, priors.camera)
+    if priors.falloff_power is not None and family is not None:
+        parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
+    return estimate.with_parts(**parts) if parts else estimate
+
+
+def light_offset_part(normal: Array, priors: Priors) -> Array:
+    """Return the covariance of a reversed sightline by a light that nobody told, shape (2, 2), rad^2."""
+    table = light_table(priors.light_offset_mm, priors.distance)
+    return table.covariance(normal, basis_across(normal))
+
+
+def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array:
+    """Return the covariance of the normal by the camera's geometry, shape (2, 2), rad^2.
+
+    The normal turns with the sightline that it looks along. Another focal length, centre or distortion sees, at the
+    pixel looked at, what this camera sees at a pixel beside it.
+    """
+    x, y = estimate.look_px
+    from_centre = np.array([x - camera.cx, y - camera.cy])
+    reach2 = (from_centre[0] / camera.fx) ** 2 + (from_centre[1] / camera.fy) ** 2
+    radial = prior.focal_sd**2 + (prior.distortion_sd * reach2) ** 2
+    in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * np.eye(2)
+    steps = STEP_PX * np.eye(2)
+    ahead, behind = (camera.unproject(estimate.look_px + sign * steps) for sign in (1.0, -1.0))
+    J = basis_across(estimate.normal) @ ((ahead - behind) / (2 * STEP_PX)).T
+    return np.nan_to_num(J @ in_pixels @ J.T)
+
+
+def falloff_part(normal: Array, family: IsophoteFamily, power: Distribution) -> Array:
+    """Return the covariance of the normal by a falloff cos^k that is left in the frame, shape (2, 2), rad^2.
+
+    Its slope, k tan(phi) towards the optical axis, moves the peak by the lobe's moments 1/H times the slope (theory.md
+    section 4).
+    """
+    sightline = family.axis
+    slope = family.basis[:, 2] / max(float(sightline[2]), 1e-3)  # grad log cos(phi) across the sightline
+    shift = basis_across(normal) @ family.basis.T @ (family.moments @ slope)
+    return np.asarray(_unit_variance(power) * np.outer(shift, shift))
+
+
+def to_base(estimate: Estimate, priors: Priors) -> Estimate:
+    """State the base's normal from a single highlight: the same normal, and the slope of the relief in its budget.
+
+    The fine normal at a highlight differs from the base's by the relief's slope there, which is a normal pair of
+    standard deviation s an axis (theory.md 7.4). An estimate that states the base's normal already is returned as it
+    is; one without uncertainty still has none.
+    """
+    if estimate.target == "base":
+        return estimate
+    based = replace(estimate, target="base", region=None)
+    return based if based.budget is None else based.with_parts(relief=relief_part(priors))
+
+
+def relief_part(priors: Priors) -> Array:
+    """Return the covariance of a single highlight's normal about the base's, shape (2, 2), rad^2."""
+    return _slope_variance(priors.relief_slope) * np.eye(2)
+
+
+def _with_told_lights(estimate: Estimate, priors: Priors) -> Estimate:
+    """Judge a reversed sightline by the told lights (see `add_untold_parts`)."""
+    across = priors.lights @ basis_across(estimate.normal).T
+    if np.linalg.norm(across, axis=1).max() < AT_CAMERA_MM:
+        return estimate
+    if estimate.covariance is not None:
+        near = float(priors.distance.quantile(np.array(NEAR_SHARE)))
+        moved = half_angles(estimate.normal, near, priors.lights)
+        if float(np.max(np.sum(moved**2, axis=1))) < NEGLIGIBLE * np.trace(estimate.covariance):
+            return estimate
+    return replace(estimate, flags=(*estimate.flags, "light_offset")).without_uncertainty()
+
+
+def half_angles(normal: Array, distance: float, lights: Array) -> Array:
+    """Return how far each light moves the normal from the reversed sightline, rad, tangent basis, shape (L, 2)."""
+    position = -distance * normal
+    return np.array([tangent_coordinates(normal, bisect(position, light)) for light in lights])
+
+
+@lru_cache(maxsize=16)
+def _unit_variance(factor: Distribution) -> float:
+    """Return the equivalent variance of an error along one line that is a factor times 1."""
+    return equivalent_variance(factor.quantile(SHARES))
+
+
+@lru_cache(maxsize=16)
+def _slope_variance(slope: Distribution) -> float:
+    """Return the equivalent variance an axis of normal pairs whose own standard deviation is a prior.
+
+    Of these pairs the share exp(-r^2 / 2 s^2) lies beyond r.
+    """
+    s = slope.quantile(SHARES)
+    if not s.max() > 0:
+        return 0.0
+    low, high = 0.0, 10 * float(s.max())
+    # bisection for the radius that 5 % exceed
+    for _ in range(60):
+        r = (low + high) / 2
+        beyond = float(np.mean(np.exp(-(r**2) / (2 * np.maximum(s, 1e-12) ** 2))))
+        low, high = (r, high) if beyond > 1 - CONFIDENCE else (low, r)
+    return high**2 / chi_squared.quantile(CONFIDENCE, 2)

@@ -1,0 +1,176 @@
+"""What nobody told: parts of the budget from the priors, against draws from these priors through exact geometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
+from simtest.errors import InputError
+from simtest.estimators.budget import equivalent_variance, line_covariance
+from simtest.estimators.prior_parts import add_untold_parts, light_offset_part, relief_part, to_base
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Camera
+from simtest.geometry.vectors import basis_across, bisect
+
+LIMIT = chi2.ppf(0.95, 2)
+WIDE = Camera.from_fov(120.0, 640, 480)
+NOISE = 1e-5 * np.eye(2)
+ANGLES_DEG = (0.0, 20.0, 40.0, 55.0)
+
+
+def sightline_at(angle_deg):
+    angle = np.radians(angle_deg)
+    return np.array([np.sin(angle) * np.cos(0.7), np.sin(angle) * np.sin(0.7), np.cos(angle)])
+
+
+def stated(sightline, **given):
+    return Estimate(-sightline, -sightline[None], WIDE.project(sightline), **{"budget": {"noise": NOISE}, **given})
+
+
+def moves_of(sightline, normals):
+    """Return the rotations from a reversed sightline to normals, tangent basis, shape (N, 2)."""
+    across = normals @ basis_across(-sightline).T
+    sine = np.linalg.norm(across, axis=1)
+    return across * (np.arctan2(sine, -normals @ sightline) / np.maximum(sine, 1e-15))[:, None]
+
+
+def true_moves(sightline, offset_mm, distance_mm, rng):
+    """Draw azimuths, and return how far the true normal on a plane is from the reversed sightline."""
+    azimuth = rng.uniform(0, 2 * np.pi, len(distance_mm))
+    lights = offset_mm * np.array([np.cos(azimuth), np.sin(azimuth), np.zeros(len(azimuth))])
+    return moves_of(sightline, bisect(distance_mm[:, None] * sightline, lights.T))
+
+
+def held(moves, covariance):
+    return np.mean(np.einsum("ni,ni->n", moves, np.linalg.solve(covariance, moves.T).T) <= LIMIT)
+
+
+# The light ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle_deg", ANGLES_DEG)
+def test_a_light_that_nobody_told_is_covered(angle_deg):
+    rng, sightline, count = np.random.default_rng(int(angle_deg)), sightline_at(angle_deg), 20000
+    covariance = light_offset_part(-sightline, Priors())
+    distance = rng.uniform(5, 80, count)
+    moves = true_moves(sightline, rng.uniform(0, 6, count), distance, rng)
+    assert held(moves, covariance) == pytest.approx(0.95, abs=0.008)
+    # The median of what is untold, its largest value, and a light at the camera.
+    assert held(true_moves(sightline, 3.0, distance, rng), covariance) >= 0.93
+    assert held(true_moves(sightline, 6.0, distance, rng), covariance) >= 0.70
+    assert held(true_moves(sightline, 0.0, distance, rng), covariance) == 1
+    # Not by being vague.
+    rms = np.sqrt(np.mean(np.sum(moves**2, axis=1)) / 2)
+    assert np.sqrt(np.linalg.eigvalsh(covariance)[1]) < 1.5 * rms
+
+
+@pytest.mark.parametrize(
+    ("offset", "distance"),
+    [(Uniform(2.0, 4.0), Uniform(30.0, 50.0)), (exactly(3.0), Normal(20.0, 4.0)), (exactly(2.0), LogUniform(5, 80))],
+)
+def test_told_ranges_narrow_the_part(offset, distance):
+    rng, sightline, count = np.random.default_rng(1), sightline_at(25.0), 40000
+    priors = Priors(light_offset_mm=offset, distance_mm=distance)
+    covariance = light_offset_part(-sightline, priors)
+    o, d = (prior.quantile(rng.random(count)) for prior in (offset, distance))
+    assert 0.93 <= held(true_moves(sightline, o, d, rng), covariance) <= 0.98
+    assert np.trace(covariance) < np.trace(light_offset_part(-sightline, Priors()))
+
+
+def test_the_light_s_part_is_in_the_budget_where_none_is_told_alone():
+    sightline = sightline_at(20.0)
+    open_light = add_untold_parts(stated(sightline), WIDE, Priors(falloff_power=None))
+    assert set(open_light.budget) == {"noise", "light_offset"}
+    at_camera = add_untold_parts(stated(sightline), WIDE, LIGHT_AT_CAMERA)
+    assert set(at_camera.budget) == {"noise"}
+    assert at_camera.flags == ()
+    # A known error is no random one, whether the distance is told or not.
+    for distance in (None, exactly(20.0)):
+        beside = add_untold_parts(stated(sightline), WIDE, Priors(((3.0, 0.0, 0.0),), distance))
+        assert (beside.covariance, beside.flags) == (None, ("light_offset",))
+    # Far below the stated error it does not matter.
+    near = Priors(((0.01, 0.0, 0.0),), exactly(50.0), falloff_power=None)
+    assert (add_untold_parts(stated(sightline), WIDE, near).covariance == NOISE).all()
+    # An estimate without an uncertainty gets none.
+    assert add_untold_parts(stated(sightline, budget=None), WIDE, Priors()).covariance is None
+
+
+# The camera -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "prior", [CameraPrior(focal_sd=0.1), CameraPrior(centre_sd_px=12.8), CameraPrior(0.1, 12.8, 0.02)]
+)
+@pytest.mark.parametrize("pixel", [(330.0, 250.0), (480.0, 300.0), (600.0, 60.0)])
+def test_a_guessed_camera_is_covered(prior, pixel):
+    """Cameras are drawn from the prior; what they see at a pixel is compared with what the guess sees there."""
+    rng, count = np.random.default_rng(3), 20000
+    sightline = WIDE.unproject(pixel)
+    noise = 0.01 * rng.standard_normal((count, 2))
+    estimate = stated(sightline, budget={"noise": 1e-4 * np.eye(2)})
+    covariance = add_untold_parts(estimate, WIDE, replace(LIGHT_AT_CAMERA, camera=prior)).covariance
+    # sightlines of the true cameras
+    focal = WIDE.fx * (1 + prior.focal_sd * rng.standard_normal(count))
+    centre = np.array([WIDE.cx, WIDE.cy]) + prior.centre_sd_px * rng.standard_normal((count, 2))
+    seen = (np.array(pixel) - centre) / focal[:, None]
+    k1 = prior.distortion_sd * rng.standard_normal(count)
+    for _ in range(8):  # undo x (1 + k1 r^2)
+        seen = (np.array(pixel) - centre) / focal[:, None] / (1 + k1 * np.sum(seen**2, axis=1))[:, None]
+    true = np.concatenate([seen, np.ones((count, 1))], axis=1)
+    true /= np.linalg.norm(true, axis=1)[:, None]
+    assert 0.93 <= held(moves_of(sightline, -true) + noise, covariance) <= 0.98
+
+
+# One number -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("draw", [Uniform(0.0, 4.0), Normal(0.0, 2.0), LogUniform(0.1, 10.0), Uniform(-1.0, 1.0)])
+def test_an_error_along_a_line_is_covered_beside_a_normal_one(draw):
+    rng, count = np.random.default_rng(5), 100_000
+    x = draw.quantile(rng.random(count)) if not isinstance(draw, Normal) else draw.sd * rng.standard_normal(count)
+    shares = (np.arange(200) + 0.5) / 200
+    samples = draw.quantile(shares)
+    v = equivalent_variance(samples)
+    assert np.mean(x**2 / v + rng.standard_normal(count) ** 2 <= LIMIT) == pytest.approx(0.95, abs=0.005)
+    if isinstance(draw, Normal):
+        assert v == pytest.approx(draw.sd**2, rel=0.02)
+    # Turned into any direction.
+    turned = line_covariance(samples[:, None] * np.array([0.6, 0.8]))
+    np.testing.assert_allclose(turned, v * np.outer([0.6, 0.8], [0.6, 0.8]), atol=1e-9 * v)
+
+
+def test_relief_is_covered_at_the_base():
+    rng, count = np.random.default_rng(6), 40000
+    slope = np.radians(rng.uniform(0, 6, count))
+    moves = slope[:, None] * rng.standard_normal((count, 2))
+    assert held(moves, relief_part(Priors())) == pytest.approx(0.95, abs=0.006)
+    told = relief_part(Priors(relief_slope=exactly(np.radians(3.0))))
+    np.testing.assert_allclose(told, np.radians(3.0) ** 2 * np.eye(2), rtol=1e-6)
+
+
+def test_a_single_highlight_states_the_base_with_the_relief_in_its_budget():
+    fine = stated(sightline_at(10.0))
+    base = to_base(fine, Priors())
+    assert (base.target, set(base.budget)) == ("base", {"noise", "relief"})
+    np.testing.assert_array_equal(base.normal, fine.normal)
+    assert to_base(base, Priors()) is base
+    assert to_base(fine.without_uncertainty(), Priors()).covariance is None
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"light_offset_mm": Uniform(-1.0, 2.0)}, "light_offset_mm = -1.0"),
+        ({"light_offset_mm": None}, "must be a Uniform"),
+        ({"falloff_power": Normal(-1.0, 1.0)}, "falloff_power = -1.0"),
+        ({"relief_slope": 3.0}, "relief_slope = 3.0"),
+        ({"camera": 0.1}, "priors camera is a float"),
+    ],
+)
+def test_malformed_priors_are_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        Priors(**given)
+    with pytest.raises(InputError, match="focal_sd = -1"):
+        CameraPrior(focal_sd=-1)
