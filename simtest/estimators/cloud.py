@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Frame, Priors, Uniform, exactly
+from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import CONFIDENCE
+from simtest.estimators.budget import CONFIDENCE, Budget, equivalent_covariance
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
     Cloud,
@@ -21,27 +21,35 @@ from simtest.estimators.cloud_mixture import (
 )
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.cloud_spots import find_spots
-from simtest.estimators.protocol import EstimatedCurvature, Estimate
+from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
+from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across
 
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
 
-LEAST_IN_VIEW = 0.5
+LEAST_IN_VIEW = 0.9
 """Nor does a cloud of which less is in view, whose centre would be a guess."""
 
-UNTOLD_DISTANCE_MM = Uniform(5.0, 80.0)
+LARGELY_SEEN = 0.97
+"""A cloud of which less is in view is flagged."""
 
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
+
+LEAST_INDEPENDENT = 2.5
+"""Fewer independent spots state no extent at all."""
+
+SHARES = (np.arange(32) + 0.5) / 32
+"""At these shares a prior on the distance is sampled."""
 
 ROUND_SIGMA = 2.0
 """A cloud is long where the log of its axis ratio is so many standard deviations off that of a round one."""
 
 
 @dataclass(frozen=True)
-class CloudEstimator:
+class CloudCentre:
     """The centre of a cloud of spots carries the base's normal, where a single highlight carries the fine one.
 
     Spots are found in the frame (`cloud_spots`) and grouped into clouds (`cloud_mixture`). With the light at the camera
@@ -60,8 +68,8 @@ class CloudEstimator:
         """Estimate the base's normal of each cloud, that of most spots first (see `FrameEstimator`).
 
         Each estimate has ``target`` base and a `cloud`. Flags: ``anisotropic_or_curved`` where the cloud is longer than
-        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a tenth of it or more is out of
-        view. The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate``
+        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view. The
+        axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate``
         where no cloud has spots enough in view.
         """
         spots = find_spots(frame)
@@ -94,7 +102,7 @@ class CloudEstimator:
         )
 
 
-cloud = CloudEstimator()
+cloud = CloudCentre()
 
 
 def _shape(estimate: Estimate) -> CloudShape:
@@ -104,11 +112,15 @@ def _shape(estimate: Estimate) -> CloudShape:
 
 def _turns(priors: Priors) -> Turns:
     """Return where each light has its part of a cloud: on a plane, at L_perp / 2 d from the reversed normal."""
-    lights, distance = priors.lights, priors.distance_mm
-    if not len(lights) or not np.linalg.norm(lights, axis=1).max() > 0:
+    if _is_at_camera(priors):
         return at_camera
-    half = 2 * (UNTOLD_DISTANCE_MM if distance is None else distance).mean
-    return lambda centre: lights @ basis_across(centre).T / half
+    lights, twice = priors.lights, 2 * priors.distance.mean
+    return lambda centre: lights @ basis_across(centre).T / twice
+
+
+def _is_at_camera(priors: Priors) -> bool:
+    """Return whether no light is told that lies beside the camera."""
+    return not len(priors.lights) or not np.linalg.norm(priors.lights, axis=1).max() > 0
 
 
 def _is_in_view(cloud: Cloud, camera: Camera, frame: Frame) -> bool:
@@ -122,32 +134,44 @@ def _is_in_view(cloud: Cloud, camera: Camera, frame: Frame) -> bool:
 
 def _estimate(cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors) -> Estimate:
     """Return the estimate of one cloud."""
-    count = len(points_px)
-    independent = max(count / CLUMPING, 2.5)
+    independent = max(len(points_px) / CLUMPING, LEAST_INDEPENDENT)
     normal = -cloud.centre
-    # The bases across a direction and its reverse are not the same.
-    turn = basis_across(normal) @ basis_across(cloud.centre).T
-    sampling = turn @ sampling_covariance(cloud, window, independent) @ turn.T
-    budget = {"relief": sampling * small_sample(independent)}
-    if len(cloud.turns) > 1:
-        spread = turn @ cloud.spread @ turn.T
-        budget["light_offset"] = spread * UNEVEN**2 / len(cloud.turns)
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
     shape = CloudShape(points_px, cloud.covariance, independent, cloud.seen, lobe, slope)
     # The cloud is longest where the gain is smallest.
     vectors = np.linalg.eigh(cloud.covariance)[1][:, ::-1].T @ basis_across(cloud.centre)
-    return Estimate(
+    estimate = Estimate(
         normal=normal,
         candidates=normal[None],
         look_px=camera.project(cloud.sightline),
         axis_ratio=shape.axis_ratio,
-        budget=budget,
+        budget=_budget(cloud, window, independent, priors),
         flags=_flags(cloud, shape),
         curvature=EstimatedCurvature(vectors, shape.axis_ratio),
         target="base",
         cloud=shape,
     )
+    return add_camera_and_falloff(estimate, camera, priors)
+
+
+def _budget(cloud: Cloud, window: Window, independent: float, priors: Priors) -> Budget:
+    """Return the budget of a cloud's normal: the relief's chance, and the lights."""
+    normal, half = -cloud.centre, basis_across(cloud.centre)
+    # The bases across a direction and its reverse are not the same.
+    turn = basis_across(normal) @ half.T
+    sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
+    budget = {"relief": turn @ sampling @ turn.T}
+    if not priors.lights_mm:
+        budget["light_offset"] = light_offset_part(normal, priors)
+    elif not _is_at_camera(priors):
+        # Lights may make different numbers of spots; the mean of all moves with the distance.
+        spread = cloud.spread * UNEVEN**2 / len(cloud.turns)
+        budget["light_offset"] = turn @ spread @ turn.T
+        middle = half @ priors.lights.mean(axis=0) / 2
+        moves = np.outer(1 / priors.distance.quantile(SHARES) - 1 / priors.distance.mean, turn @ middle)
+        budget["distance"] = equivalent_covariance(moves)
+    return budget
 
 
 def small_sample(independent: float) -> float:
@@ -165,6 +189,6 @@ def _flags(cloud: Cloud, shape: CloudShape) -> tuple[str, ...]:
     # The log of a round cloud's axis ratio has a standard deviation of about 1 / sqrt(n).
     if -math.log(shape.axis_ratio) * math.sqrt(shape.independent) > ROUND_SIGMA:
         flags.append("anisotropic_or_curved")
-    if cloud.seen < 0.9:
+    if cloud.seen < LARGELY_SEEN:
         flags.append("cut")
     return tuple(flags)

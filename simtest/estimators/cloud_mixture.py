@@ -13,8 +13,8 @@ import numpy as np
 from simtest.geometry import Array, Camera, Mask
 from simtest.geometry.vectors import basis_across
 
-MOST_CLOUDS = 8
-STEPS, CLOSE = 200, 1e-5
+MOST_CLOUDS = 6
+STEPS, CLOSE = 80, 1e-4
 """Most steps of expectation and maximisation, and the gain in log likelihood for each spot that ends them."""
 
 PARAMETERS = 6
@@ -43,7 +43,7 @@ LEAST_EXTENT = math.radians(0.3)
 FRONT = 0.2
 """A sightline whose cosine with a cloud's centre is below this is not in its tangent plane."""
 
-GRID = 48
+GRID = 32
 """Cells of the view along its longer side, over which densities are integrated."""
 
 
@@ -285,8 +285,13 @@ def _moments(cloud: Cloud, sightlines: Array, weights: Array) -> tuple[Array, Ar
     """Return weighted sums of the points about their light's part, shape (2,), and of their squares, shape (2, 2)."""
     points, _ = cloud.coordinates(sightlines)
     gap = np.where(np.isfinite(points), points, 0.0)[:, None] - cloud.turns
-    weights = np.where(np.isfinite(points).all(axis=1)[:, None], weights, 0.0)
+    weights = np.where(_sound_rows(points)[:, None], weights, 0.0)
     return np.einsum("nl,nli->i", weights, gap), np.einsum("nl,nli,nlj->ij", weights, gap, gap)
+
+
+def _sound_rows(points: Array) -> Mask:
+    """Return which points, shape (N, 2), are in front."""
+    return np.asarray(np.isfinite(points).all(axis=1))
 
 
 def sampling_covariance(cloud: Cloud, window: Window, count: float) -> Array:
@@ -297,7 +302,7 @@ def sampling_covariance(cloud: Cloud, window: Window, count: float) -> Array:
     """
     whole = replace(cloud, covariance=cloud.covariance + cloud.spread, turns=cloud.turns.mean(axis=0)[None])
     cells, _ = whole.coordinates(window.sightlines)
-    sound = np.isfinite(cells).all(axis=1)
+    sound = _sound_rows(cells)
     scale = np.sqrt(np.diag(whole.covariance))
     x, y = (np.where(sound[:, None], cells - whole.turns[0], 0.0) / scale).T
     share = whole.densities(window.sightlines)[:, 0] * window.solid * sound

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.calibration import Distribution, Normal, Uniform
+from simtest.calibration import Distribution, Uniform
 from simtest.geometry import Array, chi_squared
+from simtest.geometry.vectors import basis_across
 
 BASE_KD = Uniform(-0.5, 1.0)
 """Distance times curvature of the base along both principal directions, where nobody told: a lumen's wall from inside
@@ -24,6 +25,9 @@ LOBE_RAD2 = Uniform(0.0, math.radians(1.5) ** 2)
 """1 / c of a lobe that nobody told: its variance along one direction."""
 
 CONFIDENCE = 0.95
+
+OUTLINE = 2.0
+"""A cloud is drawn with so many standard deviations: 86 % of it is inside."""
 
 SHARES = (np.arange(20) + 0.5) / 20
 """At these shares distributions are sampled."""
@@ -79,6 +83,18 @@ class CloudShape:
         small, large = np.linalg.eigvalsh(self.covariance)
         return float(np.sqrt(small / large))
 
+    def outline(self, normal: Array, look: Array) -> Array:
+        """Return sightlines around the cloud, shape (N, 3): the ellipse of `OUTLINE` standard deviations.
+
+        `normal` and `look` are the estimate's normal and the sightline that it looks along, unit, shape (3,).
+        """
+        values, vectors = np.linalg.eigh(self.covariance)
+        phase = np.linspace(0, 2 * np.pi, 73)
+        ring = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+        across = OUTLINE * ring @ (np.sqrt(values)[:, None] * vectors.T) @ basis_across(-normal)
+        around = look / (look @ -normal) + across
+        return np.asarray(around / np.linalg.norm(around, axis=1)[:, None])
+
     def slope_with(self, gains: tuple[float, float]) -> Slope:
         """Return the slope for gains 1 + d k of the base that are told, in any order."""
         return slope_of(self.covariance, self.independent, self.lobe, gains)
@@ -103,7 +119,7 @@ def slope_of(
     if gains is not None:
         low, high, weights = *(np.array([gain]) for gain in sorted(abs(gain) for gain in gains)), np.ones(1)
     else:
-        first, second = (grid.ravel() for grid in np.meshgrid(*[1 + _values(BASE_KD)] * 2))
+        first, second = (grid.ravel() for grid in np.meshgrid(*[1 + BASE_KD.quantile(SHARES)] * 2))
         low, high = np.minimum(first, second), np.maximum(first, second)
         # Gains that fit the axis ratio count most: its log has about this variance.
         off = np.log(small / large) / 2 + np.log(high / low)
@@ -111,17 +127,10 @@ def slope_of(
     squares = (small * high**2 + large * low**2) / 2
     # The sample's variance over the true one is chi-squared.
     chance = freedom / np.array([chi_squared.quantile(share, freedom) for share in SHARES])
-    all_squares = squares[:, None, None] * chance[:, None] - LOBE_SHARE * _values(lobe)
+    all_squares = squares[:, None, None] * chance[:, None] - LOBE_SHARE * lobe.quantile(SHARES)
     all_weights = np.broadcast_to(weights[:, None, None], all_squares.shape).ravel()
     order = np.argsort(all_squares, axis=None)
     share = np.cumsum(all_weights[order]) / all_weights.sum()
     ends = all_squares.ravel()[order][np.searchsorted(share, [(1 - CONFIDENCE) / 2, 0.5, (1 + CONFIDENCE) / 2])]
     lower, middle, upper = np.sqrt(np.maximum(ends, LEAST_SLOPE**2)).tolist()
     return Slope(middle, lower, upper, gains is not None)
-
-
-def _values(prior: Distribution) -> Array:
-    """Return values of a prior, each as likely."""
-    if isinstance(prior, Normal):
-        return np.full(1, prior.mean)
-    return prior.low + (prior.high - prior.low) * SHARES

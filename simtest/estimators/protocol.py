@@ -173,4 +173,13 @@ class FrameEstimator(Protocol):
         """
 
 
+@runtime_checkable
+class CloudEstimator(FrameEstimator, Protocol):
+    """Estimates the base's normal from clouds of highlights: its estimates have a `cloud` each, and are of no patch."""
+
+    @property
+    def least_spots(self) -> int:
+        """Fewest highlights of a cloud."""
+
+
 AnyEstimator = Estimator | FrameEstimator
