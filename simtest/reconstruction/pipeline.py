@@ -331,10 +331,14 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     rounded_px = SMALL_RADIUS * frame.smoothing_px
     small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
-        estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
+        own = {name: each.of_patches[i] for name, each in made.items()}
+        estimates = {
+            name: _flagged(result, patch, limited, small[i]) for name, result in own.items() if result is not None
+        }
         result.specularities.append(Specularity(region, patch, estimates))
     undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
-    result.specularities.extend(undetected)
+    # Clouds stand last.
+    result.specularities.extend(sorted(undetected, key=_is_of_cloud))
     return result
 
 
@@ -353,12 +357,24 @@ def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
     return replace(made, specularities=based)
 
 
+def _is_of_cloud(specularity: Specularity) -> bool:
+    return any(isinstance(e, Estimate) and e.cloud is not None for e in specularity.estimates.values())
+
+
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
-    """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
+    """Return the specularity of a frame estimator's result that no patch takes: it has none.
+
+    Its region is one pixel, or the box around a cloud's highlights.
+    """
     height, width = frame.encoded.shape[:2]
     x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
-    no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
-    return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    if estimate.cloud is None:
+        no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
+        return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    low, high = (end(estimate.cloud.points_px, axis=0).astype(int).tolist() for end in (np.min, np.max))
+    box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
+    no_patch = Failure(Reason.NO_PEAK, f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one")
+    return Specularity(Region(box, (x, y), None), no_patch, {name: estimate})
 
 
 def _flagged(
