@@ -167,6 +167,15 @@ class IsophoteFamily:
         """The same without extrapolation, shape (2, 2): less noisy, with the same principal directions."""
         return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
 
+    @cached_property
+    def seen_moments(self) -> Array:
+        """The lobe's second moments as seen, with what smoothing adds, rad^2, in the basis, shape (2, 2).
+
+        Without a fit of the peak's value, which takes as long as all else: for shifts that need no precision.
+        """
+        levels = -np.log([isophote.isovalue for isophote in self.isophotes])
+        return np.asarray(self._tangent_moments.sum(axis=0) / (2 * levels.sum()))
+
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
         return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)

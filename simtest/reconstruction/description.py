@@ -17,7 +17,7 @@ from simtest.estimators.protocol import Estimate, Target, drawable
 from simtest.geometry import Camera
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.ranking import StatedErrors, best_of, stated_errors
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
@@ -162,6 +162,11 @@ class PictureRecord:
     reference: ComparisonRecord | None = None
     assumed: Sequence[Assumption] = ()
 
+    @property
+    def stated(self) -> StatedErrors | None:
+        """What the best estimates state, with the medians of their budgets; None where none states anything."""
+        return stated_errors([best for each in self.specularities if (best := each.best_estimate) is not None])
+
     def to_json(self) -> JsonObject:
         """Return the content of normals.json."""
         others = [
@@ -176,6 +181,7 @@ class PictureRecord:
             "view": _view_json(self.view),
             "warnings": self.warnings,
             "assumed": self.assumed,
+            "stated": self.stated,
             "frame": FRAME,
             "specularities": self.specularities,
             "clouds": [entry for spot in self.specularities for entry in _clouds_json(spot)],
