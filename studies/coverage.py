@@ -80,7 +80,7 @@ def _highlights(
         seen = render_view(session, scene)
         specularities = reconstruct(seen.frame(viewpoint), seen.calibration, {})
         truths = [truth for truth in seen.highlights if truth.isolated]
-        for i, j in match(specularities, truths).items():
+        for i, j in match(specularities, [truth.bp_px for truth in truths]).items():
             patch = specularities[i].patch
             if isinstance(patch, Patch):
                 found += 1

@@ -68,7 +68,7 @@ def spots(recipe: Path) -> list[Observation]:
         truths = [truth for truth in seen.highlights if truth.isolated]
         camera_from_model = np.linalg.inv(session.surface.model_from_camera)
         made = []
-        for i, j in match(found, truths).items():
+        for i, j in match(found, [truth.bp_px for truth in truths]).items():
             normals = {TRUTH: truths[j].normal[None]}
             for name, result in found[i].estimates.items():
                 if isinstance(result, Estimate):

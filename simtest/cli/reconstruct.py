@@ -9,6 +9,9 @@ from cyclopts import Parameter
 from simtest.cli.options import Estimators, Out
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from simtest.reconstruction.assumptions import Assumption
     from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 
 TABLE_WIDTH = 125
@@ -42,6 +45,10 @@ def reconstruct(
     smoothing: Annotated[
         float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")
     ] = None,
+    target: Annotated[
+        Literal["fine", "base"],
+        Parameter(help="Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
+    ] = "fine",
     every: Annotated[
         bool,
         Parameter(
@@ -77,13 +84,14 @@ def reconstruct(
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     box = None if roi is None else parse_roi(roi)
     names = None if estimators is None else tuple(estimators)
-    options = Options(camera, fov, names, box, encoding, every, detector, smoothing)
+    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target)
     if not sequence:
         from simtest.api import Extras, reconstruct_picture
 
         extras = Extras(reference, camera_from_model, depth, depth_scale)
         record, files = reconstruct_picture(image, out, options, extras)
         _print_tables(record)
+        _print_assumed(record.assumed)
         count = len(record.specularities)
         print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
     else:
@@ -93,6 +101,7 @@ def reconstruct(
         with progress_bar("writing the tables") as progress:
             made = reconstruct_sequence(image, out, options, progress)
         files = made.files
+        _print_assumed(made.assumed)
         unread = f", {made.failed} unreadable" if made.failed else ""
         print(f"{made.frames} frames{unread}: {made.specularities} specularities, {made.tracks} seen in several frames")
     for file in files:
@@ -124,12 +133,18 @@ def _print_tables(record: "PictureRecord") -> None:
         print(f"{compared.missed} sightlines miss {compared.source}")
 
 
+def _print_assumed(assumed: "Sequence[Assumption]") -> None:
+    """Print what nobody told, how it is taken, and how to narrow it."""
+    for each in assumed:
+        print(f"assumed: {each}")
+
+
 def _pair(mean: float, spread: float | None) -> str:
     return f"{mean:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
 
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
-    from simtest.reconstruction.description import deviation_deg
+    from simtest.reconstruction.ranking import deviation_deg
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px

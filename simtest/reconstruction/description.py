@@ -13,9 +13,11 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.detection.blobs import Highlight
 from simtest.detection.view_mask import View
 from simtest.errors import Failure, Reason
-from simtest.estimators.protocol import Estimate, drawable
+from simtest.estimators.protocol import Estimate, Target, drawable
 from simtest.geometry import Camera
+from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
+from simtest.reconstruction.ranking import best_of
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
@@ -24,14 +26,6 @@ from simtest.spec import describe_camera
 Points = list[list[float]]
 
 FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
-
-FOLLOWS_ISOPHOTES = ("bisector", "curved")
-BEST = (*FOLLOWS_ISOPHOTES, "cone_axis", "brightest_point")
-"""Estimators whose normal is the best one, in this order: that which knows the lights, that which follows the isophotes
-to the peak, that which averages them, and the one that needs none. `circle_pose` takes a curved surface for a plane."""
-
-UNSOUND = frozenset({"saturated", "missing_isovalues", "ambiguous_light"})
-"""With these flags the estimators that follow the isophotes to the peak give way to the next."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +83,9 @@ class SpecularityRecord:
     """A specularity, described: its region and peak, px, its sightline, and what each estimator made of it.
 
     There is no peak where there is no patch, and no sightline where the lens images none. `kind` and `score` are those
-    of its `highlight`, if the detector judges any. `best` names the estimator whose normal is the best one, `track` is
-    the specularity's number over the frames of a sequence; `drawings` are by estimator.
+    of its `highlight`, if the detector judges any. `best` names the estimator whose normal is the best one,
+    `best_because` says why; `track` is the specularity's number over the frames of a sequence; `drawings` are by
+    estimator.
     """
 
     id: int
@@ -105,6 +100,7 @@ class SpecularityRecord:
     drawings: Mapping[str, Drawing] = field(default_factory=dict)
     track: int | None = None
     reference: ReferenceRecord | None = None
+    best_because: str = ""
 
     @property
     def normals(self) -> dict[str, Estimate]:
@@ -131,6 +127,7 @@ class SpecularityRecord:
             "sightline": self.sightline,
             **({} if self.highlight is None else _highlight_json(self.highlight)),
             "best": self.best,
+            "best_because": self.best_because,
             "estimates": {name: _estimate_json(e, self.drawings.get(name)) for name, e in self.estimates.items()},
             **{name: value for name in ("track", "reference") if (value := getattr(self, name)) is not None},
         }
@@ -141,12 +138,20 @@ class SpecularityRecord:
         peak, sightline = (None if data[key] is None else np.array(data[key]) for key in ("peak_px", "sightline"))
         estimates = {name: _estimate_from_json(entry) for name, entry in data["estimates"].items()}
         judged = (data.get("kind"), data.get("score"))
-        return cls(data["id"], tuple(data["box_px"]), peak, sightline, *judged, data["best"], estimates)
+        best, because = data["best"], data["best_because"]
+        return cls(
+            data["id"], tuple(data["box_px"]), peak, sightline, *judged, best, estimates, best_because=because
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PictureRecord:
-    """A picture and all that was reconstructed in it; `encoding` is the kind of the response that was undone."""
+    """A picture and all that was reconstructed in it.
+
+    `encoding` is the kind of the response that was undone, `smoothing_px` the width of the Gaussian; `inferred` names
+    those of these and of detector, estimators and saturation level that nobody told, and `assumed` is what else nobody
+    told, and how it was taken.
+    """
 
     image: str
     camera: Camera
@@ -157,6 +162,9 @@ class PictureRecord:
     specularities: list[SpecularityRecord]
     other_highlights: Sequence[Highlight]
     reference: ComparisonRecord | None = None
+    assumed: Sequence[Assumption] = ()
+    smoothing_px: float | None = None
+    inferred: Sequence[str] = ()
 
     def to_json(self) -> JsonObject:
         """Return the content of normals.json."""
@@ -169,8 +177,11 @@ class PictureRecord:
             "camera": describe_camera(self.camera),
             "encoding": self.encoding,
             "detector": self.detector,
+            "smoothing_px": self.smoothing_px,
+            "inferred": self.inferred,
             "view": _view_json(self.view),
             "warnings": self.warnings,
+            "assumed": self.assumed,
             "frame": FRAME,
             "specularities": self.specularities,
             "other_highlights": others,
@@ -179,15 +190,21 @@ class PictureRecord:
         }
 
 
-def describe(made: Reconstruction, camera: Camera) -> list[SpecularityRecord]:
-    """Describe each specularity of a reconstruction, with what the detector says of it."""
+def describe(made: Reconstruction, camera: Camera, target: Target = "fine") -> list[SpecularityRecord]:
+    """Describe each specularity of a reconstruction, with what the detector says of it.
+
+    The best estimate is one that states the target's normal, where there is any.
+    """
     # Estimates that no region took stand behind those of the regions, and no detector judged them.
     judged: list[Highlight | None] = [*made.detection.highlights]
     judged += [None] * (len(made.specularities) - len(judged))
-    return [_describe(i, *pair, camera) for i, pair in enumerate(zip(made.specularities, judged, strict=True))]
+    pairs = zip(made.specularities, judged, strict=True)
+    return [_describe(i, *pair, camera, target) for i, pair in enumerate(pairs)]
 
 
-def _describe(index: int, specularity: Specularity, highlight: Highlight | None, camera: Camera) -> SpecularityRecord:
+def _describe(
+    index: int, specularity: Specularity, highlight: Highlight | None, camera: Camera, target: Target
+) -> SpecularityRecord:
     patch, estimates = specularity.patch, specularity.estimates
     peak = None if isinstance(patch, Failure) else patch.peak_px
     sightline = None if peak is None else camera.unproject(peak)
@@ -203,22 +220,11 @@ def _describe(index: int, specularity: Specularity, highlight: Highlight | None,
         if isinstance(result, Estimate)
     }
     kind, score = (None, None) if highlight is None else (str(highlight.kind), highlight.score)
-    box, best = specularity.region.box, best_of(estimates)
-    return SpecularityRecord(index, box, peak, sightline, kind, score, best, estimates, highlight, drawings)
-
-
-def best_of(estimates: Mapping[str, Estimate | Failure]) -> str | None:
-    """Return the name of the estimator whose normal is the best one; None where all failed."""
-    answered = {name: result for name, result in estimates.items() if isinstance(result, Estimate)}
-    ranked = [name for name in BEST if name in answered]
-    sound = [name for name in ranked if name not in FOLLOWS_ISOPHOTES or not UNSOUND & set(answered[name].flags)]
-    # An unsound normal is better than none, and another package's than that.
-    return next(iter((*sound, *ranked, *answered)), None)
-
-
-def deviation_deg(estimate: Estimate) -> float | None:
-    """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
-    return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
+    best, because = best_of(estimates, target)
+    return SpecularityRecord(
+        index, specularity.region.box, peak, sightline, kind, score, best, estimates, highlight, drawings,
+        best_because=because,
+    )  # fmt: skip
 
 
 def _view_json(view: View) -> JsonObject | None:

@@ -15,6 +15,7 @@ from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction.constraints import constraints_arrays, constraints_json
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
@@ -27,7 +28,7 @@ ARROW_SIDES = 6
 COLUMNS = (
     "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
     "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
-    "score",
+    "score", "target", "deviation_deg",
 )  # fmt: skip
 
 FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
@@ -73,13 +74,15 @@ def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, .
             if isinstance(result, Failure):
                 # candidate, normal, look and axis ratio; then margin and covariance
                 nothing = (None,) * 7
-                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *peak, spot.kind, spot.score)
+                judged = (*peak, spot.kind, spot.score, None, None)
+                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *judged)
                 continue
             look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
             covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
             seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
+            stated = (*peak, spot.kind, spot.score, result.target, deviation_deg(result))
             for k, normal in enumerate(result.candidates.tolist()):
-                yield (spot.id, name, "ok", k, *normal, *seen, *peak, spot.kind, spot.score)
+                yield (spot.id, name, "ok", k, *normal, *seen, *stated)
 
 
 def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:

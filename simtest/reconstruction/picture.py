@@ -7,11 +7,14 @@ from pathlib import Path
 from simtest.calibration import Calibration
 from simtest.detection.detector import load_detector
 from simtest.errors import InputError
-from simtest.geometry import Camera
+from simtest.estimators.protocol import Target
+from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
+
+TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
 
@@ -40,11 +43,15 @@ class Options:
         another package's detector. auto: by colour in pictures that have any and are not linear.
     smoothing_px : float, optional
         Standard deviation of the Gaussian smoothing; default 1 px by colour, else 2 px.
+    target : {"fine", "base"}
+        Which surface's normals are stated: those of the fine one, or of the base without its relief, whose slope is
+        then in the uncertainty.
 
     Raises
     ------
     InputError
-        If the camera is given twice or not at all, or no detector of that name is registered.
+        If the camera is given twice or not at all, the target is none of these, or no detector of that name is
+        registered.
     """
 
     camera: Path | None = None
@@ -55,6 +62,7 @@ class Options:
     every: bool = False
     detector: str = AUTO
     smoothing_px: float | None = None
+    target: Target = "fine"
 
     def __post_init__(self) -> None:
         if self.detector != AUTO:
@@ -62,6 +70,8 @@ class Options:
                 load_detector(self.detector)
             except InputError as error:
                 raise InputError(f"--{error}; auto chooses among those of simtest") from None
+        if self.target not in TARGETS:
+            raise InputError(f"--target {self.target}: must be one of {', '.join(TARGETS)}")
         if (self.camera is None) == (self.fov_deg is None):
             raise InputError("--camera or --fov: exactly one of them must be given")
 
@@ -88,7 +98,7 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
         calibration, cautions = load_calibration(options.camera), []
     else:
         assert options.fov_deg is not None
-        calibration = Calibration(Camera.from_fov(options.fov_deg, picture.shape[1], picture.shape[0]))
+        calibration = calibration_of_view(options.fov_deg, picture.shape[1], picture.shape[0])
         cautions = [f"no calibration: all angles depend on the field of view of {options.fov_deg:g} deg being right"]
     if calibration.response is not None and options.encoding is not None:
         raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
@@ -106,7 +116,7 @@ def reconstruct_values(
     # linear light, detect, estimate
     made, choices = run_picture(
         picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,
-        not options.every,
+        not options.every, options.target,
     )  # fmt: skip
     # describe
     return PictureRecord(
@@ -116,6 +126,9 @@ def reconstruct_values(
         detector=choices.detector,
         view=made.detection.view,
         warnings=list(cautions),
-        specularities=describe(made, calibration.camera),
+        specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
+        assumed=choices.assumed,
+        smoothing_px=choices.smoothing_px,
+        inferred=choices.inferred,
     )

@@ -1,14 +1,13 @@
 """The pipeline from the values of a picture to normals: linear light, detect, estimate; one for grey and for colour."""
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Frame
+from simtest.calibration import Calibration, Frame, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetector
@@ -16,7 +15,10 @@ from simtest.detection.detector import Detection, Detector, load_detector
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
+from simtest.estimators.prior_parts import to_base
+from simtest.estimators.protocol import Target
 from simtest.geometry import Camera, Patch
+from simtest.reconstruction.assumptions import assumptions
 from simtest.reconstruction.choices import (
     AUTO,
     SMOOTHING_BY_COLOUR_PX,
@@ -27,7 +29,7 @@ from simtest.reconstruction.choices import (
     complete,
     untold,
 )
-from simtest.reconstruction.picture_values import check_frame, check_size
+from simtest.reconstruction.picture_values import check_frame, check_roi, check_size
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
@@ -90,6 +92,7 @@ def reconstruct(
     smoothing_px: float | None = None,
     isolated: bool = True,
     detector: str | Detector | None = None,
+    target: Target = "fine",
     encoding: str | None = None,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
@@ -122,6 +125,9 @@ def reconstruct(
     detector : str or Detector, optional
         Name as registered, or the detector itself, to which `isolated` applies if it is one of the package; "auto": by
         colour in frames that have colours and are not linear, else peaks. Default "auto" in pictures, else "peaks".
+    target : {"fine", "base"}
+        Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
+        they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
     encoding : {"srgb", "linear"}, optional
         How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
         picture too where they are said to be "srgb".
@@ -144,13 +150,16 @@ def reconstruct(
     image, is_picture = check_frame(frame, known.camera, encoding)
     if is_picture:
         finder = AUTO if detector is None else detector
-        return Specularities(*run_picture(image, known, encoding, finder, estimators, roi, smoothing_px, isolated))
+        options = (encoding, finder, estimators, roi, smoothing_px, isolated, target)
+        return Specularities(*run_picture(image, known, *options))
     # light of any scale, which has no largest value
     finder = "peaks" if detector is None else detector
     names = DEFAULT_ESTIMATORS if estimators is None else estimators
-    made, choices = _choose(image, known, finder, names, roi, smoothing_px, isolated)
+    made, choices = _choose(image, known, finder, names, roi, smoothing_px, isolated, target)
     inferred = untold(known, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators)
-    return Specularities(made, replace(choices, inferred=inferred))
+    # Values that nobody called encoded are taken as linear: that is the rule for real numbers, and no guess.
+    assumed = assumptions(known, encoding or "linear", target)
+    return Specularities(made, replace(choices, inferred=inferred, assumed=tuple(assumed)))
 
 
 def run_picture(
@@ -162,6 +171,7 @@ def run_picture(
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float | None = None,
     isolated: bool = True,
+    target: Target = "fine",
 ) -> tuple[Reconstruction, Choices]:
     """Reconstruct the normals of a picture, from a file or an array (see `reconstruct`).
 
@@ -172,11 +182,12 @@ def run_picture(
     # what every picture has: an encoding, and a largest value
     known = complete(calibration, encoding)
     names = default_estimators(known) if estimators is None else estimators
-    made, choices = _choose(picture, known, detector, names, roi, smoothing_px, isolated)
+    made, choices = _choose(picture, known, detector, names, roi, smoothing_px, isolated, target)
     inferred = untold(
         calibration, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators
     )
-    return made, replace(choices, inferred=inferred)
+    assumed = assumptions(calibration, encoding, target)
+    return made, replace(choices, inferred=inferred, assumed=tuple(assumed))
 
 
 def _choose(
@@ -187,11 +198,12 @@ def _choose(
     roi: tuple[int, int, int, int] | None,
     smoothing_px: float | None,
     isolated: bool,
+    target: Target,
 ) -> tuple[Reconstruction, Choices]:
     """Choose detector and smoothing, and run the pipeline."""
     name, finder = choose_detector(detector, image, known, roi is not None, isolated)
     smoothing = choose_smoothing(smoothing_px, finder)
-    made = _run(image, known, finder, estimators, roi, smoothing)
+    made = _run(image, known, finder, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
     return made, Choices(kind, known.saturation_level, name, smoothing, tuple(estimators), known.priors)
 
@@ -228,9 +240,7 @@ def reconstruct_colour(
 
 def default_estimators(calibration: Calibration) -> tuple[str, ...]:
     """Return the names of the estimators that the calibration states enough for."""
-    priors = calibration.priors
-    lights = len(priors.lights) > 0 and priors.distance_mm is not None
-    return (*DEFAULT_ESTIMATORS, *(("bisector",) if lights else ()))
+    return (*DEFAULT_ESTIMATORS, *(("bisector",) if calibration.priors.lights_mm else ()))
 
 
 def run_pipeline(
@@ -240,11 +250,12 @@ def run_pipeline(
     estimators: Sequence[str] | Mapping[str, AnyEstimator],
     roi: tuple[int, int, int, int] | None,
     smoothing_px: float,
+    target: Target = "fine",
 ) -> Reconstruction:
     """Reconstruct the normals of a frame with any detector; nothing is inferred (see `reconstruct`)."""
     calibration = _calibration(camera)
     image, _ = check_frame(picture, calibration.camera)
-    return _run(image, calibration, load_detector(detector), estimators, roi, smoothing_px)
+    return _run(image, calibration, load_detector(detector), estimators, roi, smoothing_px, target)
 
 
 def _run(
@@ -254,19 +265,21 @@ def _run(
     estimators: Sequence[str] | Mapping[str, AnyEstimator],
     roi: tuple[int, int, int, int] | None,
     smoothing_px: float,
+    target: Target,
 ) -> Reconstruction:
     """Run detector and estimators on a frame that has been checked."""
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    box = None if roi is None else _check_roi(roi)
+    box = None if roi is None else check_roi(roi)
     chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
     detection = _detect(detector, frame) if box is None else _cut_region(frame, box)
     # estimate
-    return _estimate(detection, chosen)
+    made = _estimate(detection, chosen)
+    return made if target == "fine" else _at_base(made, calibration.priors)
 
 
 def _detect(detector: Detector, frame: Frame) -> Detection:
@@ -325,6 +338,21 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     return result
 
 
+def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
+    """Return a reconstruction whose estimates state the base's normals."""
+    based = [
+        replace(
+            each,
+            estimates={
+                name: result if isinstance(result, Failure) else to_base(result, priors)
+                for name, result in each.estimates.items()
+            },
+        )
+        for each in made.specularities
+    ]
+    return replace(made, specularities=based)
+
+
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
     """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
     height, width = frame.encoded.shape[:2]
@@ -365,12 +393,3 @@ def _check_names(names: Sequence[str]) -> Sequence[str]:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
     return names
-
-
-def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
-    try:
-        x, y, width, height = (operator.index(value) for value in roi)
-    except (TypeError, ValueError):
-        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
-    return x, y, width, height

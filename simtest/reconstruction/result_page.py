@@ -10,9 +10,11 @@ import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.estimators.budget import deviations
 from simtest.pages.html import write_page
 from simtest.pages.style import colours
-from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, deviation_deg
+from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord
+from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
@@ -77,6 +79,7 @@ def _spot(spot: SpecularityRecord, palette: dict[str, str]) -> JsonObject:
         "kind": spot.kind,
         "score": spot.score,
         "best": spot.best,
+        "because": spot.best_because,
         "rows": [
             {"name": name, "colour": palette[name], **_row(name, result, spot)}
             for name, result in spot.estimates.items()
@@ -98,6 +101,8 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord) -> Json
         "isophotes": [_rounded(points, 1) for _, points in drawing.isophotes],
         "curves": [_rounded(curve, 1) for curve in drawing.curves],
         "deviation": deviation_deg(result),
+        "target": result.target,
+        "parts": {name: round(float(np.degrees(v)), 4) for name, v in deviations(result.budget or {}).items()},
         "flags": result.flags,
         "error": error and error.error_deg,
     }

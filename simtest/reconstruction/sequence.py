@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import cv2
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
+from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.image_io import SequenceFrame, open_source
 from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
@@ -27,13 +28,17 @@ TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 
 @dataclass(frozen=True)
 class SequenceResult:
-    """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written."""
+    """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written.
+
+    `assumed` is what nobody told of its frames; empty where all were done by an earlier run.
+    """
 
     frames: int
     failed: int
     specularities: int
     tracks: int
     files: list[Path]
+    assumed: Sequence[Assumption] = ()
 
 
 def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Progress | None = None) -> SequenceResult:
@@ -77,7 +82,9 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
     if progress is not None:
         progress(run.taken, run.taken, "")
     found = sum(len(frame.specularities) for frame in run.frames)
-    return SequenceResult(run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files)
+    return SequenceResult(
+        run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files, run.assumed
+    )
 
 
 class _Run:
@@ -88,6 +95,7 @@ class _Run:
         self.frames: list[TrackedFrame] = []
         self.taken = self.failed = 0
         self.first_error = ""
+        self.assumed: Sequence[Assumption] = ()
         self._calibration: Calibration | None = None
         self._cautions: list[str] = []
         self._tracker: Tracker | None = None
@@ -120,6 +128,7 @@ class _Run:
             for caution in self._cautions:
                 warnings.warn(caution, stacklevel=5)
         record = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
+        self.assumed = record.assumed
         spots = self._tracked(record.specularities, size)
         overlay = draw_overlay(picture, spots)
         write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))

@@ -54,7 +54,8 @@ def same(found, record):
             np.testing.assert_array_equal(estimate.look_px, other.look_px)
             np.testing.assert_array_equal(estimate.covariance, other.covariance)
             assert estimate.flags == other.flags
-    assert (found.choices.encoding, found.choices.detector) == (record.encoding, record.detector)
+    for name in ("encoding", "detector", "smoothing_px", "inferred", "assumed"):
+        assert getattr(found.choices, name) == getattr(record, name), name
 
 
 def stored(values, path):
@@ -122,7 +123,7 @@ def test_depths_and_channels(kind, shape, tmp_path):
     "told",
     [
         {"encoding": "linear"}, {"detector": "peaks"}, {"detector": "simtest:colour"}, {"smoothing_px": 1.5},
-        {"roi": (60, 40, 60, 60)}, {"estimators": ("curved", "cone_axis")},
+        {"roi": (60, 40, 60, 60)}, {"target": "base"}, {"estimators": ("curved", "cone_axis")},
     ],
     ids=str,
 )  # fmt: skip
@@ -149,6 +150,7 @@ def test_the_calibration_states_what_is_not_inferred():
     assert (choices.encoding, choices.saturation_level) == ("gamma", 0.9)
     assert choices.inferred == ("detector", "smoothing_px", "estimators")
     assert choices.priors == calibration.priors
+    assert [each.what for each in choices.assumed] == ["falloff towards the border"]
     # An array gets the same default estimators as a file: lights and a distance are enough for one more.
     assert choices.estimators[-1] == "bisector"
 
@@ -168,6 +170,7 @@ def test_real_numbers_stay_light_of_any_scale():
     found = reconstruct(light, CAMERA)
     choices = found.choices
     assert (choices.encoding, choices.saturation_level, choices.detector) == ("linear", None, "peaks")
+    assert "response" not in [each.what for each in choices.assumed]
     assert choices.smoothing_px == 2.0
     (scaled,) = {len(reconstruct(1000 * light, CAMERA)), len(found)}
     assert scaled == 2
@@ -180,7 +183,8 @@ def test_real_numbers_are_a_picture_where_that_is_said():
     values = tissue()
     found, plain = (reconstruct(v, CAMERA, **t) for v, t in ((values / 255.0, {"encoding": "srgb"}), (values, {})))
     assert [s.region for s in found] == [s.region for s in plain]
-    assert found.choices == replace(plain.choices, inferred=found.choices.inferred)
+    told = {name: getattr(found.choices, name) for name in ("inferred", "assumed")}
+    assert found.choices == replace(plain.choices, **told)
     assert "encoding" not in found.choices.inferred
 
 

@@ -9,6 +9,7 @@ from simtest.calibration import LIGHT_AT_CAMERA, Calibration, LogUniform, Normal
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
+from simtest.estimators.budget import dominant
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
@@ -16,7 +17,7 @@ from simtest.estimators.dispatch import run
 from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.peak_value import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.vectors import angle_deg, bisect
+from simtest.geometry.vectors import angle_deg, bisect, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
@@ -318,3 +319,35 @@ def test_branch_point_and_look():
     assert laws.branch_point_error(1e-4) == pytest.approx(laws.circle_pose_error(1e-3, 1e-3 * (1 - 1e-4)), rel=1e-3)
     assert laws.look_error([0.01, 0.0], 1.0, 3.0) == pytest.approx(0.02)
     assert laws.look_error([0.0, 0.01], 1.0, 3.0) == pytest.approx(0.04)
+
+
+# What the bisector makes of a distance that nobody told ------------------------------------------------------------
+
+
+def test_an_untold_distance_is_the_working_range():
+    light = (3.0, -1.0, 0.0)
+    told = [
+        bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d), falloff_power=None)) for d in (5.0, 80.0)
+    ]
+    vague = bisector.estimate(lobe(0.01), CAMERA, Priors((light,), falloff_power=None))
+    # Between the two ends, whose normals lie within twice its region.
+    ends = [tangent_coordinates(vague.normal, each.normal) for each in told]
+    assert ends[0] @ ends[1] < 0
+    assert dominant(vague.budget) == "distance"
+    assert set(told[0].budget) == {"noise", "distance"}
+    assert np.trace(told[0].budget["distance"]) == 0
+    # The share of the working range whose normals lie in the region.
+    distances = np.linspace(5.0, 80.0, 151)
+    normals = [bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d))).normal for d in distances[::5]]
+    moves = np.array([tangent_coordinates(vague.normal, normal) for normal in normals])
+    covariance = vague.covariance
+    inside = np.einsum("ni,ni->n", moves, np.linalg.solve(covariance, moves.T).T) <= 5.99
+    assert 0.9 <= inside.mean() < 1
+
+
+def test_lights_that_are_not_told_apart_are_in_the_budget():
+    lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+    found = bisector.estimate(lobe(0.01), CAMERA, Priors(lights, exactly(20.0), falloff_power=None))
+    assert "ambiguous_light" in found.flags
+    half = np.arctan(4.0 / 20.0) / 2
+    assert np.trace(found.budget["light_offset"]) == pytest.approx(half**2, rel=0.05)

@@ -9,7 +9,14 @@ from scipy.stats import chi2
 from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import InputError
 from simtest.estimators.budget import equivalent_variance, line_covariance
-from simtest.estimators.prior_parts import add_untold_parts, light_offset_part, relief_part, to_base
+from simtest.estimators.prior_parts import (
+    SPOT_ONSET,
+    SPOT_SPREAD,
+    add_untold_parts,
+    light_offset_part,
+    relief_part,
+    to_base,
+)
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.vectors import basis_across, bisect
@@ -143,11 +150,15 @@ def test_an_error_along_a_line_is_covered_beside_a_normal_one(draw):
 
 def test_relief_is_covered_at_the_base():
     rng, count = np.random.default_rng(6), 40000
-    slope = np.radians(rng.uniform(0, 6, count))
-    moves = slope[:, None] * rng.standard_normal((count, 2))
+    slope = np.radians(rng.uniform(0, 8, count))
+    # highlights lie wider than the slope by the width of their lobe, in squares
+    spread = np.hypot(slope, SPOT_SPREAD * np.sqrt(1 - np.exp(-((slope / SPOT_ONSET) ** 2))))
+    moves = spread[:, None] * rng.standard_normal((count, 2))
     assert held(moves, relief_part(Priors())) == pytest.approx(0.95, abs=0.006)
-    told = relief_part(Priors(relief_slope=exactly(np.radians(3.0))))
-    np.testing.assert_allclose(told, np.radians(3.0) ** 2 * np.eye(2), rtol=1e-6)
+    told = relief_part(Priors(relief_slope=exactly(np.radians(5.0))))
+    np.testing.assert_allclose(told, (np.radians(5.0) ** 2 + SPOT_SPREAD**2) * np.eye(2), rtol=1e-5)
+    # A smooth surface has one highlight, at the base's own brightest point.
+    np.testing.assert_array_equal(relief_part(Priors(relief_slope=exactly(0.0))), np.zeros((2, 2)))
 
 
 def test_a_single_highlight_states_the_base_with_the_relief_in_its_budget():

@@ -1,0 +1,99 @@
+"""What is assumed where nobody told: as priors of a picture known by its field of view, and as text for people."""
+
+import math
+from dataclasses import dataclass
+
+from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
+from simtest.estimators.protocol import Target
+from simtest.geometry import Camera
+
+FOCAL_SD = 0.1
+"""Standard deviation of a focal length that follows from a stated field of view, as a share of it: makers state it
+along the diagonal, and the picture is often cropped."""
+
+CENTRE_SD_SHARE = 0.02
+"""Standard deviation of the principal point about the picture's centre along each axis, over the picture's width."""
+
+DISTORTION_SD = 0.1
+"""Standard deviation of a radial distortion k1, where a lens of which nobody told is taken for a pinhole."""
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One thing that nobody told: what it is, how it is taken, and how to narrow it."""
+
+    what: str
+    distribution: str
+    how_to_narrow: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.distribution} (to narrow: {self.how_to_narrow})"
+
+
+def calibration_of_view(fov_deg: float, width: int, height: int) -> Calibration:
+    """Return the calibration of a camera of which the horizontal field of view alone is known, deg.
+
+    Raises `InputError` if the angle is out of range.
+    """
+    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD)
+    return Calibration(Camera.from_fov(fov_deg, width, height), priors=Priors(camera=prior))
+
+
+def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
+    """List what is assumed of a picture, since neither its calibration nor the options tell it.
+
+    `encoding` is the one that was told beside the calibration, if any.
+    """
+    priors = calibration.priors
+    made = []
+    if not priors.lights_mm:
+        made.append(
+            Assumption(
+                "light", f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
+                "[rig] lights_mm or light_offset_mm in a calibration file",
+            )
+        )  # fmt: skip
+    if priors.distance_mm is None:
+        made.append(
+            Assumption(
+                "distance of the tissue", f"{priors.distance} mm along the sightline",
+                "[rig] distance_mm or distance_range_mm in a calibration file",
+            )
+        )  # fmt: skip
+    made += _of_camera(calibration.camera, priors.camera)
+    if calibration.response is None and encoding is None:
+        made.append(Assumption("response", "sRGB, sharpened or not", "[response] in a calibration file, or --encoding"))
+    if priors.falloff_power is not None:
+        made.append(
+            Assumption(
+                "falloff towards the border", f"cos^k over the angle from the optical axis, k {priors.falloff_power}",
+                "[vignetting] and [emission] in a calibration file, or [uncertainty] falloff_power",
+            )
+        )  # fmt: skip
+    if target == "base":
+        slope = "[surface] relief_slope_deg in a calibration file"
+        made.append(Assumption("slope of the relief", f"{_in_degrees(priors.relief_slope)} deg an axis", slope))
+    return made
+
+
+def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
+    """List what is assumed of the camera's geometry."""
+    key = "in a calibration file"
+    made = []
+    if prior.focal_sd > 0:
+        deviation = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
+        made.append(Assumption("focal length", deviation, f"[camera] fx, fy and [uncertainty] focal_sd {key}"))
+    if prior.centre_sd_px > 0:
+        deviation = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
+        made.append(Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}"))
+    if prior.distortion_sd > 0:
+        lens = "none" if camera.distortion is None else "as stated"
+        deviation = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
+        made.append(Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}"))
+    return made
+
+
+def _in_degrees(slope: Distribution) -> str:
+    """Describe a distribution of angles, rad, in deg."""
+    scaled = (math.degrees(value) for value in vars(slope).values())
+    return str(type(slope)(*scaled))

@@ -1,0 +1,147 @@
+"""The best estimate and why; what is assumed where nobody told, and the keys that narrow it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from simtest.calibration import CameraPrior, Priors, Uniform, exactly
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.protocol import Estimate
+from simtest.reconstruction.assumptions import FOCAL_SD, assumptions, calibration_of_view
+from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
+from simtest.reconstruction.ranking import best_of
+from simtest.runtime.files import write_json
+from simtest.spec import load_calibration
+
+NORMAL = np.array([0.0, 0.0, -1.0])
+CAMERA_KEYS = "width = 200\nheight = 160\nfx = 200.0\nfy = 200.0\n"
+
+
+def stating(deg=None, **given):
+    parts = {} if deg is None else {"budget": {"noise": np.radians(deg) ** 2 / 2 * np.eye(2)}}
+    return Estimate(NORMAL, NORMAL[None], np.array([100.0, 80.0]), **parts, **given)
+
+
+def spot():
+    x, y = np.meshgrid(np.arange(200), np.arange(160))
+    frame = np.exp(-((x - 100) ** 2 + (y - 80) ** 2) / 200)
+    return (frame + 0.002 * np.random.default_rng(0).standard_normal(frame.shape)).clip(0, 1).astype(np.float32)
+
+
+# The best estimate ----------------------------------------------------------------------------------------------------
+
+
+def test_the_smallest_expected_error_is_the_best():
+    two = {"bisector": stating(2.0), "other": stating(0.5), "circle_pose": stating()}
+    best, because = best_of(two)
+    assert best == "other"
+    assert because == "smallest expected error, 0.5 deg; next bisector with 2 deg"
+    assert best_of({**two, "other": Failure(Reason.NO_PEAK)})[0] == "bisector"
+
+
+def test_what_states_no_uncertainty_comes_last():
+    vague = {"brightest_point": stating(), "mine": stating(80.0)}
+    assert best_of(vague) == ("mine", "smallest expected error, 80 deg; the others state no uncertainty")
+    silent = {"circle_pose": stating(), "mine": stating(), "cone_axis": stating()}
+    assert best_of(silent)[0] == "cone_axis"
+    assert best_of({"circle_pose": stating(), "mine": stating()})[0] == "mine"
+    assert best_of({"a": Failure(Reason.NO_PEAK)}) == (None, "no estimator answered")
+
+
+def test_the_best_is_one_that_states_the_wanted_surface():
+    both = {"cone_axis": stating(3.0), "cloud": stating(0.5, target="base")}
+    assert best_of(both)[0] == "cone_axis"
+    assert best_of(both, "base")[0] == "cloud"
+    assert best_of({"cloud": both["cloud"]})[0] == "cloud"
+
+
+def test_the_largest_part_is_named():
+    light = {"light_offset": np.radians(4.0) ** 2 * np.eye(2)}
+    assert "mostly light_offset" in best_of({"cone_axis": stating(1.0).with_parts(**light)})[1]
+
+
+# What is assumed ------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_of_view_alone_leaves_all_of_it_open():
+    calibration = calibration_of_view(70.0, 200, 160)
+    assert calibration.priors == Priors(camera=CameraPrior(FOCAL_SD, 4.0, 0.1))
+    fine = assumptions(calibration, None, "fine")
+    assert [each.what for each in fine] == [
+        "light", "distance of the tissue", "focal length", "principal point", "distortion", "response",
+        "falloff towards the border",
+    ]  # fmt: skip
+    assert "uniform from 0 to 6 mm" in str(fine[0])
+    assert all(each.how_to_narrow for each in fine)
+    assert assumptions(calibration, None, "base")[-1].distribution == "uniform from 0 to 8 deg an axis"
+    assert "response" not in {each.what for each in assumptions(calibration, "linear", "fine")}
+
+
+def test_a_full_calibration_leaves_nothing_open(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text(
+        CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
+        "distance_mm = 40.0\n"
+    )
+    assert assumptions(load_calibration(path), None, "fine") == []
+
+
+def test_the_keys_that_narrow(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlight_offset_mm = [2, 4]\ndistance_range_mm = [20, 60]\n"
+        "[surface]\nrelief_slope_deg = 2.0\n"
+        "[uncertainty]\nfocal_sd = 0.02\ncentre_sd_px = 5.0\ndistortion_sd = 0.01\nfalloff_power = [0, 2]\n"
+    )
+    assert load_calibration(path).priors == Priors(
+        distance_mm=Uniform(20.0, 60.0),
+        light_offset_mm=Uniform(2.0, 4.0),
+        camera=CameraPrior(0.02, 5.0, 0.01),
+        falloff_power=Uniform(0.0, 2.0),
+        relief_slope=exactly(np.radians(2.0)),
+    )
+    path.write_text(CAMERA_KEYS + "[surface]\nrelief_slope_deg = [1, 3]\n[rig]\nlight_offset_mm = [3, 3]\n")
+    told = load_calibration(path).priors
+    assert (told.relief_slope, told.light_offset_mm) == (Uniform(*np.radians([1.0, 3.0]).tolist()), exactly(3.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[rig]\nlight_offset_mm = [4, 2]\n", r"light_offset_mm = \[4, 2\]: must be a lower and an upper end"),
+        ("[rig]\ndistance_range_mm = [0, 20]\n", r"distance_range_mm = \[0, 20\].*above 0"),
+        ("[rig]\ndistance_range_mm = [5, 20]\ndistance_mm = 9.0\n", "exclude each other"),
+        ("[rig]\nlight_offset_mm = [0, 2]\nlights_mm = [[0, 0, 0]]\n", "exclude each other"),
+        ("[uncertainty]\nfocal_sd = -0.1\n", "uncertainty.focal_sd = -0.1"),
+        ("[uncertainty]\nfalloff_power = [3, 1]\n", "falloff_power"),
+        ("[uncertainty]\nlens = 1\n", "uncertainty.lens"),
+        ("[surface]\nrelief_slope_deg = 60.0\n", "relief_slope_deg"),
+    ],
+)
+def test_malformed_keys_are_named(tmp_path, text, said):
+    (tmp_path / "c.toml").write_text(CAMERA_KEYS + text)
+    with pytest.raises(InputError, match=said) as caught:
+        load_calibration(tmp_path / "c.toml")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("target", ["fine", "base"])
+def test_a_picture_of_which_nothing_is_told(tmp_path, target):
+    options = Options(fov_deg=53.0, encoding="linear", target=target)
+    calibration, _ = read_calibration(options, spot())
+    record = reconstruct_values("spot", spot(), calibration, options)
+    write_json(tmp_path / "normals.json", record)
+    document = json.loads((tmp_path / "normals.json").read_text())
+    (found,) = document["specularities"]
+    assert (found["best"], found["estimates"]["cone_axis"]["target"]) == ("cone_axis", target)
+    parts = found["estimates"]["cone_axis"]["budget"]
+    deviations = {name: np.degrees(np.sqrt(np.trace(part))) for name, part in parts.items()}
+    assert max(deviations, key=deviations.get) == ("light_offset" if target == "fine" else "relief")
+    assert f"mostly {max(deviations, key=deviations.get)}" in found["best_because"]
+    # Not 0.009 deg: between a few deg and what the priors allow.
+    stated = np.degrees(np.sqrt(np.trace(found["estimates"]["cone_axis"]["covariance"])))
+    assert 4 < stated < (7 if target == "fine" else 12)
+    assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
+    with pytest.raises(InputError, match="--target top"):
+        Options(fov_deg=53.0, target="top")
