@@ -100,3 +100,11 @@ def check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
     except (TypeError, ValueError):
         raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
     return x, y, width, height
+
+
+def image_size(frame: npt.ArrayLike) -> tuple[int, int]:
+    """Return height and width of a frame; raise `InputError` where it is no image."""
+    shape = np.shape(frame) if isinstance(frame, np.ndarray) else ()
+    if len(shape) not in (2, 3) or 0 in shape:
+        raise InputError("frame: must be an array of shape (H, W) or (H, W, C) where the camera is a field of view")
+    return int(shape[0]), int(shape[1])

@@ -18,7 +18,7 @@ from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera, Patch
-from simtest.reconstruction.assumptions import assumptions
+from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
     AUTO,
     SMOOTHING_BY_COLOUR_PX,
@@ -29,7 +29,7 @@ from simtest.reconstruction.choices import (
     complete,
     untold,
 )
-from simtest.reconstruction.picture_values import check_frame, check_roi, check_size
+from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
@@ -86,7 +86,7 @@ class Specularities(list[Specularity]):
 
 def reconstruct(
     frame: npt.ArrayLike,
-    camera: Camera | Calibration,
+    camera: Camera | Calibration | float,
     estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float | None = None,
@@ -109,9 +109,10 @@ def reconstruct(
     frame : array_like, shape (H, W) or (H, W, C)
         Channels are RGB (OpenCV reads BGR: reverse them); of a picture, alpha is left out; of real numbers there may be
         any number of channels.
-    camera : Camera or Calibration
+    camera : Camera, Calibration or float
         Of the same size. What a calibration knows is undone before smoothing: the response, then vignetting and
-        emission.
+        emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
+        known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
         Names as registered, or the estimators themselves by name; default circle_pose, brightest_point and cone_axis,
         and in pictures all that the calibration states enough for (`default_estimators`).
@@ -145,6 +146,9 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN, infinity or integers of
         another type, whose range nobody knows; if an argument is of the wrong kind or out of range.
     """
+    if isinstance(camera, int | float) and not isinstance(camera, bool):
+        height, width = image_size(frame)
+        camera = calibration_of_view(camera, width, height)
     known = _calibration(camera)
     check_encoding(encoding, known)
     image, is_picture = check_frame(frame, known.camera, encoding)
@@ -381,7 +385,7 @@ def _flagged(
     return replace(result, flags=(*result.flags, *flags)) if flags else result
 
 
-def _calibration(camera: Camera | Calibration) -> Calibration:
+def _calibration(camera: object) -> Calibration:
     if isinstance(camera, Calibration):
         return camera
     if not isinstance(camera, Camera):

@@ -135,6 +135,19 @@ def test_what_is_told_is_told_alike(told, tmp_path):
     assert not set(told) & set(found.choices.inferred)
 
 
+def test_a_field_of_view_is_told_alike(tmp_path):
+    """Focal length, centre and lens are guesses in both, and no exact camera in one of them."""
+    values = tissue()
+    stored(values, tmp_path / "frame.png")
+    told = Options(fov_deg=60.0)
+    picture_values = read_picture(tmp_path / "frame.png")
+    record = reconstruct_values("frame.png", picture_values, read_calibration(told, picture_values)[0], told)
+    found = reconstruct(values, 60.0)
+    same(found, record)
+    assert "focal length" in [each.what for each in found.choices.assumed]
+    assert "focal length" not in [each.what for each in reconstruct(values, CAMERA).choices.assumed]
+
+
 def test_all_peaks_alike(tmp_path):
     values = tissue()
     stored(values, tmp_path / "frame.png")
