@@ -107,7 +107,7 @@ KNOWN = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(RIGS, LENSES, SENSORS, KNOWN, st.floats(1, 1e4), st.booleans())
 def test_what_any_scene_tells_reads_back(tmp_path_factory, rig, lens, sensor, known, exponent, emission_known):
     scene = scene_from_dict({
@@ -141,7 +141,7 @@ CALIBRATIONS = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(CALIBRATIONS)
 def test_priors_read_back(tmp_path_factory, calibration):
     same(written(calibration, tmp_path_factory.mktemp("told")), calibration)
