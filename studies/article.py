@@ -63,12 +63,16 @@ class View:
         Axis ratio of each.
     glints_px, glints : dict
         By the index of the specularity, position and true normal of the glint that it shows, where it shows one.
+    lit_px, lit : ndarray
+        Positions, shape (N, 2), and true normals, shape (N, 3), of all glints that are lit and in view.
     """
 
     spots: list[Observation]
     roundness: list[float]
     glints_px: dict[int, Array]
     glints: dict[int, Array]
+    lit_px: Array
+    lit: Array
 
 
 def described(viewpoint: int, slope: float) -> Scene:
@@ -108,7 +112,8 @@ def largest_first(
     A spot in which no glint lies has no true normal of its own, and stays in the other rows.
     """
     lit = [h for h in seen.highlights if h.lit]
-    matched, view = match(found, [h.bp_px for h in lit]), View([], [], {}, {})
+    lit_px, normals_of_lit = np.array([h.bp_px for h in lit]), np.array([h.normal for h in lit])
+    matched, view = match(found, lit_px), View([], [], {}, {}, lit_px.reshape(-1, 2), normals_of_lit.reshape(-1, 3))
     judged = found.detection.highlights
     for i in sorted(range(len(found)), key=lambda i: -judged[i].area_px):
         normals = {name: r.candidates for name, r in found[i].estimates.items() if isinstance(r, Estimate)}
@@ -209,6 +214,22 @@ def report(pools: dict[str, list[View]], model: Model) -> None:
     print(f"article: {ARTICLE_DEG[0]} ± {ARTICLE_DEG[1]} deg; bold: both of its figures lie in the intervals")
 
 
+def selection(views: Sequence[View], model: Model) -> str:
+    """Say how far all lit glints are off the liver's normal, and those that a specularity shows, mean ± deviation."""
+    everything: list[float] = []
+    shown: list[float] = []
+    for view in views:
+        reference = MeshReference(model, view.spots[0].camera_from_model)
+        for px, normals, made in (
+            (view.lit_px, view.lit, everything),
+            (np.array(list(view.glints_px.values())).reshape(-1, 2), list(view.glints.values()), shown),
+        ):
+            pairs = zip(normals, reference.normals_at(px, view.spots[0].camera), strict=True)
+            made += [float(angle_deg(a, b)) for a, b in pairs if np.isfinite(b).all()]
+    cells = [f"{np.mean(x):.2f} ± {np.std(x):.2f} ({len(x)})" for x in (everything, shown)]
+    return f"glints that are lit: {cells[0]}; that a specularity shows: {cells[1]}"
+
+
 def main(count: int) -> None:
     """Render the views and print the table."""
     mesh, _, _ = make_mesh(load_anatomy("liver"))
@@ -218,7 +239,10 @@ def main(count: int) -> None:
         pools[surface] = views
         sizes = [len(view.spots) for view in views]
         print(f"{surface}: {len(views)} views with {sum(sizes)} specularities, {min(sizes)} to {max(sizes)} a view")
-    report(pools, Model(mesh.vertices, mesh.normals, mesh.faces))
+    model = Model(mesh.vertices, mesh.normals, mesh.faces)
+    report(pools, model)
+    for surface, views in pools.items():
+        print(f"{surface}: {selection(views, model)}")
 
 
 if __name__ == "__main__":

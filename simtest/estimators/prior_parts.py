@@ -84,7 +84,7 @@ def add_camera_and_falloff(
 
 
 def _camera_and_falloff(
-    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None
 ) -> dict[str, Array]:
     """Return the parts ``camera`` and ``response``, where the priors leave them open."""
     parts = {}

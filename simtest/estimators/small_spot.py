@@ -103,6 +103,11 @@ class SmallSpot:
         return np.asarray(self._by_pixel @ self.variance_px2 @ self._by_pixel.T)
 
     @property
+    def seen_moments(self) -> Array:
+        """The same: nothing is taken off for the smoothing that they were not measured with."""
+        return self.moments
+
+    @property
     def axis_budget(self) -> Budget | None:
         """Budget of the axis in the basis: noise and resolution; None where the noise is not known."""
         if self.patch.noise is None:

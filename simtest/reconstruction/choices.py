@@ -12,6 +12,7 @@ from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detector, load_detector
 from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
+from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
@@ -40,9 +41,11 @@ class Choices:
     estimators : tuple of str
         Their names.
     priors : Priors
-        What the estimators were told of lights, distance and lobe; what it leaves empty nobody told.
+        What the estimators were told of lights, distance, lobe, camera and relief.
     inferred : tuple of str
         Those of `encoding`, `saturation_level`, `detector`, `smoothing_px` and `estimators` that nobody told.
+    assumed : tuple of Assumption
+        What else nobody told, with the distribution that stands for it in the budgets, and how to narrow it.
     """
 
     encoding: str
@@ -52,6 +55,7 @@ class Choices:
     estimators: tuple[str, ...]
     priors: Priors
     inferred: tuple[str, ...] = ()
+    assumed: tuple[Assumption, ...] = ()
 
     def __str__(self) -> str:
         """Return the choices on one line; those that nobody told are marked."""

@@ -148,7 +148,9 @@ class SpecularityRecord:
 class PictureRecord:
     """A picture and all that was reconstructed in it.
 
-    `encoding` is the kind of the response that was undone; `assumed` is what nobody told, and how it was taken.
+    `encoding` is the kind of the response that was undone, `smoothing_px` the width of the Gaussian; `inferred` names
+    those of these and of detector, estimators and saturation level that nobody told, and `assumed` is what else nobody
+    told, and how it was taken.
     """
 
     image: str
@@ -161,6 +163,8 @@ class PictureRecord:
     other_highlights: Sequence[Highlight]
     reference: ComparisonRecord | None = None
     assumed: Sequence[Assumption] = ()
+    smoothing_px: float | None = None
+    inferred: Sequence[str] = ()
 
     @property
     def stated(self) -> StatedErrors | None:
@@ -178,6 +182,8 @@ class PictureRecord:
             "camera": describe_camera(self.camera),
             "encoding": self.encoding,
             "detector": self.detector,
+            "smoothing_px": self.smoothing_px,
+            "inferred": self.inferred,
             "view": _view_json(self.view),
             "warnings": self.warnings,
             "assumed": self.assumed,

@@ -8,7 +8,7 @@ from simtest.calibration import Calibration
 from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.reconstruction.assumptions import assumptions, calibration_of_view
+from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.pipeline import run_picture
@@ -50,7 +50,8 @@ class Options:
     Raises
     ------
     InputError
-        If the camera is given twice or not at all, no detector of that name is registered, or the target is neither.
+        If the camera is given twice or not at all, the target is none of these, or no detector of that name is
+        registered.
     """
 
     camera: Path | None = None
@@ -112,7 +113,6 @@ def reconstruct_values(
     Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
     the picture.
     """
-    assumed = assumptions(calibration, options.encoding, options.target)
     # linear light, detect, estimate
     made, choices = run_picture(
         picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,
@@ -128,5 +128,7 @@ def reconstruct_values(
         warnings=list(cautions),
         specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
-        assumed=assumed,
+        assumed=choices.assumed,
+        smoothing_px=choices.smoothing_px,
+        inferred=choices.inferred,
     )

@@ -1,5 +1,7 @@
 """The values of a picture, from a file or an array: what is encoded, and what has colours."""
 
+import operator
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -7,6 +9,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Image
+from simtest.runtime.resources import shown
 
 LARGEST = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}
 """The value that light of full scale has, by the type of the values."""
@@ -88,3 +91,20 @@ def check_size(image: Image, camera: Camera) -> None:
             f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
             "the size of the camera's calibration"
         )
+
+
+def check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
+    try:
+        x, y, width, height = (operator.index(value) for value in roi)
+    except (TypeError, ValueError):
+        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
+    return x, y, width, height
+
+
+def image_size(frame: npt.ArrayLike) -> tuple[int, int]:
+    """Return height and width of a frame; raise `InputError` where it is no image."""
+    shape = np.shape(frame) if isinstance(frame, np.ndarray) else ()
+    if len(shape) not in (2, 3) or 0 in shape:
+        raise InputError("frame: must be an array of shape (H, W) or (H, W, C) where the camera is a field of view")
+    return int(shape[0]), int(shape[1])

@@ -1,7 +1,6 @@
 """The pipeline from the values of a picture to normals: linear light, detect, estimate; one for grey and for colour."""
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +19,7 @@ from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
+from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
     AUTO,
     SMOOTHING_BY_COLOUR_PX,
@@ -30,7 +30,7 @@ from simtest.reconstruction.choices import (
     complete,
     untold,
 )
-from simtest.reconstruction.picture_values import check_frame, check_size
+from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
@@ -87,14 +87,14 @@ class Specularities(list[Specularity]):
 
 def reconstruct(
     frame: npt.ArrayLike,
-    camera: Camera | Calibration,
+    camera: Camera | Calibration | float,
     estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
     roi: tuple[int, int, int, int] | None = None,
     smoothing_px: float | None = None,
     isolated: bool = True,
     detector: str | Detector | None = None,
-    encoding: str | None = None,
     target: Target = "fine",
+    encoding: str | None = None,
 ) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
 
@@ -110,9 +110,10 @@ def reconstruct(
     frame : array_like, shape (H, W) or (H, W, C)
         Channels are RGB (OpenCV reads BGR: reverse them); of a picture, alpha is left out; of real numbers there may be
         any number of channels.
-    camera : Camera or Calibration
+    camera : Camera, Calibration or float
         Of the same size. What a calibration knows is undone before smoothing: the response, then vignetting and
-        emission.
+        emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
+        known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
         Names as registered, or the estimators themselves by name; default circle_pose, brightest_point and cone_axis,
         and in pictures all that the calibration states enough for (`default_estimators`).
@@ -126,12 +127,12 @@ def reconstruct(
     detector : str or Detector, optional
         Name as registered, or the detector itself, to which `isolated` applies if it is one of the package; "auto": by
         colour in frames that have colours and are not linear, else peaks. Default "auto" in pictures, else "peaks".
-    encoding : {"srgb", "linear"}, optional
-        How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
-        picture too where they are said to be "srgb".
     target : {"fine", "base"}
         Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
         they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
+    encoding : {"srgb", "linear"}, optional
+        How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
+        picture too where they are said to be "srgb".
 
     Returns
     -------
@@ -146,20 +147,24 @@ def reconstruct(
         If the frame is no image, differs in size from the camera's calibration, or holds NaN, infinity or integers of
         another type, whose range nobody knows; if an argument is of the wrong kind or out of range.
     """
+    if isinstance(camera, int | float) and not isinstance(camera, bool):
+        height, width = image_size(frame)
+        camera = calibration_of_view(camera, width, height)
     known = _calibration(camera)
     check_encoding(encoding, known)
     image, is_picture = check_frame(frame, known.camera, encoding)
     if is_picture:
         finder = AUTO if detector is None else detector
-        return Specularities(
-            *run_picture(image, known, encoding, finder, estimators, roi, smoothing_px, isolated, target)
-        )
+        options = (encoding, finder, estimators, roi, smoothing_px, isolated, target)
+        return Specularities(*run_picture(image, known, *options))
     # light of any scale, which has no largest value
     finder = "peaks" if detector is None else detector
     names = DEFAULT_ESTIMATORS if estimators is None else estimators
     made, choices = _choose(image, known, finder, names, roi, smoothing_px, isolated, target)
     inferred = untold(known, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators)
-    return Specularities(made, replace(choices, inferred=inferred))
+    # Values that nobody called encoded are taken as linear: that is the rule for real numbers, and no guess.
+    assumed = assumptions(known, encoding or "linear", target)
+    return Specularities(made, replace(choices, inferred=inferred, assumed=tuple(assumed)))
 
 
 def run_picture(
@@ -186,7 +191,8 @@ def run_picture(
     inferred = untold(
         calibration, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators
     )
-    return made, replace(choices, inferred=inferred)
+    assumed = assumptions(calibration, encoding, target)
+    return made, replace(choices, inferred=inferred, assumed=tuple(assumed))
 
 
 def _choose(
@@ -271,7 +277,7 @@ def _run(
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    box = None if roi is None else _check_roi(roi)
+    box = None if roi is None else check_roi(roi)
     chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
@@ -398,7 +404,7 @@ def _flagged(
     return replace(result, flags=(*result.flags, *flags)) if flags else result
 
 
-def _calibration(camera: Camera | Calibration) -> Calibration:
+def _calibration(camera: object) -> Calibration:
     if isinstance(camera, Calibration):
         return camera
     if not isinstance(camera, Camera):
@@ -410,12 +416,3 @@ def _check_names(names: Sequence[str]) -> Sequence[str]:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
     return names
-
-
-def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
-    try:
-        x, y, width, height = (operator.index(value) for value in roi)
-    except (TypeError, ValueError):
-        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
-    return x, y, width, height

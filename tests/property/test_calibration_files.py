@@ -1,6 +1,7 @@
 """What is written as a calibration file reads back as the same calibration, field by field."""
 
 import math
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -106,7 +107,7 @@ KNOWN = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(RIGS, LENSES, SENSORS, KNOWN, st.floats(1, 1e4), st.booleans())
 def test_what_any_scene_tells_reads_back(tmp_path_factory, rig, lens, sensor, known, exponent, emission_known):
     scene = scene_from_dict({
@@ -140,7 +141,7 @@ CALIBRATIONS = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(CALIBRATIONS)
 def test_priors_read_back(tmp_path_factory, calibration):
     same(written(calibration, tmp_path_factory.mktemp("told")), calibration)
@@ -199,3 +200,14 @@ def test_a_table_profile_is_the_same_to_the_rounding_of_degrees(tmp_path):
 def test_a_fisheye_reads_back(tmp_path):
     camera = Camera(64, 48, 20.0, 20.0, 32.0, 24.0, distortion=KannalaBrandt(k1=-0.01, k4=1e-5))
     assert written(Calibration(camera), tmp_path).camera == camera
+
+
+def test_the_example_of_the_manual_reads_back(tmp_path):
+    manual = (Path(__file__).resolve().parents[2] / "docs" / "reconstruct.md").read_text(encoding="utf-8")
+    (example,) = [block for block in re.findall(r"```toml\n(.*?)```", manual, flags=re.S) if "[rig]" in block]
+    (tmp_path / "example.toml").write_text(example)
+    stated = simtest.load_calibration(tmp_path / "example.toml")
+    same(written(stated, tmp_path), stated)
+    # Each key of the example is one that counts.
+    assert len(stated.priors.lights_mm) == 2
+    assert stated.priors.camera == CameraPrior(0.01, 5.0, 0.02)

@@ -549,6 +549,9 @@ ARGUMENTS = {
     "detector unknown": ({"detector": "magic"}, "detector 'magic': not installed; allowed: "),
     "detector of a region": ({"detector": "colour", "roi": (0, 0, 9, 9)}, "the region of interest is named"),
     "detector of grey": ({"detector": "colour"}, "detector colour: the picture is grey; must be peaks"),
+    "field of view out of range": ({"camera": 200.0}, "200"),
+    "field of view of no image": ({"camera": 60.0, "frame": [1.0, 2.0]}, "where the camera is a field of view"),
+    "camera a truth": ({"camera": True}, "camera is a bool: must be a simtest.Camera"),
     "camera a matrix": ({"camera": np.eye(3)}, "camera is a ndarray: must be a simtest.Camera"),
 }
 
