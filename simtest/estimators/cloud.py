@@ -29,10 +29,10 @@ from simtest.geometry.vectors import basis_across
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
 
-LEAST_IN_VIEW = 0.9
+LEAST_IN_VIEW = 0.95
 """Nor does a cloud of which less is in view, whose centre would be a guess."""
 
-LARGELY_SEEN = 0.97
+LARGELY_SEEN = 0.98
 """A cloud of which less is in view is flagged."""
 
 UNEVEN = 0.2
