@@ -28,7 +28,7 @@ REGION = chi_squared.quantile(0.95, 2)
 
 @dataclass(frozen=True)
 class Answer:
-    """An estimate against the base's highlight point that most of its spots belong to.
+    """An estimate against the base's highlight point that most of its spots belong to; of several lights their mean.
 
     Parameters
     ----------
@@ -82,18 +82,19 @@ def _answer(frame: BaseFrame, estimate: Estimate) -> Answer:
     count = len(shape.points_px)
     semi_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(estimate.covariance)[-1])))
     unit_deg = slope_deg / float(np.sqrt(count))
-    votes = frame.votes(shape.points_px)
-    if not votes.any():
+    matched = frame.matched(shape.points_px, estimate.look_px)
+    if not matched:
         return Answer(count, None, unit_deg, None, semi_deg, None, None, estimate.flags)
-    best = np.flatnonzero(votes == votes.max())
-    number = int(best[np.linalg.norm(frame.points_px[best] - estimate.look_px, axis=1).argmin()])
-    first, second = frame.gains[number].tolist()
+    # Lights that are not told apart make one cloud, around the mean of their points.
+    truth = frame.normals[matched].mean(axis=0)
+    truth /= np.linalg.norm(truth)
+    first, second = frame.gains[matched[0]].tolist()
     told = shape.slope_with((first, second))
     return Answer(
         spots=count,
-        error_deg=float(angle_deg(estimate.normal, frame.normals[number])),
+        error_deg=float(angle_deg(estimate.normal, truth)),
         unit_deg=unit_deg,
-        mahalanobis2=mahalanobis2(estimate, frame.normals[number]),
+        mahalanobis2=mahalanobis2(estimate, truth),
         semi_deg=semi_deg,
         slope_ratio=float(np.degrees(told.value)) / slope_deg,
         prior_holds=shape.slope.low <= np.radians(slope_deg) <= shape.slope.high,
