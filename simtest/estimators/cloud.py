@@ -29,14 +29,19 @@ from simtest.geometry.vectors import basis_across
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
 
-LEAST_IN_VIEW = 0.9
+LEAST_IN_VIEW = 0.95
 """Nor does a cloud of which less is in view, whose centre would be a guess."""
 
-LARGELY_SEEN = 0.97
+LARGELY_SEEN = 0.98
 """A cloud of which less is in view is flagged."""
 
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
+
+BENDS, BENDS_LONG = 0.12, 0.4
+"""How far the centre may be off since the base's gains change inside the cloud, standard deviation as a share of the
+cloud's extent: in any direction, and along a cloud that is longer than wide by what it is longer. Where the base bends
+as much as its distance, so does the gain; a round cloud speaks for a flat base."""
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""
@@ -156,12 +161,15 @@ def _estimate(cloud: Cloud, points_px: Array, window: Window, camera: Camera, pr
 
 
 def _budget(cloud: Cloud, window: Window, independent: float, priors: Priors) -> Budget:
-    """Return the budget of a cloud's normal: the relief's chance, and the lights."""
+    """Return the budget of a cloud's normal: the relief's chance, the base's bends, and the lights."""
     normal, half = -cloud.centre, basis_across(cloud.centre)
     # The bases across a direction and its reverse are not the same.
     turn = basis_across(normal) @ half.T
     sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
-    budget = {"relief": turn @ sampling @ turn.T}
+    bends = BENDS**2 * cloud.covariance
+    if _is_long(cloud.covariance, independent):
+        bends = bends + BENDS_LONG**2 * _longer(cloud.covariance)
+    budget = {"relief": turn @ sampling @ turn.T, "shape": turn @ bends @ turn.T}
     if not priors.lights_mm:
         budget["light_offset"] = light_offset_part(normal, priors)
     elif not _is_at_camera(priors):
@@ -172,6 +180,18 @@ def _budget(cloud: Cloud, window: Window, independent: float, priors: Priors) ->
         moves = np.outer(1 / priors.distance.quantile(SHARES) - 1 / priors.distance.mean, turn @ middle)
         budget["distance"] = equivalent_covariance(moves)
     return budget
+
+
+def _is_long(covariance: Array, independent: float) -> bool:
+    """Return whether a cloud is longer than wide, beyond chance."""
+    small, large = np.linalg.eigvalsh(covariance)
+    # The log of a round cloud's axis ratio has a standard deviation of about 1 / sqrt(n).
+    return bool(math.log(large / small) / 2 * math.sqrt(independent) > ROUND_SIGMA)
+
+
+def _longer(covariance: Array) -> Array:
+    """Return what a covariance has along its longer axis beyond a round one."""
+    return np.asarray(covariance - np.linalg.eigvalsh(covariance)[0] * np.eye(2))
 
 
 def small_sample(independent: float) -> float:
@@ -186,8 +206,7 @@ def small_sample(independent: float) -> float:
 
 def _flags(cloud: Cloud, shape: CloudShape) -> tuple[str, ...]:
     flags = []
-    # The log of a round cloud's axis ratio has a standard deviation of about 1 / sqrt(n).
-    if -math.log(shape.axis_ratio) * math.sqrt(shape.independent) > ROUND_SIGMA:
+    if _is_long(cloud.covariance, shape.independent):
         flags.append("anisotropic_or_curved")
     if cloud.seen < LARGELY_SEEN:
         flags.append("cut")

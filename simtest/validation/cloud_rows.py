@@ -1,5 +1,6 @@
 """Rows of results for estimates of clouds: each against the base's highlight point that most of its spots belong to."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -56,24 +57,24 @@ def apart(
     return singles, clouds, failures
 
 
-def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> int | None:
-    """Return the index in `view.clouds` of the lit highlight point of the base that an estimate is of.
+def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> list[int]:
+    """Return the indices in `view.clouds` of the lit highlight points of the base that an estimate is of, one a light.
 
-    It is the one that most of the estimate's spots belong to, of any light; of several, the nearest to where the
-    estimate looks. None where they belong to none that is in view.
+    Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
+    estimate looks. That of most spots comes first. Empty where they belong to none that is in view.
     """
     if estimate.cloud is None or not view.clouds:
-        return None
-    points = estimate.cloud.points_px
-    votes = np.zeros(len(view.clouds), dtype=int)
-    for light in sorted({centre.light for centre in view.clouds}):
-        owners = regions.assign(session, np.full(len(points), light), points, list(view.clouds))
-        votes += np.bincount([n for n in owners if n is not None], minlength=len(votes))
-    votes[[not centre.lit for centre in view.clouds]] = 0
-    if not votes.any():
-        return None
-    best: list[int] = np.flatnonzero(votes == votes.max()).tolist()
-    return min(best, key=lambda n: float(np.hypot(*(view.clouds[n].bp_px - estimate.look_px))))
+        return []
+    points, centres = estimate.cloud.points_px, list(view.clouds)
+    votes: dict[int, int] = {}
+    for light in sorted({centre.light for centre in centres if centre.lit}):
+        owners = regions.assign(session, np.full(len(points), light), points, centres)
+        counts = Counter(n for n in owners if n is not None and centres[n].lit)
+        if counts:
+            best = [n for n, count in counts.items() if count == max(counts.values())]
+            nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))
+            votes[nearest] = counts[nearest]
+    return sorted(votes, key=lambda n: -votes[n])
 
 
 def cloud_rows(
@@ -88,13 +89,13 @@ def cloud_rows(
     made = []
     common = replace(common, target="base")
     for name, estimates in found.items():
-        taken = set()
+        taken: set[int] = set()
         for i, estimate in estimates:
-            number = match_cloud(session, view, estimate)
-            taken.add(number)
-            row = _row(session, common, view, whole, number)
+            numbers = match_cloud(session, view, estimate)
+            taken.update(numbers)
+            row = _row(session, common, view, whole, numbers[0] if numbers else None)
             row = estimate_row(replace(row, estimator=name, specularity=i), estimate)
-            made.append(row if number is None else _with_errors(session, row, estimate, view.clouds[number]))
+            made.append(_with_errors(session, row, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
         for number, cloud in whole.items():
@@ -114,17 +115,25 @@ def _row(
     return row if own is None else filled_with_cloud(row, own)
 
 
-def _with_errors(session: Session, row: ResultRow, estimate: Estimate, centre: HighlightPoint) -> ResultRow:
-    """Fill in the errors against the base's normal at its highlight point, and where the estimate looks."""
-    errors = angle_deg(estimate.candidates, centre.normal_base)
+def _with_errors(session: Session, row: ResultRow, estimate: Estimate, centres: Sequence[HighlightPoint]) -> ResultRow:
+    """Fill in the errors against the base's normal at its highlight point, and where the estimate looks.
+
+    Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
+    """
+    mean = np.mean([centre.normal_base for centre in centres], axis=0)
+    truth = mean / np.linalg.norm(mean)
+    errors = angle_deg(estimate.candidates, truth)
     look = session.exact_points(estimate.look_px[None], fine=False)
     at_look = float(angle_deg(estimate.normal, look.normal_base[0])) if look.valid[0] else None
     return replace(
         row,
+        truth_x=float(truth[0]),
+        truth_y=float(truth[1]),
+        truth_z=float(truth[2]),
         error_deg=float(errors[0]),
         error_base_deg=float(errors[0]),
         error_oracle_deg=float(errors.min()),
         error_look_deg=at_look,
         rank_correct=int(errors.argmin()),
-        mahalanobis2=mahalanobis2(estimate, centre.normal_base),
+        mahalanobis2=mahalanobis2(estimate, truth),
     )

@@ -86,6 +86,20 @@ class BaseFrame:
         """What reconstruction is told; a told distance is that of the nearest point."""
         return self.case.scene.calibration(float(self.distances.min()) if len(self.distances) else None)
 
+    def matched(self, points_px: Array, look_px: Array) -> list[int]:
+        """Return for each light the highlight point that most of a cloud's spots, shape (N, 2), px, belong to.
+
+        Of several, the nearest to where its estimate looks. Lights to whose points none belongs are left out.
+        """
+        votes, found = self.votes(points_px), []
+        gaps = np.linalg.norm(self.points_px - look_px, axis=1)
+        for light in np.unique(self.lights):
+            own = np.flatnonzero((self.lights == light) & (votes > 0))
+            if len(own):
+                best = own[votes[own] == votes[own].max()]
+                found.append(int(best[gaps[best].argmin()]))
+        return found
+
     def votes(self, points_px: Array) -> IntArray:
         """Return how many image points, shape (N, 2), belong to each highlight point, over all lights, shape (K,)."""
         columns, rows = (points_px / STRIDE).astype(int).T
