@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         load_camera,
         load_experiment,
         load_scene,
+        save_calibration,
         save_camera,
     )
 
@@ -51,7 +52,8 @@ _HOMES = {
     "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "ViewMask"),
     "simtest.reconstruction": ("Specularity", "reconstruct"),
     "simtest.spec": (
-        "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_camera",
+        "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_calibration",
+        "save_camera",
     ),
 }  # fmt: skip
 _named, _names = lazy_names(__name__, _HOMES)
@@ -80,6 +82,7 @@ __all__ = [
     "load_scene",
     "reconstruct",
     "render",
+    "save_calibration",
     "save_camera",
     "validate",
 ]

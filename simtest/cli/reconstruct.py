@@ -36,8 +36,11 @@ def reconstruct(
         Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
     ] = None,
     detector: Annotated[
-        Literal["auto", "colour", "peaks"],
-        Parameter(help="Find highlights by the tissue's colour, or as peaks; auto: by colour where there is any."),
+        str,
+        Parameter(
+            help="colour: by the tissue's colour; peaks; or the name of another package's. "
+            "auto: by colour where there is any."
+        ),
     ] = "auto",
     smoothing: Annotated[
         float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")

@@ -6,8 +6,8 @@ from simtest.cli.options import Out, SceneName, Settings, Variant
 def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
-    A sensor with a response, bits, saturation, vignetting or a full well also gets calibration.toml, and so does a
-    light at the camera whose emission is known (rig.emission_known).
+    calibration.toml holds what reconstruction is told of frame.png: camera, response, falloff, noise, lights, distance
+    and lobe, as far as the scene says that they are known; `simtest reconstruct --camera` reads it.
     """
     from simtest import api
     from simtest.cli.progress import progress_bar

@@ -25,9 +25,12 @@ UNIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class FrameResults:
-    """The results of one estimator: of each patch, and estimates of a frame that no patch takes."""
+    """The results of one estimator: of each patch, and estimates of a frame that no patch takes.
 
-    of_patches: list[Estimate | Failure]
+    A patch has None from an estimator whose estimates are of clouds of highlights.
+    """
+
+    of_patches: Sequence[Estimate | Failure | None]
     elsewhere: list[Estimate] = field(default_factory=list)
 
 
@@ -96,8 +99,10 @@ def run_in_frame(
     """Run an estimator on the patches of a frame or, if it is a `FrameEstimator`, on the frame.
 
     Estimates of a frame go to patches: each to the one that holds the pixel it looks at, the nearest to the patch's
-    peak first, one a patch. A patch without any gets a Failure ``no_estimate``. Where `estimate_frame` raises, or one
-    of its estimates is malformed, its results are refused as a whole: every patch gets that Failure.
+    peak first, one a patch. A patch without any gets a Failure ``no_estimate``. Those of clouds are of no single
+    highlight, so they go to no patch, and patches get none from an estimator that states clouds alone. Where
+    `estimate_frame` raises, or one of its estimates is malformed, its results are refused as a whole: every patch gets
+    that Failure.
     """
     camera = frame.calibration.camera
     if not isinstance(estimator, FrameEstimator):
@@ -109,7 +114,11 @@ def run_in_frame(
         results = _estimator_error(error)
     if isinstance(results, Failure):
         return FrameResults([patch if isinstance(patch, Failure) else results for patch in patches])
-    return _assigned(results, patches)
+    of_clouds = [estimate for estimate in results if estimate.cloud is not None]
+    if of_clouds and len(of_clouds) == len(results):
+        return FrameResults([None] * len(patches), of_clouds)
+    made = _assigned([estimate for estimate in results if estimate.cloud is None], patches)
+    return FrameResults(made.of_patches, [*made.elsewhere, *of_clouds])
 
 
 def _all_sound(returned: Sequence[object], camera: Camera) -> list[Estimate] | Failure:

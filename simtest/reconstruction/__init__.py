@@ -1,8 +1,8 @@
 """From a picture, film or array to normals and what is written of them; never sees the truth.
 
-image_io reads. pipeline leads from values to normals: linear light, a detector, the estimators. description makes
-records of them, which output_files, overlay, constraints and result_page write. picture does all this for one picture,
-sequence for a folder or a video, with tracking.
+image_io reads; choices says how a picture is taken where nobody tells it. pipeline leads from values to normals: linear
+light, a detector, the estimators. description makes records of them, which output_files, overlay, constraints and
+result_page write. picture does all this for one picture, sequence for a folder or a video, with tracking.
 """
 
 from typing import TYPE_CHECKING
@@ -10,19 +10,21 @@ from typing import TYPE_CHECKING
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from simtest.reconstruction.picture_detection import detect_in_picture
     from simtest.reconstruction.pipeline import (
         DEFAULT_ESTIMATORS,
+        Specularities,
         Specularity,
-        detect_in_picture,
         reconstruct,
         reconstruct_colour,
     )
 
 _HOMES = {
+    "simtest.reconstruction.picture_detection": ("detect_in_picture",),
     "simtest.reconstruction.pipeline": (
         "DEFAULT_ESTIMATORS",
+        "Specularities",
         "Specularity",
-        "detect_in_picture",
         "reconstruct",
         "reconstruct_colour",
     ),
@@ -30,6 +32,7 @@ _HOMES = {
 
 __all__ = [
     "DEFAULT_ESTIMATORS",
+    "Specularities",
     "Specularity",
     "detect_in_picture",
     "reconstruct",

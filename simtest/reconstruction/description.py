@@ -148,7 +148,9 @@ class SpecularityRecord:
 class PictureRecord:
     """A picture and all that was reconstructed in it.
 
-    `encoding` is the kind of the response that was undone; `assumed` is what nobody told, and how it was taken.
+    `encoding` is the kind of the response that was undone, `smoothing_px` the width of the Gaussian; `inferred` names
+    those of these and of detector, estimators and saturation level that nobody told, and `assumed` is what else nobody
+    told, and how it was taken.
     """
 
     image: str
@@ -161,6 +163,8 @@ class PictureRecord:
     other_highlights: Sequence[Highlight]
     reference: ComparisonRecord | None = None
     assumed: Sequence[Assumption] = ()
+    smoothing_px: float | None = None
+    inferred: Sequence[str] = ()
 
     @property
     def stated(self) -> StatedErrors | None:
@@ -178,12 +182,15 @@ class PictureRecord:
             "camera": describe_camera(self.camera),
             "encoding": self.encoding,
             "detector": self.detector,
+            "smoothing_px": self.smoothing_px,
+            "inferred": self.inferred,
             "view": _view_json(self.view),
             "warnings": self.warnings,
             "assumed": self.assumed,
             "stated": self.stated,
             "frame": FRAME,
             "specularities": self.specularities,
+            "clouds": [entry for spot in self.specularities for entry in _clouds_json(spot)],
             "other_highlights": others,
             "provenance": provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),
@@ -214,7 +221,7 @@ def _describe(
     drawings = {
         name: Drawing(
             [(t, np.round(points, 3).tolist()) for t, points in result.contours(patch)],
-            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
+            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes] + _cloud_outline(result, camera),
         )
         for name, result in estimates.items()
         if isinstance(result, Estimate)
@@ -234,6 +241,33 @@ def _view_json(view: View) -> JsonObject | None:
     contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
     return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
+
+
+def _cloud_outline(result: Estimate, camera: Camera) -> list[Points]:
+    """Return the outline of an estimate's cloud, px, as curves to draw; none where it has no cloud."""
+    if result.cloud is None:
+        return []
+    look = camera.unproject(result.look_px)
+    return [drawable(camera.project(result.cloud.outline(result.normal, look)))]
+
+
+def _clouds_json(spot: SpecularityRecord) -> list[JsonObject]:
+    """Describe the clouds of highlights that estimates of a specularity stand on."""
+    return [
+        {
+            "specularity": spot.id,
+            "estimator": name,
+            "highlights": len(cloud.points_px),
+            "points_px": np.round(cloud.points_px, 2),
+            "covariance": cloud.covariance,
+            "axis_ratio": cloud.axis_ratio,
+            "seen": cloud.seen,
+            "slope_deg": {end: float(np.degrees(getattr(cloud.slope, end))) for end in ("value", "low", "high")},
+            "outline": spot.drawings[name].curves[0] if name in spot.drawings else None,
+        }
+        for name, result in spot.normals.items()
+        if (cloud := result.cloud) is not None
+    ]
 
 
 def _highlight_json(highlight: Highlight) -> JsonObject:

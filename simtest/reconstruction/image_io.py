@@ -14,6 +14,7 @@ from PIL import Image as PillowImage
 from PIL import UnidentifiedImageError
 
 from simtest.errors import InputError
+from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
 
@@ -28,16 +29,11 @@ def read_picture(path: Path) -> Image:
     Grey, RGB and RGBA are read; alpha is ignored. Raises `InputError` as `read_raw` does, and for other depths.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
-    largest = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}.get(picture.dtype.name)
-    if largest is None:
+    scaled = scale_picture(picture, shown(path))
+    if scaled is None:
         raise InputError(f"{shown(path)}: pixels are {picture.dtype}; must be 8 or 16 bits")
-    if picture.ndim == 3 and picture.shape[2] not in (1, 3, 4):
-        raise InputError(f"{shown(path)}: has {picture.shape[2]} channels; must have 1, 3 or 4")
-    scaled: Image = np.asarray(picture, dtype=np.float32) / np.float32(largest)
-    if scaled.ndim == 3 and scaled.shape[2] == 1:
-        scaled = scaled[:, :, 0]
-    # OpenCV's order of channels is BGR or BGRA.
-    return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, 2::-1])
+    # OpenCV's order of channels is BGR.
+    return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, ::-1])
 
 
 def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
@@ -85,14 +81,6 @@ def _check_size(path: Path) -> None:
 
 def _too_large(path: Path, size: str) -> str:
     return f"{shown(path)}: {size}; at most {MAX_PIXELS} px are allowed"
-
-
-def is_coloured(picture: Image) -> bool:
-    """Return whether a picture has colours: three channels that are not all the same."""
-    if picture.ndim != 3:
-        return False
-    red, green, blue = cv2.split(picture)
-    return bool(np.any(red != green) or np.any(green != blue))
 
 
 @dataclass(frozen=True)

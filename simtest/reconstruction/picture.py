@@ -1,22 +1,19 @@
 """One picture: its camera, how it is to be reconstructed, and the record of its normals."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from simtest.calibration import Calibration, Response
-from simtest.conventions import DEFAULT_SMOOTHING_PX
-from simtest.detection.colour import ColourDetector
-from simtest.detection.peaks import PeakDetector
+from simtest.calibration import Calibration
+from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.reconstruction.assumptions import assumptions, calibration_of_view
+from simtest.reconstruction.assumptions import calibration_of_view
+from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
-from simtest.reconstruction.image_io import is_coloured
-from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, SMOOTHING_BY_COLOUR_PX, run_pipeline
+from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
 
-DETECTORS = ("auto", "colour", "peaks")
 TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
@@ -41,9 +38,9 @@ class Options:
         those of linear values.
     every : bool
         Take highlights of every kind, and peaks that the border cuts or whose shape is not that of one point highlight.
-    detector : {"auto", "colour", "peaks"}
-        How highlights are found: by the tissue's colour, or as peaks of the mean of the channels. auto: by colour in
-        pictures that have any and are not linear.
+    detector : str
+        How highlights are found: colour (by the tissue's colour), peaks (of the mean of the channels), or the name of
+        another package's detector. auto: by colour in pictures that have any and are not linear.
     smoothing_px : float, optional
         Standard deviation of the Gaussian smoothing; default 1 px by colour, else 2 px.
     target : {"fine", "base"}
@@ -53,7 +50,8 @@ class Options:
     Raises
     ------
     InputError
-        If the camera is given twice or not at all, or detector or target is none of these.
+        If the camera is given twice or not at all, the target is none of these, or no detector of that name is
+        registered.
     """
 
     camera: Path | None = None
@@ -62,13 +60,16 @@ class Options:
     roi: tuple[int, int, int, int] | None = None
     encoding: str | None = None
     every: bool = False
-    detector: str = "auto"
+    detector: str = AUTO
     smoothing_px: float | None = None
     target: Target = "fine"
 
     def __post_init__(self) -> None:
-        if self.detector not in DETECTORS:
-            raise InputError(f"--detector {self.detector}: must be one of {', '.join(DETECTORS)}")
+        if self.detector != AUTO:
+            try:
+                load_detector(self.detector)
+            except InputError as error:
+                raise InputError(f"--{error}; auto chooses among those of simtest") from None
         if self.target not in TARGETS:
             raise InputError(f"--target {self.target}: must be one of {', '.join(TARGETS)}")
         if (self.camera is None) == (self.fov_deg is None):
@@ -87,7 +88,8 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
 def read_calibration(options: Options, picture: Image) -> tuple[Calibration, list[str]]:
     """Return the calibration of pictures of this size, and warnings about it.
 
-    Raises `InputError` if the camera's file is malformed, or states the response and the options do too.
+    What every picture has, an encoding and a largest value, is added where it is reconstructed. Raises `InputError` if
+    the camera's file is malformed, or states the response and the options do too.
     """
     if options.camera is not None:
         # Imported here: the models of files are slow to load, and a field of view needs none.
@@ -103,18 +105,6 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
     return calibration, cautions
 
 
-def _completed(calibration: Calibration, options: Options) -> Calibration:
-    """Add what every picture file has: an encoding, and a largest value, at which it is clipped."""
-    response = calibration.response or (Response() if options.encoding == "linear" else Response("srgb"))
-    level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
-    return replace(calibration, response=response, saturation_level=level)
-
-
-def default_estimators(calibration: Calibration) -> tuple[str, ...]:
-    """Return the names of the estimators that the calibration states enough for."""
-    return (*DEFAULT_ESTIMATORS, *(("bisector",) if calibration.priors.lights_mm else ()))
-
-
 def reconstruct_values(
     name: str, picture: Image, calibration: Calibration, options: Options, cautions: Sequence[str] = ()
 ) -> PictureRecord:
@@ -123,38 +113,22 @@ def reconstruct_values(
     Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
     the picture.
     """
-    assumed = assumptions(calibration, options.encoding, options.target)
-    calibration = _completed(calibration, options)
-    estimators = list(options.estimators or default_estimators(calibration))
-    detector = _detector(picture, calibration, options)
-    smoothing_px = SMOOTHING_BY_COLOUR_PX if detector == "colour" else DEFAULT_SMOOTHING_PX
-    if options.smoothing_px is not None:
-        smoothing_px = options.smoothing_px
-    finder = (ColourDetector if detector == "colour" else PeakDetector)(isolated=not options.every)
     # linear light, detect, estimate
-    made = run_pipeline(picture, calibration, finder, estimators, options.roi, smoothing_px, options.target)
+    made, choices = run_picture(
+        picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,
+        not options.every, options.target,
+    )  # fmt: skip
     # describe
     return PictureRecord(
         image=name,
         camera=calibration.camera,
-        encoding=calibration.response.kind if calibration.response else "linear",
-        detector=detector,
+        encoding=choices.encoding,
+        detector=choices.detector,
         view=made.detection.view,
         warnings=list(cautions),
         specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
-        assumed=assumed,
+        assumed=choices.assumed,
+        smoothing_px=choices.smoothing_px,
+        inferred=choices.inferred,
     )
-
-
-def _detector(picture: Image, calibration: Calibration, options: Options) -> str:
-    """Choose the detector of a picture by name."""
-    if options.detector == "colour" and (picture.ndim != 3 or options.roi is not None):
-        what = "--roi names the region" if picture.ndim == 3 else "the picture is grey"
-        raise InputError(f"--detector colour: {what}; must be peaks")
-    if options.roi is not None:
-        return "peaks"
-    linear = calibration.response is not None and calibration.response.kind == "linear"
-    if options.detector == "auto":
-        return "colour" if is_coloured(picture) and not linear else "peaks"
-    return options.detector

@@ -1,20 +1,17 @@
 """The pipeline from the values of a picture to normals: linear light, detect, estimate; one for grey and for colour."""
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Frame, Priors, Response
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
+from simtest.calibration import Calibration, Frame, Priors
+from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
-from simtest.detection.colour import ColourDetection, ColourDetector, detect_colour
+from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detection, Detector, load_detector
-from simtest.detection.peaks import PeakDetector
-from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
@@ -22,14 +19,23 @@ from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
+from simtest.reconstruction.assumptions import assumptions, calibration_of_view
+from simtest.reconstruction.choices import (
+    AUTO,
+    SMOOTHING_BY_COLOUR_PX,
+    Choices,
+    check_encoding,
+    choose_detector,
+    choose_smoothing,
+    complete,
+    untold,
+)
+from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
-
-SMOOTHING_BY_COLOUR_PX = 1.0
-"""Highlights of real pictures are small, and 2 px would round them."""
 
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
@@ -63,56 +69,148 @@ class Reconstruction:
     detection: Detection
 
 
+class Specularities(list[Specularity]):
+    """The specularities found in a frame, the brightest first, with how the frame was taken.
+
+    Attributes
+    ----------
+    detection : Detection
+        What the detector found, with highlights of other kinds and the view where it judges them.
+    choices : Choices
+        Encoding, detector, smoothing, estimators and priors; `choices.inferred` names those that nobody told.
+    """
+
+    def __init__(self, made: Reconstruction, choices: Choices) -> None:
+        super().__init__(made.specularities)
+        self.detection, self.choices = made.detection, choices
+
+
 def reconstruct(
     frame: npt.ArrayLike,
-    camera: Camera | Calibration,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator] = DEFAULT_ESTIMATORS,
+    camera: Camera | Calibration | float,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
     roi: tuple[int, int, int, int] | None = None,
-    smoothing_px: float = DEFAULT_SMOOTHING_PX,
+    smoothing_px: float | None = None,
     isolated: bool = True,
     detector: str | Detector | None = None,
     target: Target = "fine",
-) -> list[Specularity]:
+    encoding: str | None = None,
+) -> Specularities:
     """Reconstruct the normals at a frame's isolated specularities.
+
+    A frame of type uint8 or uint16 is a picture, and is taken as `simtest reconstruct` takes the same file: its values
+    are shares of 255 or 65535, sRGB-encoded unless the calibration states the response, and clipped at the largest one
+    (or at the calibration's saturation level); specularities are found by colour where it has any. A frame of real
+    numbers is linear light of any scale, or values as encoded where the calibration states the response, in which no
+    pixel counts as clipped unless the calibration states the level; specularities are found as peaks of the channels'
+    mean. What was told and what was inferred stands in the result's `choices`.
 
     Parameters
     ----------
     frame : array_like, shape (H, W) or (H, W, C)
-        Linear intensities of any scale, or values as encoded where the calibration states the response; channels are
-        averaged.
-    camera : Camera or Calibration
+        Channels are RGB (OpenCV reads BGR: reverse them); of a picture, alpha is left out; of real numbers there may be
+        any number of channels.
+    camera : Camera, Calibration or float
         Of the same size. What a calibration knows is undone before smoothing: the response, then vignetting and
-        emission.
+        emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
+        known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
-        Names as registered, or the estimators themselves by name.
+        Names as registered, or the estimators themselves by name; default circle_pose, brightest_point and cone_axis,
+        and in pictures all that the calibration states enough for (`default_estimators`).
     roi : tuple of int, optional
         Column, row, width, height of the one region of interest; default: regions detected in the frame.
-    smoothing_px : float
-        Standard deviation of the Gaussian smoothing, px, in [0, 50].
+    smoothing_px : float, optional
+        Standard deviation of the Gaussian smoothing, px, in [0, 50]; default 1 where found by colour, else 2.
     isolated : bool
         Detect only specularities whose isophote at t = 0.5 closes inside the frame and the camera's view mask, and
-        whose shape is that of one point highlight (`simtest.detection.peak_shape`).
+        whose shape is that of one point highlight (`simtest.detection.peak_shape`); by colour, no other kinds.
     detector : str or Detector, optional
-        Name as registered, or the detector itself; default `peaks`, to which alone `isolated` applies.
+        Name as registered, or the detector itself, to which `isolated` applies if it is one of the package; "auto": by
+        colour in frames that have colours and are not linear, else peaks. Default "auto" in pictures, else "peaks".
     target : {"fine", "base"}
         Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
         they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
+    encoding : {"srgb", "linear"}, optional
+        How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
+        picture too where they are said to be "srgb".
 
     Returns
     -------
-    list of Specularity
-        The brightest first; empty where the frame holds no isolated specularity. Estimates whose isophotes enclose
-        clipped pixels have the flag ``saturated``; those that reach to where too little light is left for the whole
-        correction, ``vignetted``.
+    Specularities
+        A list, the brightest first; empty where the frame holds no isolated specularity. Estimates whose isophotes
+        enclose clipped pixels have the flag ``saturated``; those that reach to where too little light is left for the
+        whole correction, ``vignetted``.
 
     Raises
     ------
     InputError
-        If the frame is no image, differs in size from the camera's calibration, or holds NaN or infinity; if an
-        argument is of the wrong kind or out of range.
+        If the frame is no image, differs in size from the camera's calibration, or holds NaN, infinity or integers of
+        another type, whose range nobody knows; if an argument is of the wrong kind or out of range.
     """
-    finder = PeakDetector(isolated) if detector is None else detector
-    return run_pipeline(frame, camera, finder, estimators, roi, smoothing_px, target).specularities
+    if isinstance(camera, int | float) and not isinstance(camera, bool):
+        height, width = image_size(frame)
+        camera = calibration_of_view(camera, width, height)
+    known = _calibration(camera)
+    check_encoding(encoding, known)
+    image, is_picture = check_frame(frame, known.camera, encoding)
+    if is_picture:
+        finder = AUTO if detector is None else detector
+        options = (encoding, finder, estimators, roi, smoothing_px, isolated, target)
+        return Specularities(*run_picture(image, known, *options))
+    # light of any scale, which has no largest value
+    finder = "peaks" if detector is None else detector
+    names = DEFAULT_ESTIMATORS if estimators is None else estimators
+    made, choices = _choose(image, known, finder, names, roi, smoothing_px, isolated, target)
+    inferred = untold(known, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators)
+    # Values that nobody called encoded are taken as linear: that is the rule for real numbers, and no guess.
+    assumed = assumptions(known, encoding or "linear", target)
+    return Specularities(made, replace(choices, inferred=inferred, assumed=tuple(assumed)))
+
+
+def run_picture(
+    picture: Image,
+    calibration: Calibration,
+    encoding: str | None = None,
+    detector: str | Detector = AUTO,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
+    roi: tuple[int, int, int, int] | None = None,
+    smoothing_px: float | None = None,
+    isolated: bool = True,
+    target: Target = "fine",
+) -> tuple[Reconstruction, Choices]:
+    """Reconstruct the normals of a picture, from a file or an array (see `reconstruct`).
+
+    The picture holds encoded values in [0, 1], float32, shape (H, W) or (H, W, 3). Raises `InputError` as
+    `reconstruct` does.
+    """
+    check_size(picture, calibration.camera)
+    # what every picture has: an encoding, and a largest value
+    known = complete(calibration, encoding)
+    names = default_estimators(known) if estimators is None else estimators
+    made, choices = _choose(picture, known, detector, names, roi, smoothing_px, isolated, target)
+    inferred = untold(
+        calibration, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators
+    )
+    assumed = assumptions(calibration, encoding, target)
+    return made, replace(choices, inferred=inferred, assumed=tuple(assumed))
+
+
+def _choose(
+    image: Image,
+    known: Calibration,
+    detector: str | Detector,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator],
+    roi: tuple[int, int, int, int] | None,
+    smoothing_px: float | None,
+    isolated: bool,
+    target: Target,
+) -> tuple[Reconstruction, Choices]:
+    """Choose detector and smoothing, and run the pipeline."""
+    name, finder = choose_detector(detector, image, known, roi is not None, isolated)
+    smoothing = choose_smoothing(smoothing_px, finder)
+    made = _run(image, known, finder, estimators, roi, smoothing, target)
+    kind = known.response.kind if known.response else "linear"
+    return made, Choices(kind, known.saturation_level, name, smoothing, tuple(estimators), known.priors)
 
 
 def reconstruct_colour(
@@ -146,40 +244,9 @@ def reconstruct_colour(
     return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
 
 
-@dataclass(frozen=True)
-class PictureDetection:
-    """What a colour picture shows: the part of it that is tissue, and its highlights."""
-
-    view: View
-    detection: ColourDetection
-
-
-def detect_in_picture(
-    picture: Image, response: Response | None = None, level: float = 1.0, seen: Mask | None = None
-) -> PictureDetection:
-    """Find the highlights of a colour picture, without a camera.
-
-    Parameters
-    ----------
-    picture : ndarray of float32, shape (H, W, 3)
-        RGB values as encoded, in [0, 1], of 16 bits at most.
-    response : Response, optional
-        How light became values; default sRGB.
-    level : float
-        Value at and above which a channel is clipped.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the camera's view mask; default: found in the picture.
-
-    Returns
-    -------
-    PictureDetection
-    """
-    # Detection by colour uses no angle, so any field of view serves.
-    camera = Camera.from_fov(60.0, picture.shape[1], picture.shape[0])
-    calibration = Calibration(camera, response=response or Response("srgb"), saturation_level=level)
-    frame = Frame(picture, calibration, SMOOTHING_BY_COLOUR_PX, seen=seen)
-    view = find_view(picture) if seen is None else View(seen)
-    return PictureDetection(view, detect_colour(frame.channels, frame.clipped, view.seen))
+def default_estimators(calibration: Calibration) -> tuple[str, ...]:
+    """Return the names of the estimators that the calibration states enough for."""
+    return (*DEFAULT_ESTIMATORS, *(("bisector",) if calibration.priors.lights_mm else ()))
 
 
 def run_pipeline(
@@ -191,18 +258,31 @@ def run_pipeline(
     smoothing_px: float,
     target: Target = "fine",
 ) -> Reconstruction:
-    """Reconstruct the normals of a picture with any detector (see `reconstruct` and `reconstruct_colour`)."""
+    """Reconstruct the normals of a frame with any detector; nothing is inferred (see `reconstruct`)."""
     calibration = _calibration(camera)
-    image = check_frame(picture, calibration.camera)
+    image, _ = check_frame(picture, calibration.camera)
+    return _run(image, calibration, load_detector(detector), estimators, roi, smoothing_px, target)
+
+
+def _run(
+    image: Image,
+    calibration: Calibration,
+    detector: Detector,
+    estimators: Sequence[str] | Mapping[str, AnyEstimator],
+    roi: tuple[int, int, int, int] | None,
+    smoothing_px: float,
+    target: Target,
+) -> Reconstruction:
+    """Run detector and estimators on a frame that has been checked."""
     number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
     if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
         raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    box = None if roi is None else _check_roi(roi)
+    box = None if roi is None else check_roi(roi)
     chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection = _detect(load_detector(detector), frame) if box is None else _cut_region(frame, box)
+    detection = _detect(detector, frame) if box is None else _cut_region(frame, box)
     # estimate
     made = _estimate(detection, chosen)
     return made if target == "fine" else _at_base(made, calibration.priors)
@@ -258,10 +338,14 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     rounded_px = SMALL_RADIUS * frame.smoothing_px
     small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
-        estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
+        own = {name: each.of_patches[i] for name, each in made.items()}
+        estimates = {
+            name: _flagged(result, patch, limited, small[i]) for name, result in own.items() if result is not None
+        }
         result.specularities.append(Specularity(region, patch, estimates))
     undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
-    result.specularities.extend(undetected)
+    # Clouds stand last.
+    result.specularities.extend(sorted(undetected, key=_is_of_cloud))
     return result
 
 
@@ -280,12 +364,24 @@ def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
     return replace(made, specularities=based)
 
 
+def _is_of_cloud(specularity: Specularity) -> bool:
+    return any(isinstance(e, Estimate) and e.cloud is not None for e in specularity.estimates.values())
+
+
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
-    """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
+    """Return the specularity of a frame estimator's result that no patch takes: it has none.
+
+    Its region is one pixel, or the box around a cloud's highlights.
+    """
     height, width = frame.encoded.shape[:2]
     x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
-    no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
-    return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    if estimate.cloud is None:
+        no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
+        return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    low, high = (end(estimate.cloud.points_px, axis=0).astype(int).tolist() for end in (np.min, np.max))
+    box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
+    no_patch = Failure(Reason.NO_PEAK, f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one")
+    return Specularity(Region(box, (x, y), None), no_patch, {name: estimate})
 
 
 def _flagged(
@@ -309,7 +405,7 @@ def _flagged(
     return replace(result, flags=(*result.flags, *flags)) if flags else result
 
 
-def _calibration(camera: Camera | Calibration) -> Calibration:
+def _calibration(camera: object) -> Calibration:
     if isinstance(camera, Calibration):
         return camera
     if not isinstance(camera, Camera):
@@ -321,41 +417,3 @@ def _check_names(names: Sequence[str]) -> Sequence[str]:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
     return names
-
-
-def _check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Return a region as four plain integers; that it lies inside the frame is checked where it is cut."""
-    try:
-        x, y, width, height = (operator.index(value) for value in roi)
-    except (TypeError, ValueError):
-        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
-    return x, y, width, height
-
-
-def check_frame(frame: npt.ArrayLike, camera: Camera) -> Image:
-    """Return a frame as float32 values, shape (H, W) or (H, W, C); raise `InputError` where it does not fit."""
-    try:
-        given = np.asarray(frame)
-    except (TypeError, ValueError):
-        raise InputError(
-            "frame: must be an array of numbers; its rows differ in length or hold something else"
-        ) from None
-    if given.dtype.kind not in "biuf":
-        raise InputError(f"frame holds values of type {given.dtype}: must be an array of real numbers")
-    # What float32 cannot hold becomes infinite and is refused below.
-    with np.errstate(all="ignore"):
-        image = given.astype(np.float32)
-    if image.ndim not in (2, 3) or image.size == 0:
-        raise InputError(f"frame has shape {image.shape}: must be (H, W) or (H, W, C)")
-    if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
-            "the size of the camera's calibration"
-        )
-    # The channels' mean may be beyond what float32 holds.
-    with np.errstate(all="ignore"):
-        finite = np.isfinite(image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32))
-    if not finite.all():
-        bad = int(np.count_nonzero(~finite))
-        raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
-    return image

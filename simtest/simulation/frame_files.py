@@ -1,5 +1,6 @@
 """Writes a labelled frame: picture, radiance, ground truth, and what reconstruction may know of it."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import Calibration, Response
 from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
@@ -16,12 +18,13 @@ from simtest.runtime.files import Json, make_folder, write_atomically, write_jso
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
-from simtest.spec import Scene, camera_toml, describe_camera
+from simtest.spec import Scene, calibration_toml, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
-from simtest.spec.toml_files import toml_tables
 
 FIELDS = {
     "frame.png": "sRGB-encoded picture of the sensor's frame, clipped to full scale",
+    "calibration.toml": "what reconstruction is told of frame.png: simtest reconstruct frame.png --camera "
+    "calibration.toml",
     "radiance.exr": "linear radiance, power per steradian over mm^2",
     "depth_mm": "distance along the ray from the camera centre, mm; NaN off the surface, as in all fields below",
     "position_mm": "surface point, camera frame (x right, y down, z forward), mm",
@@ -61,11 +64,13 @@ MOTION_FIELD = (
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml; calibration.toml where more is known.
+    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml and calibration.toml.
 
     The folder is made if need be; `InputError` is raised if it cannot be written. Returns the files.
     """
-    files = [out / name for name in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")]
+    names = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml")
+    files = [out / name for name in names]
+    calibration = calibration_toml(picture_calibration(frame.calibration, frame.scene.sensor), _note(frame.scene))
     make_folder(out)
     try:
         write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
@@ -73,19 +78,10 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
         write_json(files[3], _description(frame))
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
-        if _is_calibrated(frame.scene):
-            files.append(out / "calibration.toml")
-            write_atomically(files[5], lambda part: part.write_text(_calibration_file(frame.scene), encoding="utf-8"))
+        write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
     return files
-
-
-def _is_calibrated(scene: Scene) -> bool:
-    """Return whether more is known of a frame than its camera."""
-    sensor, emission = scene.sensor, scene.rig.known_emission()
-    vignetted = not sensor.vignetting.model().is_uniform
-    return sensor.clips or sensor.full_well is not None or vignetted or emission is not None
 
 
 def _png_bits(sensor: Sensor) -> int:
@@ -93,24 +89,30 @@ def _png_bits(sensor: Sensor) -> int:
     return 16 if sensor.encodes and (sensor.bits or 16) > 8 else 8
 
 
-def _calibration_file(scene: Scene) -> str:
-    """Return the calibration file of frame.png, as `simtest reconstruct --camera` reads it."""
-    sensor = scene.sensor
-    # Only what the scene says is known (`sensor.*_known`).
-    stated: dict[str, dict[str, Json]] = {"camera": scene.camera.still.model_dump(exclude_none=True)}
-    if not sensor.encodes:
-        stated["response"] = {"type": "srgb"}
-    else:
-        stated["response"] = sensor.response.model_dump() if sensor.response_known else {"type": "linear"}
-    if sensor.vignetting_known and not sensor.vignetting.model().is_uniform:
-        stated["vignetting"] = sensor.vignetting.model_dump()
-    if (profile := scene.rig.known_emission()) is not None:
-        stated["emission"] = profile.model_dump()
-    # Noise and quantisation.
-    electrons = {"full_well": sensor.full_well, "read_noise": sensor.read_noise} if sensor.full_well else {}
-    bits = (sensor.bits or _png_bits(sensor)) if sensor.encodes else 8
-    stated["sensor"] = {**electrons, "bits": bits, "saturation_level": 1.0}
-    return "# What is known of frame.png; pixel centres at integer + 0.5.\n" + toml_tables(stated)
+def picture_calibration(told: Calibration, sensor: Sensor) -> Calibration:
+    """Return what is known of frame.png, from what reconstruction is told of the sensor's frame.
+
+    A frame that the sensor encodes is the picture: nothing is added but the 16 bits of one that it does not quantise.
+    Any other is encoded on writing, as sRGB of 8 bits, and clipped.
+    """
+    if sensor.encodes:
+        bits = sensor.bits or _png_bits(sensor)
+        return replace(told, noise=replace(told.noise, bits=bits))
+    response = Response("srgb")
+    noise = replace(told.noise, bits=_png_bits(sensor), response=response)
+    return replace(told, response=response, noise=noise, saturation_level=1.0)
+
+
+def _note(scene: Scene) -> str:
+    """Return the comment of calibration.toml: of which picture it is, and what the scene keeps back."""
+    sensor, rig, known = scene.sensor, scene.rig, scene.known
+    untold = {
+        "response (taken as linear)": sensor.response_known or not sensor.encodes,
+        "vignetting": sensor.vignetting_known, "emission": rig.emission_known, "lights": known.lights,
+        "lobe": known.lobe,
+    }  # fmt: skip
+    kept = ", ".join(name for name, told in untold.items() if not told)
+    return "Of frame.png" + (f"; the scene does not tell: {kept}." if kept else ".")
 
 
 def encoded_png(image: Image, sensor: Sensor) -> bytes:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
@@ -42,6 +43,8 @@ class LabelledFrame:
         The camera's pose, mm; the world is the surface's own frame.
     variant : str
         Mitsuba variant.
+    calibration : Calibration
+        What reconstruction is told of camera, sensor, lights, distance and lobe.
     """
 
     scene: Scene
@@ -55,6 +58,7 @@ class LabelledFrame:
     full_scale: float
     world_from_camera: Array
     variant: str
+    calibration: Calibration
 
 
 def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
@@ -88,4 +92,5 @@ def make_frame(scene: Scene, variant: str | None = None, progress: Progress | No
         full_scale=view.full_scale,
         world_from_camera=session.surface.model_from_camera,
         variant=session.variant,
+        calibration=view.calibration,
     )

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from simtest.spec.calibration_file import load_calibration
+    from simtest.spec.calibration_file import load_calibration, save_calibration
     from simtest.spec.calibration_spec import CalibrationSpec
+    from simtest.spec.calibration_tables import calibration_toml
     from simtest.spec.camera_spec import CameraSpec, load_camera, save_camera
     from simtest.spec.camera_tables import camera_table, camera_toml, describe_camera
     from simtest.spec.dataset_recipe import Dataset, load_dataset
@@ -33,8 +34,9 @@ if TYPE_CHECKING:
     from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
 _HOMES = {
-    "simtest.spec.calibration_file": ("load_calibration",),
+    "simtest.spec.calibration_file": ("load_calibration", "save_calibration"),
     "simtest.spec.calibration_spec": ("CalibrationSpec",),
+    "simtest.spec.calibration_tables": ("calibration_toml",),
     "simtest.spec.camera_spec": ("CameraSpec", "load_camera", "save_camera"),
     "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
     "simtest.spec.dataset_recipe": ("Dataset", "load_dataset"),
@@ -73,6 +75,7 @@ __all__ = [
     "Surface",
     "Uniform",
     "apply_settings",
+    "calibration_toml",
     "camera_table",
     "camera_toml",
     "describe_camera",
@@ -85,6 +88,7 @@ __all__ = [
     "load_scene",
     "parse_settings",
     "read_toml",
+    "save_calibration",
     "save_camera",
     "scene_from_dict",
 ]

@@ -1,9 +1,11 @@
-"""Reads calibration files: a camera, and what is known beside it."""
+"""Reads and writes calibration files: a camera, and what is known beside it."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 from simtest.calibration import Calibration
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, is_toml, load_camera
 from simtest.spec.spec_model import validate
 from simtest.spec.toml_files import read_toml
@@ -43,3 +45,34 @@ def load_calibration(path: str | Path) -> Calibration:
 
     # The camera's own table has been read, by its own rules.
     return validate(CalibrationSpec, {**data, "camera": {}}, str(path)).calibration(camera)
+
+
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """Write a calibration file that `load_calibration` reads back as the same calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What to write; what it does not know is left out.
+    path : str or Path
+        The file, TOML; replaced if it exists.
+
+    Raises
+    ------
+    InputError
+        If the calibration holds what no file states (such as a log-uniform distance), or the file cannot be written.
+    """
+    path = Path(path)
+    if not isinstance(calibration, Calibration):
+        raise InputError(f"calibration is a {type(calibration).__name__}: must be a simtest.Calibration")
+    if not is_toml(path):
+        raise InputError(f"{shown(path)}: a calibration is TOML, not {path.suffix}; name it .toml")
+    # Imported on demand: reading needs neither.
+    from simtest.runtime.files import write_atomically
+    from simtest.spec.calibration_tables import calibration_toml
+
+    text = calibration_toml(calibration)
+    try:
+        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{shown(path)}: cannot be written ({error.strerror})") from error

@@ -41,6 +41,12 @@ def _check_interval(name: str, interval: Interval | float | None, above: float |
 class SensorCalibration(Spec):
     """What is known of the sensor's noise and range."""
 
+    noise_sigma: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="standard deviation of white noise, share of full scale, at least; default as the frame shows",
+    )
     full_well: FullWell | None = Field(None, description="electrons at full scale")
     read_noise: ReadNoise = Field(0.0, description="standard deviation, electrons")
     bits: Bits | None = Field(None, description="of the values")
@@ -110,6 +116,12 @@ class SurfaceCalibration(Spec):
     """What is known of the surface's lobe and relief."""
 
     phong_exponent: float | None = Field(None, gt=0, le=1e5, description="roughness exponent n; default not known")
+    lobe_curvature: float | None = Field(
+        None,
+        gt=0,
+        le=1e9,
+        description="instead of phong_exponent: -(log f)'' of the lobe f where normal and view agree, rad^-2",
+    )
     relief_slope_deg: Annotated[float, Field(ge=0, le=45)] | Interval | None = Field(
         None,
         description="slope of the relief an axis, deg: a number, or the interval that it lies in; default [0, 8]",
@@ -117,6 +129,8 @@ class SurfaceCalibration(Spec):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
+        if self.phong_exponent is not None and self.lobe_curvature is not None:
+            raise ValueError("phong_exponent and lobe_curvature exclude each other; give one of them")
         _check_interval("relief_slope_deg", self.relief_slope_deg)
         return self
 
@@ -142,7 +156,7 @@ class CalibrationSpec(Spec):
         # A response that is not stated counts as linear in the noise model, but stays unknown in the calibration.
         response = self.response.model() if self.response is not None else None
         sensor = self.sensor
-        noise = NoiseModel(0.0, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
+        noise = NoiseModel(sensor.noise_sigma, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
         falloff = (self.vignetting.model(), self.emission.model())
         return Calibration(camera, response, *falloff, noise, sensor.saturation_level, self.priors())
 
@@ -154,7 +168,7 @@ class CalibrationSpec(Spec):
             distance = Normal(rig.distance_mm, rig.distance_sd_mm)
         # A falloff that neither table states is still in the frame.
         states_falloff = bool(self.model_fields_set & {"vignetting", "emission"})
-        lobe = None
+        lobe = None if surface.lobe_curvature is None else exactly(surface.lobe_curvature)
         if surface.phong_exponent is not None:
             # Imported here: the reflectances are slower to load than the whole calibration.
             from simtest.spec.reflectance import PhongReflectance

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera
@@ -508,6 +509,9 @@ FRAMES = {
     "nothing": (None, "frame holds values of type object: must be an array of real numbers"),
     "complex": (SPOT * 1j, "frame holds values of type complex128: must be an array of real numbers"),
     "dates": (np.zeros((HEIGHT, WIDTH), "datetime64[s]"), "frame holds values of type datetime64[s]"),
+    "integers of no range": (np.zeros((HEIGHT, WIDTH), int), "integers of type int64, whose range is not known"),
+    "a picture of two channels": (np.zeros((HEIGHT, WIDTH, 2), np.uint8), "frame: has 2 channels; must have 1, 3 or 4"),
+    "a picture of another size": (np.zeros((5, 6, 3), np.uint16), "frame is 6 x 5 px: must be 32 x 24"),
 }  # fmt: skip
 
 
@@ -536,6 +540,18 @@ ARGUMENTS = {
     "estimator twice": ({"estimators": ["cone_axis"] * 2}, "estimator 'cone_axis': given twice"),
     "estimators one name": ({"estimators": "cone_axis"}, "estimators = 'cone_axis': must be a list of names"),
     "estimators numbers": ({"estimators": [5]}, "estimators = [5]: must be a list of names"),
+    "encoding unknown": ({"encoding": "rec709"}, "encoding = 'rec709': must be one of srgb, linear, or None"),
+    "encoding of large values": ({"encoding": "srgb", "frame": 255 * SPOT}, "encoded real values must lie in [0, 1]"),
+    "encoding told twice": (
+        {"encoding": "srgb", "camera": Calibration(EYE, Response("gamma", 2.2))},
+        "encoding = 'srgb': the calibration states the response; give one of them",
+    ),
+    "detector unknown": ({"detector": "magic"}, "detector 'magic': not installed; allowed: "),
+    "detector of a region": ({"detector": "colour", "roi": (0, 0, 9, 9)}, "the region of interest is named"),
+    "detector of grey": ({"detector": "colour"}, "detector colour: the picture is grey; must be peaks"),
+    "field of view out of range": ({"camera": 200.0}, "200"),
+    "field of view of no image": ({"camera": 60.0, "frame": [1.0, 2.0]}, "where the camera is a field of view"),
+    "camera a truth": ({"camera": True}, "camera is a bool: must be a simtest.Camera"),
     "camera a matrix": ({"camera": np.eye(3)}, "camera is a ndarray: must be a simtest.Camera"),
 }
 
@@ -543,7 +559,7 @@ ARGUMENTS = {
 @pytest.mark.parametrize("name", ARGUMENTS)
 def test_arguments_of_reconstruct(name):
     given, fragment = ARGUMENTS[name]
-    refused(lambda: reconstruct(SPOT, **{"camera": EYE, **given}), fragment)
+    refused(lambda: reconstruct(**{"frame": SPOT, "camera": EYE, **given}), fragment)
 
 
 NOTHING_TO_SEE = {
@@ -552,7 +568,7 @@ NOTHING_TO_SEE = {
     "all saturated": np.ones((HEIGHT, WIDTH)),
     "all 255": np.full((HEIGHT, WIDTH, 3), 255, np.uint8),
     "negative": -SPOT - 1,
-    "chequered": (_ROWS + _COLUMNS) % 2,
+    "chequered": (_ROWS + _COLUMNS) % 2.0,
     "ramp": _COLUMNS / WIDTH,
     "noise": np.random.default_rng(0).random((HEIGHT, WIDTH)),
 }

@@ -251,9 +251,8 @@ def frames(tmp_path_factory):
     for process, name in zip(children, ("first", "second"), strict=True):
         output, errors = process.communicate(timeout=120)
         assert (process.returncode, errors) == (0, "")
-        assert output.split() == [
-            f"{name}/{file}" for file in ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml")
-        ]
+        written = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml")
+        assert output.split() == [f"{name}/{file}" for file in written]
     return folder / "first", folder / "second"
 
 

@@ -63,9 +63,9 @@ def test_tissue_without_highlights_shows_none(tissue):
     ("specular", "expected"),
     [
         (lobe(160, 120, 16.0, 2.5, 0.4), Kind.ELONGATED),
-        (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.MERGED),
+        (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.CLUSTER),
         (lobe(3, 120, 5.0), Kind.BORDER),
-        (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.MERGED),
+        (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.CLUSTER),
     ],
 )
 def test_other_kinds_are_told_apart(specular, expected):

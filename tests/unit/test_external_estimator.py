@@ -93,6 +93,7 @@ from simtest.detection import load_detector
 from simtest.detection.detector import DETECTORS
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.registry import load_estimators
+from simtest.reconstruction.picture import Options, reconstruct_values
 
 camera = simtest.Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
 x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
@@ -119,10 +120,17 @@ with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     load_estimators(["other_plain"])
 seen = Frame(frame, Calibration(camera), 2.0)
+asked = Options(fov_deg=60.0, detector="other_middle", estimators=("brightest_point",))
+taken = reconstruct_values("frame", frame, Calibration(camera), asked)
+try:
+    Options(fov_deg=60.0, detector="nobody")
+except simtest.InputError as error:
+    refused["--detector nobody"] = str(error)
 print(json.dumps({
     "available": ESTIMATORS.names(), "detectors": DETECTORS.names(), "said": said, "refused": refused,
     "distributions": ESTIMATORS.distributions(["other_axis", "Other-Core:cone_axis", "nobody"]),
     "deprecated": [[warning.category.__name__, str(warning.message)] for warning in told],
+    "taken": [taken.detector, [list(spot.box_px) for spot in taken.specularities]],
     "middle": list(load_detector("other_middle").detect(seen, camera, Priors()).regions[0].box),
 }))
 """
@@ -160,6 +168,7 @@ def test_it_is_found_beside_those_of_simtest(answer):
     assert answer["available"] == sorted(answer["available"])
     assert {"other_middle", "peaks", "colour"} <= set(answer["detectors"])
     assert answer["middle"] == [30, 22, 60, 45]
+    assert answer["taken"] == ["other_middle", [[30, 22, 60, 45]]]
     found = {"estimator other_axis": "other-core 3.1", "estimator Other-Core:cone_axis": "other-core 3.1"}
     assert answer["distributions"] == found
 
@@ -204,11 +213,15 @@ def test_a_plain_function_is_told_to_be_of_the_old_form(answer):
 def test_a_broken_registration_is_refused_with_one_line(answer):
     refused = answer["refused"]
     assert set(refused) == {"other_missing", "other_constant", "nobody", "cone_axis", "nobody:cone_axis",
-                            "detector nobody", "detector other_constant"}  # fmt: skip
+                            "--detector nobody", "detector nobody", "detector other_constant"}  # fmt: skip
     assert "cannot be imported" in refused["other_missing"]
     assert "not callable" in refused["other_constant"]
     assert "other_axis" in refused["nobody"]
     assert "not installed" in refused["nobody:cone_axis"]
     assert "peaks" in refused["detector nobody"]
+    assert (
+        "detector 'nobody': not installed; allowed: colour, other_constant, other_middle, peaks"
+        in refused["--detector nobody"]
+    )
     assert "no object with a method detect" in refused["detector other_constant"]
     assert all("\n" not in message for message in refused.values())

@@ -38,6 +38,7 @@ PUBLIC = {
     "load_scene": "simtest.spec.scene",
     "reconstruct": "simtest.reconstruction.pipeline",
     "render": "simtest.api",
+    "save_calibration": "simtest.spec.calibration_file",
     "save_camera": "simtest.spec.camera_spec",
     "validate": "simtest.api",
 }

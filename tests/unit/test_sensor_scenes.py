@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from simtest.api import reconstruct_picture, render
+from simtest.calibration import Response
+from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
@@ -402,9 +404,8 @@ def test_known_emission_reads_back(tmp_path):
     """A cos^4 light at the camera and a plain sensor: the files alone undo the falloff."""
     described = scene(tilt=20.0, size=560, focal=406.0, rig={"lights": [{"profile": COS4}]})
     frame = render(described)
-    names = [path.name for path in write_frame(frame, tmp_path)]
-    assert names[-1] == "calibration.toml"
-    assert load_calibration(tmp_path / names[-1]).emission == described.calibration().emission
+    write_frame(frame, tmp_path)
+    assert load_calibration(tmp_path / "calibration.toml").emission == described.calibration().emission
     errors = {}
     for told in ("calibration.toml", "camera.toml"):
         _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", Options(tmp_path / told))
@@ -414,12 +415,18 @@ def test_known_emission_reads_back(tmp_path):
     assert errors["calibration.toml"] < LIMIT_DEG < 0.3 < errors["camera.toml"]
 
 
-def test_a_plain_sensor_writes_what_it_always_did(tmp_path):
+def test_the_picture_of_a_plain_sensor_is_calibrated_too(tmp_path):
     frame = render(scene({"noise_sigma": 0.02}, size=80, focal=80.0))
     names = [path.name for path in write_frame(frame, tmp_path)]
-    assert names == ["frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml"]
+    assert names == ["frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml"]
     assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
-    assert "encoding" not in json.loads((tmp_path / "frame.json").read_text())
+    described = json.loads((tmp_path / "frame.json").read_text())
+    assert "encoding" not in described
+    assert "calibration.toml" in described["fields"]
+    # frame.png itself is sRGB-encoded in 8 bits, whatever the sensor.
+    stated = load_calibration(tmp_path / "calibration.toml")
+    assert (stated.response, stated.noise.bits, stated.saturation_level) == (Response("srgb"), 8, 1.0)
+    assert stated.priors == frame.calibration.priors == frame.scene.calibration().priors
 
 
 def test_what_is_not_known_is_not_written(tmp_path):
@@ -428,6 +435,35 @@ def test_what_is_not_known_is_not_written(tmp_path):
     calibration = load_calibration(tmp_path / "calibration.toml")
     assert calibration.response.kind == "linear"
     assert calibration.falloff is None
+    # That nobody told it leaves a falloff of unknown power in the frame.
+    assert calibration.priors.falloff_power == UNTOLD_FALLOFF_POWER
+    said = (tmp_path / "calibration.toml").read_text().splitlines()[1]
+    assert said == "# Of frame.png; the scene does not tell: response (taken as linear), vignetting."
+
+
+def test_render_then_reconstruct_knows_its_light(tmp_path):
+    """Two lights aside of the camera: the folder's calibration tells them, its camera alone does not."""
+    rig = {"preset": "colonoscope_2", "radius_mm": 3.0}
+    surface = {"type": "plane", "distance_mm": 30.0, "tilt_deg": 20.0}
+    described = scene_from_dict({
+        "surface": surface, "rig": rig, "camera": {"width": 240, "height": 240, "fx": 240.0, "fy": 240.0},
+        "reflectance": {"type": "phong", "exponent": 600.0}, "sensor": {"bits": 8, "response": {"type": "srgb"}},
+        "known": {"distance_error": 0.0, "distance_sd": 0.1},
+    })  # fmt: skip
+    frame = render(described)
+    write_frame(frame, tmp_path)
+    stated = load_calibration(tmp_path / "calibration.toml")
+    assert stated == frame.calibration
+    assert len(stated.priors.lights_mm) == 2
+    assert stated.priors.distance_mm is not None
+    record, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "out", Options(tmp_path / "calibration.toml"))
+    truths = np.array([h.normal for h in frame.highlights if h.isolated])
+    assert len(record.specularities) == len(truths) == 2
+    for spot in record.specularities:
+        near, far = (
+            min(angle_deg(spot.normals[name].normal, truth) for truth in truths) for name in ("bisector", "cone_axis")
+        )
+        assert near < 0.1 < 2 < far
 
 
 def test_two_encodings_are_refused(tmp_path):

@@ -1,0 +1,245 @@
+"""A picture gives the same normals as a file and as an array: one rule says how its values are taken."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image as PillowImage
+from test_colour_detection import HEIGHT, WIDTH, lobe, picture
+
+import simtest
+from simtest.calibration import Calibration, Priors, Response, exactly, srgb_encode
+from simtest.detection.colour import ColourDetector
+from simtest.errors import Failure
+from simtest.geometry import Camera
+from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
+from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
+
+CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
+FRAMES = Path(__file__).resolve().parents[3] / "shared" / "data" / "frames"
+REAL = sorted(path.name for path in FRAMES.iterdir()) if FRAMES.is_dir() else []
+
+
+def tissue():
+    """RGB values of 8 bits, with two highlights."""
+    spots = sum(lobe(x, y, width, peak=0.5) for x, y, width in ((90, 70, 5.0), (230, 160, 6.0)))
+    return np.rint(255 * picture(spots)).astype(np.uint8)
+
+
+def by_file(path, tmp_path, camera, **options):
+    """Reconstruct a file as the command does, without writing what it writes."""
+    simtest.save_camera(camera, tmp_path / "camera.toml")
+    told, values = Options(tmp_path / "camera.toml", **options), read_picture(path)
+    return reconstruct_values(str(path), values, read_calibration(told, values)[0], told)
+
+
+def same(found, record):
+    """Check that an array's specularities are those of a file, to the last bit."""
+    assert len(found) == len(record.specularities)
+    for spot, told in zip(found, record.specularities, strict=True):
+        assert spot.region.box == told.box_px
+        assert list(spot.estimates) == list(told.estimates)
+        for name, estimate in spot.estimates.items():
+            other = told.estimates[name]
+            if isinstance(estimate, Failure):
+                assert estimate == other
+                continue
+            np.testing.assert_array_equal(estimate.candidates, other.candidates)
+            np.testing.assert_array_equal(estimate.look_px, other.look_px)
+            np.testing.assert_array_equal(estimate.covariance, other.covariance)
+            assert estimate.flags == other.flags
+    for name in ("encoding", "detector", "smoothing_px", "inferred", "assumed"):
+        assert getattr(found.choices, name) == getattr(record, name), name
+
+
+def stored(values, path):
+    """Write RGB or grey values as PNG; return what OpenCV reads, in RGB."""
+    cv2.imwrite(str(path), values if values.ndim == 2 else values[:, :, ::-1])
+    read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return read if read.ndim == 2 else read[:, :, ::-1]
+
+
+@pytest.mark.skipif(not REAL, reason="no real frames in ../shared/data/frames")
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["middle", "whole"])
+@pytest.mark.parametrize("name", REAL)
+def test_real_frames_as_file_and_as_array(name, whole, tmp_path):
+    with PillowImage.open(FRAMES / name) as opened:
+        values = np.asarray(opened.convert("RGB"))
+    if not whole:
+        top, left = (size // 2 - 90 for size in values.shape[:2])
+        values = values[top : top + 180, left : left + 180]
+    camera = Camera.from_fov(70.0, values.shape[1], values.shape[0])
+    # As PNG: decoders of JPEG differ in the last bit.
+    read = stored(values, tmp_path / "frame.png")
+    np.testing.assert_array_equal(read, values)
+    record = by_file(tmp_path / "frame.png", tmp_path, camera)
+    found = reconstruct(values, camera)
+    same(found, record)
+    assert len(found) > 0 or "no_highlight" in name or not whole
+    assert found.choices.detector == "colour"
+
+
+@pytest.mark.skipif(not REAL, reason="no real frames in ../shared/data/frames")
+def test_a_real_frame_in_other_depths(tmp_path):
+    """16 bits and grey of a real frame: cropped, for time."""
+    colours = read_picture(FRAMES / "fig7_a.bmp")[100:300, 100:300]
+    grey = cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY)
+    camera = Camera.from_fov(40.0, 200, 200)
+    for values, largest, kind in ((colours, 65535, np.uint16), (grey, 255, np.uint8), (grey, 65535, np.uint16)):
+        read = stored(np.rint(values * largest).astype(kind), tmp_path / "frame.png")
+        assert read.dtype == kind
+        found = reconstruct(read, camera)
+        same(found, by_file(tmp_path / "frame.png", tmp_path, camera))
+        assert found.choices.detector == ("colour" if values.ndim == 3 else "peaks")
+        assert len(found) > 0
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", ["colour", "alpha", "grey", "one channel", "three alike"])
+def test_depths_and_channels(kind, shape, tmp_path):
+    colours = tissue().astype(kind) * (257 if kind is np.uint16 else 1)
+    grey = colours[:, :, 0]
+    values = {
+        "colour": colours, "grey": grey, "one channel": grey[:, :, None], "three alike": np.dstack([grey] * 3),
+        "alpha": np.dstack([colours, np.full_like(grey, 7)]),
+    }[shape]  # fmt: skip
+    written = (
+        values[:, :, [2, 1, 0, *range(3, values.shape[2])]] if values.ndim == 3 and shape != "one channel" else values
+    )
+    cv2.imwrite(str(tmp_path / "frame.png"), written)
+    found = reconstruct(values, CAMERA)
+    same(found, by_file(tmp_path / "frame.png", tmp_path, CAMERA))
+    assert found.choices.detector == ("colour" if shape in ("colour", "alpha") else "peaks")
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"encoding": "linear"}, {"detector": "peaks"}, {"detector": "simtest:colour"}, {"smoothing_px": 1.5},
+        {"roi": (60, 40, 60, 60)}, {"target": "base"}, {"estimators": ("curved", "cone_axis")},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_is_told_is_told_alike(told, tmp_path):
+    values = tissue()
+    stored(values, tmp_path / "frame.png")
+    found = reconstruct(values, CAMERA, **told)
+    same(found, by_file(tmp_path / "frame.png", tmp_path, CAMERA, **told))
+    assert not set(told) & set(found.choices.inferred)
+
+
+def test_a_field_of_view_is_told_alike(tmp_path):
+    """Focal length, centre and lens are guesses in both, and no exact camera in one of them."""
+    values = tissue()
+    stored(values, tmp_path / "frame.png")
+    told = Options(fov_deg=60.0)
+    picture_values = read_picture(tmp_path / "frame.png")
+    record = reconstruct_values("frame.png", picture_values, read_calibration(told, picture_values)[0], told)
+    found = reconstruct(values, 60.0)
+    same(found, record)
+    assert "focal length" in [each.what for each in found.choices.assumed]
+    assert "focal length" not in [each.what for each in reconstruct(values, CAMERA).choices.assumed]
+
+
+def test_all_peaks_alike(tmp_path):
+    values = tissue()
+    stored(values, tmp_path / "frame.png")
+    same(reconstruct(values, CAMERA, isolated=False), by_file(tmp_path / "frame.png", tmp_path, CAMERA, every=True))
+
+
+def test_the_calibration_states_what_is_not_inferred():
+    calibration = Calibration(
+        CAMERA, Response("gamma", 2.0), saturation_level=0.9,
+        priors=Priors(((4.0, 0.0, 0.0),), exactly(40.0)),
+    )  # fmt: skip
+    choices = reconstruct(tissue(), calibration).choices
+    assert (choices.encoding, choices.saturation_level) == ("gamma", 0.9)
+    assert choices.inferred == ("detector", "smoothing_px", "estimators")
+    assert choices.priors == calibration.priors
+    assert [each.what for each in choices.assumed] == ["falloff towards the border"]
+    # An array gets the same default estimators as a file: lights and a distance are enough for one more.
+    assert choices.estimators[-1] == "bisector"
+
+
+def test_the_choices_say_what_was_inferred():
+    choices = reconstruct(tissue(), CAMERA).choices
+    assert choices.inferred == ("encoding", "saturation_level", "detector", "smoothing_px", "estimators")
+    assert str(choices) == (
+        "encoding srgb (inferred), clipped at 1 (inferred), detector colour (inferred), smoothing 1 px (inferred), "
+        "estimators circle_pose brightest_point cone_axis curved (inferred)"
+    )
+
+
+def test_real_numbers_stay_light_of_any_scale():
+    """The call that simulations make: nothing is decoded, nothing clipped, peaks of the channels' mean at 2 px."""
+    light = (tissue() / 255.0) ** 2.2
+    found = reconstruct(light, CAMERA)
+    choices = found.choices
+    assert (choices.encoding, choices.saturation_level, choices.detector) == ("linear", None, "peaks")
+    assert "response" not in [each.what for each in choices.assumed]
+    assert choices.smoothing_px == 2.0
+    (scaled,) = {len(reconstruct(1000 * light, CAMERA)), len(found)}
+    assert scaled == 2
+    explicit = reconstruct(light.mean(axis=2), CAMERA, ["cone_axis"], smoothing_px=2.0, detector="peaks")
+    for one, other in zip(found, explicit, strict=True):
+        np.testing.assert_allclose(one.estimates["cone_axis"].normal, other.estimates["cone_axis"].normal, atol=1e-6)
+
+
+def test_real_numbers_are_a_picture_where_that_is_said():
+    values = tissue()
+    found, plain = (reconstruct(v, CAMERA, **t) for v, t in ((values / 255.0, {"encoding": "srgb"}), (values, {})))
+    assert [s.region for s in found] == [s.region for s in plain]
+    told = {name: getattr(found.choices, name) for name in ("inferred", "assumed")}
+    assert found.choices == replace(plain.choices, **told)
+    assert "encoding" not in found.choices.inferred
+
+
+def test_by_colour_takes_pictures_of_any_depth():
+    values = tissue()
+    for other in (values / np.float32(255), values.astype(np.uint16) * 257):
+        boxes = [[s.region.box for s in reconstruct_colour(v, CAMERA, {}).specularities] for v in (values, other)]
+        assert boxes[0] == boxes[1]
+        assert len(boxes[0]) == 2
+
+
+def test_the_detector_that_is_given_decides_the_smoothing():
+    for detector, smoothing_px in (("colour", 1.0), (ColourDetector(isolated=False), 1.0), ("peaks", 2.0)):
+        assert reconstruct(tissue(), CAMERA, {}, detector=detector).choices.smoothing_px == smoothing_px
+
+
+def test_the_result_is_a_list_that_travels():
+    found = reconstruct(tissue(), CAMERA, ["brightest_point"])
+    assert isinstance(found, list)
+    again = pickle.loads(pickle.dumps(found))
+    assert len(again) == len(found) == 2
+    assert again.choices == found.choices
+    assert found.detection.view.seen is None
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([np.uint8, np.uint16]),
+    st.booleans(),
+    st.sampled_from([None, "srgb", "linear"]),
+)
+def test_any_picture_is_the_same_as_file_and_as_array(tmp_path_factory, seed, kind, coloured, encoding):
+    rng, folder = np.random.default_rng(seed), tmp_path_factory.mktemp("frame")
+    y, x = np.mgrid[:48, :64]
+    light = np.zeros((48, 64)) + 0.05
+    for cx, cy, width in zip(rng.uniform(8, 56, 3), rng.uniform(8, 40, 3), rng.uniform(1.5, 4, 3), strict=True):
+        light += rng.uniform(0.3, 1.2) * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2) / width**2)
+    light = light[:, :, None] * rng.uniform(0.6, 1, 3) if coloured else light
+    largest = np.iinfo(kind).max
+    values = np.rint(largest * srgb_encode(np.clip(light + rng.normal(0, 0.003, light.shape), 0, 1))).astype(kind)
+    read = stored(values, folder / "frame.png")
+    camera = Camera.from_fov(60.0, 64, 48)
+    found = reconstruct(read, camera, encoding=encoding)
+    same(found, by_file(folder / "frame.png", folder, camera, encoding=encoding))
