@@ -79,6 +79,9 @@ LEAK, LEAK_PX = 1.3, 4
 """An isophote at half height that holds more than this share of the spot's pixels, and this number on top, holds
 something else besides."""
 
+FOOT_REACH, FARTHEST_PX = 0.7, 10
+"""Clutter is looked for beyond this share of a radius from the isophote at half height, and no farther off."""
+
 EDGE_PX = 3
 """The picture's edge may cut a highlight within this distance."""
 
@@ -360,7 +363,12 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     around = cv2.dilate(bright.astype(np.uint8), _WIDE) == 0
     if np.count_nonzero(around) < MIN_AREA_PX:
         return 1.0, 0.0, 0.0
-    clutter = _ranked(specular[around], CLUTTER_SHARE) / spot.value
+    # The foot of a wide highlight reaches farther, and is no clutter.
+    far, reach = around, min(int(FOOT_REACH * np.sqrt(spot.area_px / np.pi)), FARTHEST_PX)
+    if reach > _WIDE.shape[0] // 2:
+        far = cv2.dilate(bright.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) == 0
+        far = far if np.count_nonzero(far) >= MIN_AREA_PX else around
+    clutter = _ranked(specular[far], CLUTTER_SHARE) / spot.value
     tissue = np.median(values[around], axis=0)
     own = np.median(linear[spot.crop][spot.mask], axis=0)
     brighter = _ranked(values[around].mean(axis=1), PALE_SHARE)
