@@ -26,6 +26,7 @@ class Reason(StrEnum):
 
     NO_LIGHT = "no_light"
     NO_PEAK = "no_peak"
+    CLUSTER = "cluster"
     NO_CLOSED_ISOPHOTE = "no_closed_isophote"
     TOO_FEW_POINTS = "too_few_points"
     NOT_AN_ELLIPSE = "not_an_ellipse"

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
-from simtest.detection.light_split import SplitLight
+from simtest.detection.light_split import BLOCKS, NEIGHBOURHOOD, SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
 from simtest.detection.spots import Spot
 from simtest.errors import Failure
@@ -21,6 +21,8 @@ from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
 from simtest.runtime.arrays import Index
 
 Box = tuple[int, int, int, int]
+_Fitted = tuple[Array, FittedConic]
+"""An isophote's points and its ellipse."""
 
 MIN_AREA_PX = 4
 """Fewer pixels tell nothing of their surroundings."""
@@ -59,21 +61,26 @@ gain, the light was reflected by tissue before."""
 UNCLIPPED = 0.85
 """Channels above this share of full scale may be partly clipped."""
 
-CLUTTER_PERCENTILE = 90.0
+CLUTTER_SHARE = 0.9
 CLUTTER = 0.2
 """Largest specular light, over the peak's, of nine tenths of the surroundings: instruments, pale folds and glistening
 patches have more."""
 
 PALE, PALE_WIDE, WIDE_PX = 0.6, 0.4, 200
-PALE_PERCENTILE = 75.0
+PALE_SHARE = 0.75
 """Where the brightest quarter of the surroundings is brighter than this share of a spot that has no highlight's shape
-(the second share from so many pixels on), the spot is pale tissue, unless more than the share that follows is white."""
+(the second share from so many pixels on), the spot is pale tissue, ..."""
 
-GLARING = 0.2
+GLARING, WIDEST, CLIPPED_CORE = 0.2, 0.5, 0.02
+"""... unless more than this share of it is white, and it is narrower than the second share of the neighbourhood that
+the tissue's colour is taken from (a wider one would be its own measure), or the third share of it is clipped."""
 
 LEAK, LEAK_PX = 1.3, 4
 """An isophote at half height that holds more than this share of the spot's pixels, and this number on top, holds
 something else besides."""
+
+FOOT_REACH, FARTHEST_PX = 0.7, 10
+"""Clutter is looked for beyond this share of a radius from the isophote at half height, and no farther off."""
 
 EDGE_PX = 3
 """The picture's edge may cut a highlight within this distance."""
@@ -186,9 +193,8 @@ def classify(
     """
     traced = [_traced(spot, smoothed, (clipped, white), seen) for spot in spots]
     # ellipses of all isophotes at once
-    fits = _fit([part for one in traced for part in one.sets])
-    step = len(NESTED_ISOVALUES)
-    return [_classified(one, fits[i * step : (i + 1) * step], linear, mask, light) for i, one in enumerate(traced)]
+    fits = _fit(traced)
+    return [_classified(one, fitted, linear, mask, light) for one, fitted in zip(traced, fits, strict=True)]
 
 
 def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | None) -> _Traced:
@@ -210,34 +216,43 @@ def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | N
     return _Traced(spot, sets, (left, top), _at_border(spot, smoothed.shape, seen), clipped, white)
 
 
-def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
-    """Fit ellipses to the borders of level sets; None where there is none or no ellipse fits."""
-    contours = [crossings([part]).points for part in sets if part is not None]
-    conics = fit_ellipses(contours)
-    fitted = iter(range(len(contours)))
-    made: list[FittedConic | None] = []
-    for part in sets:
-        conic = None if part is None else conics[next(fitted)]
-        made.append(None if isinstance(conic, Failure) else conic)
-    return made
+def _fit(traced: list[_Traced]) -> list[list[_Fitted]]:
+    """Fit ellipses to the isophotes of each spot, outwards in, up to the first that is open or no ellipse."""
+    contours: list[list[Array]] = []
+    for one in traced:
+        closed = [part for part in one.sets if part is not None]
+        found = crossings(closed) if closed else None
+        contours.append([] if found is None else found.each(found.points))
+    conics = iter(fit_ellipses([points for each in contours for points in each]))
+    fits: list[list[_Fitted]] = []
+    for one, each in zip(traced, contours, strict=True):
+        points = iter(each)
+        fitted = [None if part is None else (next(points), next(conics)) for part in one.sets]
+        made: list[_Fitted] = []
+        for pair in fitted:
+            if pair is None or isinstance(pair[1], Failure):
+                break
+            made.append((pair[0], pair[1]))
+        fits.append(made)
+    return fits
 
 
-def _classified(
-    one: _Traced, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight
-) -> Highlight | None:
+def _classified(one: _Traced, fits: list[_Fitted], linear: Image, mask: Mask, light: SplitLight) -> Highlight | None:
     """Return the highlight of a spot with its kind and score; None where it is pale tissue."""
     spot, area = one.spot, one.spot.area_px
     # measurements
     outline, box = _outline(one, light.specular.shape)
-    axis_ratio, residual, wander = _shape(one, fits)
+    axis_ratio, residual, wander = _shape(fits)
     tint, clutter, surround = _around(spot, box, linear, mask, light)
     kind = _kind(one, axis_ratio, residual, wander, tint, clutter)
-    glaring = one.white_px >= GLARING * area
-    pale = PALE if area < WIDE_PX else PALE_WIDE
-    if kind not in (*SINGLE, Kind.UNCLEAR) and surround > pale and not glaring:
-        return None
-    if kind is not Kind.BORDER and kind in SINGLE and _near_edge(outline, light.specular.shape):
-        kind = Kind.BORDER
+    if kind not in (*SINGLE, Kind.UNCLEAR):
+        wide = area >= WIDE_PX
+        across = 2 * np.sqrt(area / np.pi) / max(light.specular.shape)
+        glaring = one.white_px >= GLARING * area and (
+            across < WIDEST * NEIGHBOURHOOD / BLOCKS or one.clipped_px >= CLIPPED_CORE * area
+        )
+        if surround > (PALE_WIDE if wide else PALE) and not glaring:
+            return None
     # score
     score = 0.0
     if axis_ratio is not None and residual is not None and wander is not None:
@@ -283,13 +298,11 @@ def _kind(
 def _outline(one: _Traced, shape: tuple[int, ...]) -> tuple[Array, Box]:
     """Return the isophote at half height, or the border of the pixels, and the region of interest around them."""
     half, (x, y), (rows, columns) = one.sets[0], one.spot.corner, one.spot.mask.shape
-    outline = border_of(one.spot.mask) + one.spot.corner
-    if half is not None:
-        outline = half.polygon() + PIXEL_CENTRE + one.corner
+    own = border_of(one.spot.mask) + one.spot.corner if half is None else half.polygon() + PIXEL_CENTRE + one.corner
     x0, x1 = x - columns // 2 - MARGIN_PX, x + columns + columns // 2 + MARGIN_PX
     y0, y1 = y - rows // 2 - MARGIN_PX, y + rows + rows // 2 + MARGIN_PX
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])
-    return outline, (x0, y0, x1 - x0, y1 - y0)
+    return own, (x0, y0, x1 - x0, y1 - y0)
 
 
 def border_of(mask: Mask) -> Array:
@@ -326,21 +339,14 @@ def _near_edge(outline: Array, shape: tuple[int, ...]) -> bool:
     return bool((outline < EDGE_PX).any() or (outline > edge).any())
 
 
-def _shape(one: _Traced, fits: list[FittedConic | None]) -> tuple[float | None, float | None, float | None]:
+def _shape(fits: list[_Fitted]) -> tuple[float | None, float | None, float | None]:
     """Return axis ratio, residual and wander (see `Highlight`); None where the ellipse at half height is missing."""
-    half, contour = fits[0], one.sets[0]
-    if half is None or contour is None:
+    if not fits:
         return None, None, None
-    # ellipses outwards in, up to the first that is missing
-    centres, residuals = [], []
-    for conic, part in zip(fits, one.sets, strict=True):
-        if conic is None or part is None:
-            break
-        away = conic.relative_radii(crossings([part]).points) - 1
-        centres.append(conic.centre_and_matrix()[0])
-        residuals.append(float(np.sqrt(np.mean(away**2))))
-    low, high = np.linalg.eigvalsh(half.centre_and_matrix()[1])
-    wander = max(float(np.hypot(*(centre - centres[0]))) for centre in centres) * (low * high) ** 0.25
+    residuals = [float(np.sqrt(np.mean((conic.relative_radii(points) - 1) ** 2))) for points, conic in fits]
+    shapes = [conic.centre_and_matrix() for _, conic in fits]
+    low, high = np.linalg.eigvalsh(shapes[0][1])
+    wander = max(float(np.hypot(*(centre - shapes[0][0]))) for centre, _ in shapes) * (low * high) ** 0.25
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)
 
 
@@ -357,10 +363,15 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     around = cv2.dilate(bright.astype(np.uint8), _WIDE) == 0
     if np.count_nonzero(around) < MIN_AREA_PX:
         return 1.0, 0.0, 0.0
-    clutter = float(np.percentile(specular[around], CLUTTER_PERCENTILE)) / spot.value
+    # The foot of a wide highlight reaches farther, and is no clutter.
+    far, reach = around, min(int(FOOT_REACH * np.sqrt(spot.area_px / np.pi)), FARTHEST_PX)
+    if reach > _WIDE.shape[0] // 2:
+        far = cv2.dilate(bright.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) == 0
+        far = far if np.count_nonzero(far) >= MIN_AREA_PX else around
+    clutter = _ranked(specular[far], CLUTTER_SHARE) / spot.value
     tissue = np.median(values[around], axis=0)
     own = np.median(linear[spot.crop][spot.mask], axis=0)
-    brighter = float(np.percentile(values[around].mean(axis=1), PALE_PERCENTILE))
+    brighter = _ranked(values[around].mean(axis=1), PALE_SHARE)
     surround = brighter / max(float(own.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
     shown = (specular >= 0.3 * spot.value) & (values.max(axis=2) < UNCLIPPED)
@@ -369,3 +380,9 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     gain = values[shown].mean(axis=0) - tissue
     weakest, strongest = float(gain[tissue.argmin()]), float(gain[tissue.argmax()])
     return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter, surround
+
+
+def _ranked(values: Image, share: float) -> float:
+    """Return the value that a share of the values, shape (n,), does not exceed."""
+    k = int(share * (len(values) - 1))
+    return float(np.partition(values, k)[k])

@@ -8,7 +8,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import Highlight, classify
+from simtest.detection.blobs import SINGLE, Highlight, Kind, classify
 from simtest.detection.detector import Detection
 from simtest.detection.foreign import find_foreign
 from simtest.detection.light_split import SplitLight, fill, split_light
@@ -107,14 +107,14 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     if seen is not None:
         candidates &= seen
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
-    flat = _all_clipped(linear, clipped, PLATEAU)
+    flat, white = _all_clipped(linear, clipped)
     spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
     spots = _brighter_than_around(spots, smoothed + tissue, candidates, ratio, seen)
     bright = _pixels(spots, candidates.shape)
     foreign = find_foreign(bright)
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
-    made = classify(spots, smoothed, light, linear, bright, flat, _all_clipped(linear, clipped, GLARE), seen)
+    made = classify(spots, smoothed, light, linear, bright, flat, white, seen)
     kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
     # pixels that show a highlight
     mask = _pixels([spot for spot, _ in kept], candidates.shape)
@@ -184,12 +184,15 @@ def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:
     return feet
 
 
-def _all_clipped(linear: Image, clipped: Mask, share: float) -> Mask:
-    """Return where all channels are above a share of the least value that a clipped one has."""
+def _all_clipped(linear: Image, clipped: Mask) -> tuple[Mask, Mask]:
+    """Return where all channels are clipped, and where they are nearly so."""
     if not clipped.any():
-        return clipped
-    most = linear.max(axis=2)
-    return np.asarray(linear.min(axis=2) >= share * most[clipped].min())
+        return clipped, clipped
+    channels = cv2.split(np.ascontiguousarray(linear))
+    least = cv2.min(cv2.min(channels[0], channels[1]), channels[2])
+    # the least value that a clipped channel has
+    full = float(linear[clipped].max(axis=1).min())
+    return np.asarray(least >= PLATEAU * full), np.asarray(least >= GLARE * full)
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,7 @@ class ColourDetector:
     Parameters
     ----------
     isolated : bool
-        Leave out highlights of the other kinds.
+        Leave out highlights of the other kinds, but for clusters: these are told, and no estimator answers for them.
     """
 
     isolated: bool = True
@@ -212,8 +215,9 @@ class ColourDetector:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
-        taken = tuple(found.isolated if self.isolated else found.highlights)
-        others = tuple(highlight for highlight in found.highlights if self.isolated and not highlight.is_isolated)
+        kinds = (*SINGLE, Kind.CLUSTER) if self.isolated else tuple(Kind)
+        taken = tuple(highlight for highlight in found.highlights if highlight.kind in kinds)
+        others = tuple(highlight for highlight in found.highlights if highlight.kind not in kinds)
         specular = replace(frame, seen=view.seen, light=found.light.specular)
         return Detection(tuple(highlight.region for highlight in taken), specular, taken, others, view)
 

@@ -93,14 +93,13 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray) -> list[tuple[int, int, i
         like = abs(float(np.median(height[line])) - size) <= max(1.0, SLACK * size)
         if line not in sure and like and start - size <= left[line[0]] <= end + size and len(line) >= CHARACTERS - 1:
             sure.append(line)
-    boxes = []
-    for line in sure:
-        reach = int(1.5 * size)
-        boxes.append((
-            int(left[line[0]]) - reach, int(np.min(top[line])) - 2,
-            int(left[line[-1]] + width[line[-1]]) + reach, int(np.max(top[line] + height[line])) + 2,
-        ))  # fmt: skip
-    return boxes
+    # A row of the block is text from end to end: characters before bright tissue are seen in parts.
+    end = max(int(left[line[-1]] + width[line[-1]]) for line in sure)
+    reach = int(1.5 * size)
+    return [
+        (start - reach, int(np.min(top[line])) - 2, end + reach, int(np.max(top[line] + height[line])) + 2)
+        for line in sure
+    ]
 
 
 def _is_thin(labels: np.ndarray, box: np.ndarray, number: int) -> bool:

@@ -16,13 +16,9 @@ SADDLE_NOISE = 4.0
 """... and lower by so many standard deviations of the noise."""
 
 
-RISE = 0.3
-"""Clipped light is taken to rise by this share for each pixel from the rim: so the shape of a clipped patch tells the
-highlights that have melted in it apart."""
-
-
-DEEPEST_PX = 60.0
-"""Farther from the rim it rises no more."""
+RISE = 0.85
+"""Clipped light is taken to rise by this power of 1 + the distance from the rim, px: so the shape of a clipped patch
+tells the highlights that have melted in it apart."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ def find_spots(
     if flat is not None and flat.any():
         # Light that is clipped is the higher the farther from the rim.
         depth = cv2.distanceTransform(flat.astype(np.uint8), cv2.DIST_L2, 5)
-        rise = np.exp(RISE * np.minimum(depth, DEEPEST_PX))
+        rise = (1 + depth) ** RISE
         climbed, base = specular * rise, tissue * rise
     basins = find_basins(climbed, mask, base, SADDLE, SADDLE_NOISE * noise)
     peak = specular[basins.rows, basins.columns].astype(np.float64)

@@ -275,6 +275,8 @@ def _highlight_json(highlight: Highlight) -> JsonObject:
         "kind": highlight.kind,
         "score": highlight.score,
         "area_px": highlight.area_px,
+        "peaks": max(len(highlight.peaks), 1),
+        "clipped": round(highlight.clipped, 3),
         "specular_peak": highlight.region.contrast,
         "shape": {name: getattr(highlight, name) for name in ("axis_ratio", "residual", "wander", "tint", "clutter")},
         "outline": np.round(highlight.outline, 2),

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Frame, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
+from simtest.detection.blobs import Kind
 from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detection, Detector, load_detector
 from simtest.errors import Failure, InputError, Reason
@@ -324,6 +325,10 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
     cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
+    # Highlights that touch have no isophotes of their own, so no estimator answers for them.
+    for i, highlight in enumerate(detection.highlights):
+        if highlight.kind is Kind.CLUSTER:
+            cut[i] = Failure(Reason.CLUSTER, f"{len(highlight.peaks)} highlights touch, and carry no single normal")
     patches = [
         patch
         if isinstance(patch, Failure) or len(cut) == 1

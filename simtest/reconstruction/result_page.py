@@ -34,7 +34,7 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         "others": [
             {"kind": h.kind, "outline": _rounded(h.outline, 1), "peak": np.add(h.region.peak, 0.5).tolist(),
              "score": h.score}
-            for h in record.other_highlights
+            for h in (*record.other_highlights, *(s.highlight for s in spots if s.highlight and s.peak_px is None))
         ],
         "colours": palette,
     }  # fmt: skip

@@ -21,6 +21,9 @@ from simtest.reconstruction.pipeline import PictureDetection
 Mask = npt.NDArray[np.bool_]
 Polygon = Sequence[int]
 
+FINER = 5
+"""Outlines are filled on pixels of this share of a pixel's side; odd, so that one has the pixel's centre."""
+
 ROOT = Path(__file__).resolve().parents[2]
 OUTLINES = ROOT / "tests" / "data" / "real_frames.json"
 FRAMES = ROOT.parent / "shared" / "data" / "frames"
@@ -107,19 +110,20 @@ def _filled(polygons: Sequence[Polygon], shape: tuple[int, ...]) -> Mask:
 
 def inside_outlines(highlights: Sequence[Highlight], shape: tuple[int, ...]) -> Mask:
     """Return the pixels whose centres lie inside the outlines of highlights, in px."""
-    bits = 4
-    mask = np.zeros(shape, dtype=np.uint8)
+    mask = np.zeros(shape, dtype=bool)
     for highlight in highlights:
         if len(highlight.outline) < 3:
             continue
-        # OpenCV fills what the line touches; a centre within 1/16 px of the line counts.
-        one = np.zeros(shape, dtype=np.uint8)
-        corners = np.rint((highlight.outline - 0.5) * 2**bits).astype(np.int32)
-        x, y, w, h = cv2.boundingRect(np.floor(highlight.outline).astype(np.int32))
-        cv2.fillPoly(one, [corners], 1, cv2.LINE_8, bits)
-        crop = np.s_[max(y - 2, 0) : y + h + 2, max(x - 2, 0) : x + w + 2]
-        mask[crop] |= one[crop]
-    return mask > 0
+        left, top = np.maximum(np.floor(highlight.outline.min(axis=0)).astype(int), 0)
+        right, bottom = np.ceil(highlight.outline.max(axis=0)).astype(int)
+        # Finer, since OpenCV also fills what the line touches.
+        fine = np.zeros((FINER * (bottom - top), FINER * (right - left)), dtype=np.uint8)
+        corners = np.rint((highlight.outline - [left, top]) * FINER - 0.5).astype(np.int32)
+        cv2.fillPoly(fine, [corners], 1)
+        inside = fine[FINER // 2 :: FINER, FINER // 2 :: FINER] > 0
+        part = mask[top:bottom, left:right]
+        part |= inside[: part.shape[0], : part.shape[1]]
+    return mask
 
 
 def score_frame(frame: OutlinedFrame, found: PictureDetection) -> FrameScore:
