@@ -9,20 +9,22 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from benchmarks.measuring import Figure, print_markdown
 from benchmarks.scheduler import shard_times, simulate
-from simtest.dataset.index import write_tables
+from simtest.dataset.index import write_shard_tables, write_tables
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import FileEntry, Manifest, new_manifest
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.shard import finish, write_sample
+from simtest.dataset.shard import PART, finish, write_sample
+from simtest.dataset.shard_writer import UNSAVED_SHARE
 from simtest.runtime.arrays import Array
 from simtest.spec import load_dataset
 from simtest.spec.dataset_recipe import Dataset
@@ -161,23 +163,28 @@ def _blocks(plan: Plan, count: int) -> list[int]:
 
 
 def _tables(plan: Plan, folder: Path, made: list[int]) -> float:
-    """Return the processor time of one sample in the tables, s, from tables of the shard that was written."""
+    """Return the processor time of one sample in the tables, s, from the rows that its worker has written."""
 
     class Written(Plan):
         shards: tuple[Shard, ...] = (Shard("train", 0, tuple(made)),)
 
     written, times = Written(plan.dataset), []
+    write_shard_tables(written, folder, written.shards[0])
+    # Few samples were made; a shard of the run has more rows.
+    more = max(round(plan.samples_per_shard / len(made)), 1)
+    for part in folder.glob(f"*.parquet{PART}"):
+        pl.concat([pl.read_parquet(part)] * more).write_parquet(part)
     for copies in (1, 1, COPIES):
         # The same shard over and over: what is left of the difference is the samples' own.
         written.shards = Written.shards * copies
         start = time.process_time()
         write_tables(written, folder)
         times.append(time.process_time() - start)
-    return (times[2] - times[1]) / (COPIES - 1) / len(made)
+    return (times[2] - times[1]) / (COPIES - 1) / (more * len(made))
 
 
 def _booking(plan: Plan, folder: Path) -> tuple[float, float]:
-    """Return the processor time to book a shard, s, without others and for each one that is booked before."""
+    """Return the processor time to save the manifest, s, without shards and for each one that it lists."""
     manifest = new_manifest(plan, "any")
     counts, times = (1, 20_000), []
     for count in counts:
@@ -208,7 +215,7 @@ def table(measured: Mapping[str, Measured]) -> list[list[str]]:
         ("10^7 samples: core hours", lambda m: f"{hours(m):,.0f}"),
         ("10^7 samples: TB", lambda m: f"{FRAMES * m.sample_bytes / 1e12:.1f}"),
         ("10^7 samples: shards", lambda m: f"{m.shards:,}"),
-        ("tables at the end, by one process, h", lambda m: f"{FRAMES * m.tables_s / 3600:.1f}"),
+        ("tables joined at the end, by one process, h", lambda m: f"{FRAMES * m.tables_s / 3600:.1f}"),
         (
             f"price at {CORE_HOUR:g} a core hour and {TB_MONTH:g} a TB and month, one month",
             lambda m: f"{price(m):,.0f}",
@@ -234,6 +241,21 @@ def figures() -> list[Figure]:
     return [figure for name, own in measured.items() for figure in scheduled(name, own)]
 
 
+def _bookings(alone: float, each: float) -> Callable[[int], float]:
+    """Return how long a shard takes to book: the manifest is saved when enough of its shards are new."""
+    unsaved = 0
+
+    def booking_s(booked: int) -> float:
+        nonlocal unsaved
+        unsaved += 1
+        if unsaved <= UNSAVED_SHARE * (booked + 1):
+            return 0.0
+        unsaved = 0
+        return alone + each * (booked + 1)
+
+    return booking_s
+
+
 def scheduled(name: str, measured: Measured) -> list[Figure]:
     """Simulate ten million frames on more and more workers of one core each."""
     tasks = shard_times(
@@ -242,8 +264,8 @@ def scheduled(name: str, measured: Measured) -> list[Figure]:
     alone, each = measured.booking_s
     shown = []
     for workers in WORKERS:
-        run = simulate(tasks, workers, lambda booked: alone + each * booked, START_S)
-        # One process makes the tables when all shards are there, while the workers wait.
+        run = simulate(tasks, workers, _bookings(alone, each), START_S)
+        # One process joins the tables when all shards are there, while the workers wait.
         tables_s = FRAMES * measured.tables_s
         whole = replace(run, makespan_s=run.makespan_s + tables_s, work_s=run.work_s + tables_s)
         label = f"{name}, {workers} worker{'s' * (workers > 1)}, simulated: share of their time that is work, "

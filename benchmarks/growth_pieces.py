@@ -27,8 +27,9 @@ from simtest.rendering import Session, backend
 from simtest.report import write_report
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.rendered_view import expose_picture
 from simtest.spec import Scene, load_experiment
+from simtest.spec.sensor import Sensor
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.recipe import load_recipe
@@ -131,7 +132,13 @@ def _labelled(session: Session) -> Callable[[], object]:
 
 def _searched(session: Session) -> Callable[[], object]:
     radiance = session.radiance()
-    return lambda: session.highlights(radiance)
+
+    def work() -> object:
+        # A session searches once for each light and camera.
+        session._forget_misfits()
+        return session.highlights(radiance)
+
+    return work
 
 
 def _truth(session: Session) -> Callable[[], object]:
@@ -143,15 +150,17 @@ def _truth(session: Session) -> Callable[[], object]:
 
 
 def _seen(session: Session) -> Callable[[], object]:
-    view = render_view(session, session.scene)
-    return lambda: view.frame(1)
+    """Pass a frame through the whole chain of a colonoscope: mosaic, noise, sharpening and JPEG."""
+    radiance = session.radiance()
+    scene = session.scene.model_copy(update={"sensor": Sensor.model_validate({"preset": "colonoscope_hd"})})
+    return lambda: expose_picture(session, scene, radiance)
 
 
 _OF_A_VIEW = {
     "labelled frame of 16 samples": _labelled,
     "true highlights": _searched,
     "exact truth": _truth,
-    "camera chain": _seen,
+    "camera chain of a colonoscope": _seen,
 }
 
 

@@ -33,6 +33,7 @@ class Reason(StrEnum):
     NOT_FINITE = "not_finite"
     NOT_CONVERGED = "not_converged"
     STREAK = "streak"
+    UNRESOLVED = "unresolved"
     NOT_KNOWN = "not_known"
     NO_ESTIMATE = "no_estimate"
     ESTIMATOR_ERROR = "estimator_error"

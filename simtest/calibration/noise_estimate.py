@@ -49,10 +49,10 @@ def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask
     if not response.size:
         return 0.0
     # robust spread
-    return float(MAD_TO_SIGMA * _median(np.abs(response)) / 6.0)
+    return float(MAD_TO_SIGMA * median(np.abs(response)) / 6.0)
 
 
-def _median(values: npt.NDArray[np.float32]) -> np.float32:
+def median(values: npt.NDArray[np.float32]) -> np.float32:
     """Return the median of values, shape (n,), as `np.median` does, which loads `numpy.ma` first."""
     if np.isnan(values.max()):
         return np.float32(np.nan)

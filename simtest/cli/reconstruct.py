@@ -91,6 +91,8 @@ def reconstruct(
         extras = Extras(reference, camera_from_model, depth, depth_scale)
         record, files = reconstruct_picture(image, out, options, extras)
         _print_tables(record)
+        if record.stated is not None:
+            print(f"stated: {record.stated}")
         _print_assumed(record.assumed)
         count = len(record.specularities)
         print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")

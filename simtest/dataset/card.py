@@ -10,6 +10,7 @@ from simtest.dataset.fields import BASE_FIELDS, FIELDS, INSTRUMENT
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
+from simtest.pages.markdown import escaped, paragraphs, yaml_string
 from simtest.runtime.files import write_atomically
 from simtest.spec.dataset_recipe import Distribution
 
@@ -36,7 +37,8 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    # Markdown, not HTML: nothing is escaped.
+    # Markdown, not HTML, so what a recipe says is escaped where it stands.
+    environment.filters.update(escaped=escaped, paragraphs=paragraphs, yaml=yaml_string)
     return environment.get_template("card.md.j2").render(
         dataset=dataset,
         counts=counts,

@@ -11,8 +11,8 @@ import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.metadata import EstimateMeta, SampleMeta
-from simtest.dataset.plan import Plan
-from simtest.dataset.shard import samples
+from simtest.dataset.plan import Plan, Shard
+from simtest.dataset.shard import PART, samples
 from simtest.runtime.files import write_atomically
 from simtest.validation.results_table import SCHEMA
 
@@ -116,14 +116,18 @@ class HighlightRow:
 
 def make_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
     """Make the tables from the shards; rows in the order of the samples."""
+    return _joined(shard_tables(plan, folder, shard) for shard in plan.shards)
+
+
+def shard_tables(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
+    """Make the rows of one shard, from its metadata."""
     rows: list[SampleRow] = []
     highlights: list[HighlightRow] = []
     estimates: list[EstimateMeta] = []
-    for shard in plan.shards:
-        for meta, offset, size in _stored(folder / shard.name):
-            rows.append(SampleRow.of(meta, shard.name, offset, size))
-            highlights += HighlightRow.of(meta)
-            estimates += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
+    for meta, offset, size in _stored(folder / shard.name):
+        rows.append(SampleRow.of(meta, shard.name, offset, size))
+        highlights += HighlightRow.of(meta)
+        estimates += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
     of_samples, of_estimates = _schema(SampleRow), dict(_ESTIMATE_SCHEMA)
     if plan.has_instruments:
         of_estimates[ON_INSTRUMENT] = pl.Boolean()
@@ -154,11 +158,38 @@ def _schema(record: type) -> dict[str, pl.DataType]:
 def _table(rows: Iterable[Mapping[str, Any]], schema: Mapping[str, pl.DataType]) -> pl.DataFrame:
     rows = list(rows)
     columns = {name: [row.get(name) for row in rows] for name in schema}
+    return pl.DataFrame(columns, schema=schema, strict=False)
+
+
+def _joined(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """Join the rows of all shards, in the order of the samples."""
+    of_shards = list(parts)
     # Stable: rows of one sample stay in their order.
-    return pl.DataFrame(columns, schema=schema, strict=False).sort("index", maintain_order=True)
+    return {
+        name: pl.concat([part[name] for part in of_shards]).sort("index", maintain_order=True).rechunk()
+        for name in TABLES
+    }
+
+
+def write_shard_tables(plan: Plan, folder: Path, shard: Shard) -> None:
+    """Write the rows of a finished shard beside it, for `write_tables`; done by the worker that made the shard."""
+    for name, table in shard_tables(plan, folder, shard).items():
+        write_atomically(_part(folder, shard, name), table.write_parquet)
 
 
 def write_tables(plan: Plan, folder: Path) -> None:
-    """Write the tables."""
-    for name, table in make_tables(plan, folder).items():
+    """Write the tables, from the rows that workers have written or else from the shards."""
+    for name, table in _joined(_written(plan, folder, shard) for shard in plan.shards).items():
         write_atomically(folder / name, table.write_parquet)
+
+
+def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
+    """Read the rows of a shard; make them anew where they are missing or cannot be read."""
+    try:
+        return {name: pl.read_parquet(_part(folder, shard, name)) for name in TABLES}
+    except (OSError, pl.exceptions.PolarsError):
+        return shard_tables(plan, folder, shard)
+
+
+def _part(folder: Path, shard: Shard, name: str) -> Path:
+    return folder / f"{shard.name}.{name}{PART}"

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict
@@ -18,6 +19,7 @@ from simtest.spec.dataset_recipe import Dataset
 NAME = "manifest.json"
 FORMAT = "simtest dataset, version 1"
 MAX_BYTES = 1_000_000_000
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,200}")
 
 
 class ManifestError(Exception):
@@ -115,13 +117,34 @@ def read_manifest(folder: Path) -> Manifest:
         raise ManifestError(f"{NAME}: is no manifest of the form {FORMAT!r}")
     if content.pop("digest", None) != _digest(content):
         raise ManifestError(f"{NAME}: was changed; its digest does not fit")
+    for key in ("dataset", "origin", "environment"):
+        if not isinstance(content.get(key), dict):
+            raise ManifestError(f"{NAME}: {key} must be a table")
     return Manifest(
         content["dataset"],
         content["origin"],
         content["environment"],
-        {name: FileEntry(**entry) for name, entry in content["shards"].items()},
-        {name: FileEntry(**entry) for name, entry in content["tables"].items()},
+        _entries(content, "shards"),
+        _entries(content, "tables"),
     )
+
+
+def _entries(content: dict[str, Any], key: str) -> dict[str, FileEntry]:
+    """Return the listed files; raise `ManifestError` where one is malformed or lies outside the folder.
+
+    Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder
+    is never opened.
+    """
+    listed = content.get(key)
+    if not isinstance(listed, dict):
+        raise ManifestError(f"{NAME}: {key} must be a table of files")
+    for name, entry in listed.items():
+        if not _PLAIN_NAME.fullmatch(name):
+            raise ManifestError(f"{NAME}: {key} lists {shown(name, 80)}; must be a file's name inside the folder")
+        sound = isinstance(entry, dict) and entry.keys() == {"bytes", "sha256"}
+        if not (sound and type(entry["bytes"]) is int and isinstance(entry["sha256"], str)):
+            raise ManifestError(f"{NAME}: {key}.{shown(name, 80)} must hold bytes, an integer, and sha256, a text")
+    return {name: FileEntry(**entry) for name, entry in listed.items()}
 
 
 def _digest(content: Any) -> str:

@@ -17,6 +17,9 @@ from typing import IO
 
 from simtest.dataset.metadata import SampleMeta
 
+PART = ".part"
+"""End of the name of a file that is not finished, or that serves to make another."""
+
 BLOCK = tarfile.BLOCKSIZE
 MAX_MEMBER_BYTES = 1 << 31
 

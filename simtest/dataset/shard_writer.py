@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from simtest.dataset.card import CARD, write_card
-from simtest.dataset.index import TABLES, write_tables
+from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.manifest import (
     NAME,
@@ -24,15 +24,13 @@ from simtest.dataset.manifest import (
 )
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample
-from simtest.dataset.shard import finish, locked, whole_samples, write_sample
+from simtest.dataset.shard import PART, finish, locked, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine, OnStep
 from simtest.runtime.files import make_folder, sync_folder
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
-
-PART = ".part"
 
 SHARDS_PER_PROCESS = 8
 """After so many a process is replaced, since rebuilding scenes in a loop grows memory."""
@@ -112,7 +110,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
         write_card(plan, manifest, folder)
         manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}
         manifest.save(folder)
-    # parts of interrupted runs
+    # rows of single shards, and parts of interrupted runs
     for left in folder.glob(f"*{PART}*"):
         left.unlink(missing_ok=True)
 
@@ -195,8 +193,12 @@ def _maker(dataset: str, variant: str) -> Maker:
 def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
     """Write a shard, or finish one that was begun; call `on_step` after each sample."""
     folder, maker = Path(task.folder), _maker(task.dataset, task.variant)
+    shard = maker.plan.shards[task.number]
     with _one_line_errors(folder):
-        return _write_shard(folder, maker, maker.plan.shards[task.number], on_step)
+        entry = _write_shard(folder, maker, shard, on_step)
+        # Here, not at the end: one process would take hours for the tables of millions of samples.
+        write_shard_tables(maker.plan, folder, shard)
+        return entry
 
 
 def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> FileEntry:

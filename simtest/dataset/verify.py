@@ -23,8 +23,8 @@ from simtest.dataset.manifest import (
 from simtest.dataset.metadata import SampleMeta, has_relief
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample, decode, sample_key
-from simtest.dataset.shard import BrokenShardError, read_member, samples
-from simtest.dataset.shard_writer import PART, remake
+from simtest.dataset.shard import PART, BrokenShardError, read_member, samples
+from simtest.dataset.shard_writer import remake
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg

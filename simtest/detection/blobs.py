@@ -1,11 +1,11 @@
-"""Split highlight pixels into highlights and classify them by the elliptic-shape prior.
+"""Classify the spots of a frame by the elliptic-shape prior.
 
 Where the normal bisects light and camera the isophotes are nested ellipses with a common centre (theory.md, section 3,
-item 3). Highlights that a border cuts, streaks, merged ones, and light that was reflected by tissue before are other
+item 3). Highlights that a border cuts, streaks, clusters, and light that was reflected by tissue before are other
 kinds.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import cv2
@@ -14,20 +14,19 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.light_split import SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
+from simtest.detection.spots import Spot
 from simtest.errors import Failure
-from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses, smooth
+from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
+from simtest.runtime.arrays import Index
 
 Box = tuple[int, int, int, int]
 
 MIN_AREA_PX = 4
-"""Fewer pixels are a speck."""
+"""Fewer pixels tell nothing of their surroundings."""
 
-MIN_HALF_HEIGHT_PX = 3
-"""Least number of pixels above half height that determine an ellipse, by interpolation between them."""
-
-SMOOTHING_PX = 0.7
-"""Smoothing before the shape is measured; a wider one makes any small blob an ellipse."""
+MIN_SHAPE_PX = 12
+"""Fewer pixels above half height determine no ellipse: the highlight is small, and its shape is not judged."""
 
 NESTED_ISOVALUES = (0.5, 0.65, 0.8)
 """Isophotes whose ellipses are compared."""
@@ -45,10 +44,13 @@ LEAST_AXIS_RATIO = 0.3
 """A longer highlight is a streak: abs(1 + d k) differs so much between its axes that one of them is near 0."""
 
 MIN_CLIPPED_PX = 12
-"""With so many clipped pixels above half height, a highlight counts as clipped."""
+"""With so many pixels that are nearly clipped above half height the shape is that of a clipped highlight."""
 
-TOP = 0.8
-"""Separate parts of a highlight above this share of its peak are peaks of their own."""
+CLIPPED_SHARE = 0.5
+"""With this share of the pixels above half height clipped, and the least that follows, a highlight counts as clipped:
+what is left of its lobe is the rim."""
+
+LEAST_CLIPPED_PX = 4
 
 TINT = 0.4
 """Light mirrored by the surface is grey. Where the weakest channel gains less than this share of the strongest one's
@@ -62,8 +64,16 @@ CLUTTER = 0.2
 """Largest specular light, over the peak's, of nine tenths of the surroundings: instruments, pale folds and glistening
 patches have more."""
 
-LEAST_CONTRAST = 0.1
-"""Least specular light at the peak of an isolated highlight, share of full scale."""
+PALE, PALE_WIDE, WIDE_PX = 0.6, 0.4, 200
+PALE_PERCENTILE = 75.0
+"""Where the brightest quarter of the surroundings is brighter than this share of a spot that has no highlight's shape
+(the second share from so many pixels on), the spot is pale tissue, unless more than the share that follows is white."""
+
+GLARING = 0.2
+
+LEAK, LEAK_PX = 1.3, 4
+"""An isophote at half height that holds more than this share of the spot's pixels, and this number on top, holds
+something else besides."""
 
 EDGE_PX = 3
 """The picture's edge may cut a highlight within this distance."""
@@ -72,20 +82,26 @@ _WIDE = np.ones((7, 7), dtype=np.uint8)
 
 
 class Kind(StrEnum):
-    """Kinds of highlights; only isolated ones carry one normal."""
+    """Kinds of highlights; isolated, clipped and small ones may carry one normal."""
 
     ISOLATED = "isolated"
+    CLIPPED = "clipped"
+    SMALL = "small"
+    CLUSTER = "cluster"
     ELONGATED = "elongated"
     MERGED = "merged"
     BORDER = "border"
     INTER_REFLECTION = "inter_reflection"
-    SMALL = "small"
     UNCLEAR = "unclear"
+
+
+SINGLE = frozenset({Kind.ISOLATED, Kind.CLIPPED, Kind.SMALL})
+"""Kinds that may carry one normal."""
 
 
 @dataclass(frozen=True)
 class Highlight:
-    """A highlight of a colour frame.
+    """A highlight of a colour frame, or several that touch.
 
     Parameters
     ----------
@@ -96,7 +112,7 @@ class Highlight:
     score : float
         In [0, 1]: likeness of shape, colour and height to an isolated highlight's.
     area_px : int
-        Pixels above half of its peak.
+        Pixels above half of its peak, a cluster's above half of its peaks and the saddles between them.
     axis_ratio, residual, wander : float or None
         Of its ellipse at half height; RMS distance from it, and largest distance between the nested ellipses' centres,
         as shares of its radius; None where no ellipse fits.
@@ -105,7 +121,11 @@ class Highlight:
     clutter : float
         Specular light of the surroundings, over the peak's.
     outline : ndarray, shape (N, 2)
-        Its isophote at half height, px, closed; empty where it does not close.
+        Its isophote at half height, px, closed; the border of its pixels where that is open or holds other highlights.
+    peaks : ndarray of int, shape (P, 2)
+        Column and row of each highlight in it, the brightest first; one but for clusters.
+    clipped : float
+        Share of its pixels that are clipped.
     """
 
     region: Region
@@ -118,108 +138,76 @@ class Highlight:
     tint: float
     clutter: float
     outline: Array
+    peaks: Index = field(default_factory=lambda: np.empty((0, 2), dtype=np.intp))
+    clipped: float = 0.0
 
     @property
     def is_isolated(self) -> bool:
         """Whether it may carry one normal."""
-        return self.kind is Kind.ISOLATED
+        return self.kind in SINGLE
 
 
 @dataclass(frozen=True)
-class _Peak:
-    """A peak with its isophotes, in a crop of the frame; isophotes that do not close are None."""
+class _Traced:
+    """A spot with its isophotes, in a crop of the frame; isophotes that do not close are None."""
 
-    pixel: tuple[int, int]
-    value: float
+    spot: Spot
     sets: tuple[LevelSet | None, ...]
     corner: tuple[int, int]
     at_border: bool
-    several: bool
-    clipped: bool
-    area_px: int
+    clipped_px: int
+    white_px: int
 
 
-def highlights_of(
-    mask: Mask, light: SplitLight, linear: Image, clipped: Mask, seen: Mask | None = None
-) -> list[Highlight]:
-    """Find and classify the highlights among the pixels of a mask, shape (H, W), the brightest first.
+def classify(
+    spots: list[Spot], smoothed: Image, light: SplitLight, linear: Image, mask: Mask, clipped: Mask,
+    white: Mask, seen: Mask | None = None,
+) -> list[Highlight | None]:  # fmt: skip
+    """Classify spots; None where one is pale tissue.
 
-    `linear` is the frame, shape (H, W, 3), `clipped` where a channel is clipped, `seen` the view, both (H, W).
+    Parameters
+    ----------
+    spots : list of Spot
+        Of the same frame.
+    smoothed : ndarray, shape (H, W)
+        Specular light, smoothed.
+    light : SplitLight
+        The frame's two parts.
+    linear : ndarray, shape (H, W, 3)
+        The frame.
+    mask : ndarray of bool, shape (H, W)
+        Pixels that show a highlight.
+    clipped : ndarray of bool, shape (H, W)
+        Where all channels are clipped.
+    white : ndarray of bool, shape (H, W)
+        Where they are nearly so.
+    seen : ndarray of bool, shape (H, W), optional
+        The view; default everywhere.
     """
-    # peaks of each connected part
-    smoothed = smooth(light.specular, SMOOTHING_PX, seen)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    found: list[_Peak] = []
-    for label in range(1, count):
-        x, y, width, height, area = (int(v) for v in stats[label])
-        if area >= MIN_AREA_PX:
-            inside = labels[y : y + height, x : x + width] == label
-            found += _peaks(smoothed, inside, (x, y, width, height), clipped, seen)
-    # ellipses of all isophotes at once, then the kinds
-    fits = _fit([part for peak in found for part in peak.sets])
+    traced = [_traced(spot, smoothed, (clipped, white), seen) for spot in spots]
+    # ellipses of all isophotes at once
+    fits = _fit([part for one in traced for part in one.sets])
     step = len(NESTED_ISOVALUES)
-    made = [_classified(peak, fits[i * step : (i + 1) * step], linear, mask, light) for i, peak in enumerate(found)]
-    order = sorted(range(len(found)), key=lambda i: -found[i].value)
-    return [made[i] for i in order]
+    return [_classified(one, fits[i * step : (i + 1) * step], linear, mask, light) for i, one in enumerate(traced)]
 
 
-def _peaks(smoothed: Image, inside: Mask, box: Box, clipped: Mask, seen: Mask | None) -> list[_Peak]:
-    """Find the peaks of connected pixels whose half-height isophote holds no higher one, the brightest first."""
-    # a crop that holds the isophotes
-    x, y, width, height = box
-    left, top = max(x - width - MARGIN_PX, 0), max(y - height - MARGIN_PX, 0)
-    crop = np.s_[top : y + 2 * height + MARGIN_PX, left : x + 2 * width + MARGIN_PX]
-    values = smoothed[crop]
+def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | None) -> _Traced:
+    """Trace a spot's isophotes; a cluster and a shoulder have none of their own."""
+    height, width = spot.mask.shape
+    x, y = spot.corner
+    left, top = max(x - width // 2 - MARGIN_PX, 0), max(y - height // 2 - MARGIN_PX, 0)
+    crop = np.s_[top : y + height + height // 2 + MARGIN_PX, left : x + width + width // 2 + MARGIN_PX]
     visible = None if seen is None else seen[crop]
-    here = np.zeros(values.shape, dtype=bool)
-    here[y - top : y - top + height, x - left : x - left + width] = inside
-    # candidates: local maxima
-    maxima = here & (values >= cv2.dilate(values, np.ones((3, 3), np.uint8)))
-    rows, columns = np.nonzero(maxima)
-    taken, found = np.zeros(values.shape, dtype=bool), []
-    for i in np.argsort(-values[rows, columns], kind="stable"):
-        row, column = int(rows[i]), int(columns[i])
-        if taken[row, column]:
-            continue
-        region = _half_height(values, column, row)
-        higher = bool((taken & region).any())
-        taken |= region
-        if not higher:
-            peak = _traced(values, (column, row), (left, top), region, (clipped[crop], visible))
-            found.append(peak if peak.sets[0] is not None else _bordering(peak, region, visible, smoothed.shape))
-    return found
-
-
-def _half_height(values: Image, column: int, row: int) -> Mask:
-    """Return the connected pixels above half height."""
-    marks = (values >= HIGHLIGHT_ISOVALUE * values[row, column]).astype(np.uint8)
-    cv2.floodFill(marks, None, (column, row), 2, flags=4)
-    return np.asarray(marks == 2)
-
-
-def _traced(
-    values: Image, pixel: tuple[int, int], corner: tuple[int, int], region: Mask, masks: tuple[Mask, Mask | None]
-) -> _Peak:
-    """Trace a peak's isophotes."""
-    column, row = pixel
-    clipped, visible = masks
-    value = float(values[row, column])
-    sets = tuple(level_set_around(values, pixel, t * value, visible) for t in NESTED_ISOVALUES)
-    # several peaks, or a clipped plateau
-    count, _, stats, _ = cv2.connectedComponentsWithStats(((values >= TOP * value) & region).astype(np.uint8))
-    several = int(np.count_nonzero(stats[1:count, cv2.CC_STAT_AREA] >= 2)) > 1
-    in_frame = (column + corner[0], row + corner[1])
-    flat = int(np.count_nonzero(clipped & region)) >= MIN_CLIPPED_PX
-    return _Peak(in_frame, value, sets, corner, False, several, flat, int(np.count_nonzero(region)))
-
-
-def _bordering(peak: _Peak, region: Mask, visible: Mask | None, shape: tuple[int, ...]) -> _Peak:
-    """Mark a peak whose open isophote the view's border cuts; else it runs into other bright tissue."""
-    rows, columns = np.nonzero(region)
-    x, y = columns + peak.corner[0], rows + peak.corner[1]
-    edge = bool((x == 0).any() or (y == 0).any() or (x == shape[1] - 1).any() or (y == shape[0] - 1).any())
-    cut = visible is not None and bool((cv2.dilate(region.astype(np.uint8), _WIDE) > 0)[~visible].any())
-    return replace(peak, at_border=edge or cut)
+    none: tuple[LevelSet | None, ...] = (None,) * len(NESTED_ISOVALUES)
+    sets = none
+    if (len(spot.peaks) == 1 or spot.melted) and not spot.touches:
+        column, row = int(spot.peaks[0, 0]) - left, int(spot.peaks[0, 1]) - top
+        sets = tuple(level_set_around(smoothed[crop], (column, row), t * spot.value, visible) for t in NESTED_ISOVALUES)
+        # A lower, separate bump may hang on below the mask's pixels: then the isophote is not the spot's own.
+        if sets[0] is not None and np.count_nonzero(sets[0].inside) > LEAK * spot.area_px + LEAK_PX:
+            sets = none
+    clipped, white = (int(np.count_nonzero(part[spot.crop] & spot.mask)) for part in full)
+    return _Traced(spot, sets, (left, top), _at_border(spot, smoothed.shape, seen), clipped, white)
 
 
 def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
@@ -234,57 +222,102 @@ def _fit(sets: list[LevelSet | None]) -> list[FittedConic | None]:
     return made
 
 
-def _classified(peak: _Peak, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight) -> Highlight:
-    """Return the highlight of a peak with its kind and score."""
+def _classified(
+    one: _Traced, fits: list[FittedConic | None], linear: Image, mask: Mask, light: SplitLight
+) -> Highlight | None:
+    """Return the highlight of a spot with its kind and score; None where it is pale tissue."""
+    spot, area = one.spot, one.spot.area_px
     # measurements
-    outline, box = _outline(peak, light.specular.shape)
-    axis_ratio, residual, wander = _shape(peak, fits)
-    tint, clutter = _around(peak, box, linear, mask, light)
-    # kind: the first reason against an isolated highlight
-    allowed = RESIDUAL_CLIPPED if peak.clipped else RESIDUAL
-    fine = residual is not None and residual <= allowed and wander is not None and wander <= WANDER
-    long = axis_ratio is not None and axis_ratio < LEAST_AXIS_RATIO
-    if peak.at_border or _near_edge(outline, light.specular.shape):
+    outline, box = _outline(one, light.specular.shape)
+    axis_ratio, residual, wander = _shape(one, fits)
+    tint, clutter, surround = _around(spot, box, linear, mask, light)
+    kind = _kind(one, axis_ratio, residual, wander, tint, clutter)
+    glaring = one.white_px >= GLARING * area
+    pale = PALE if area < WIDE_PX else PALE_WIDE
+    if kind not in (*SINGLE, Kind.UNCLEAR) and surround > pale and not glaring:
+        return None
+    if kind is not Kind.BORDER and kind in SINGLE and _near_edge(outline, light.specular.shape):
         kind = Kind.BORDER
-    elif tint < TINT:
-        kind = Kind.INTER_REFLECTION
-    elif peak.area_px < MIN_HALF_HEIGHT_PX:
-        kind = Kind.SMALL
-    elif peak.several or not (fine or long):
-        kind = Kind.MERGED
-    elif long:
-        kind = Kind.ELONGATED
-    elif clutter > CLUTTER or peak.value < LEAST_CONTRAST:
-        kind = Kind.UNCLEAR
-    else:
-        kind = Kind.ISOLATED
     # score
     score = 0.0
     if axis_ratio is not None and residual is not None and wander is not None:
-        height = peak.value / (peak.value + max(10 * light.noise, 1e-6))
+        height = spot.value / (spot.value + max(10 * light.noise, 1e-6))
         score = float(
             np.exp(-((residual / RESIDUAL) ** 2 + (wander / WANDER) ** 2) / 4) * min(max(tint, 0), 1) * height
         )
-    region = Region(box, peak.pixel, peak.value)
-    return Highlight(region, kind, round(score, 4), peak.area_px, axis_ratio, residual, wander, tint, clutter, outline)
+    column, row = (int(v) for v in spot.peaks[0])
+    return Highlight(
+        Region(box, (column, row), spot.value), kind, round(score, 4), area, axis_ratio, residual, wander, tint,
+        clutter, outline, spot.peaks if kind is Kind.CLUSTER else spot.peaks[:1], one.clipped_px / area,
+    )  # fmt: skip
 
 
-def _outline(peak: _Peak, shape: tuple[int, ...]) -> tuple[Array, Box]:
-    """Return the isophote at half height as a polygon, and the region of interest around it."""
-    half = peak.sets[0]
-    if half is None:
-        outline = np.empty((0, 2))
-        x, y = peak.pixel
-        reach = int(np.sqrt(peak.area_px)) + MARGIN_PX
-        x0, y0, x1, y1 = x - reach, y - reach, x + reach + 1, y + reach + 1
-    else:
-        outline = half.polygon() + PIXEL_CENTRE + peak.corner
-        rows, columns = half.inside.shape
-        x, y = half.corner[0] + peak.corner[0], half.corner[1] + peak.corner[1]
-        x0, x1 = x - columns // 2 - MARGIN_PX, x + columns + columns // 2 + MARGIN_PX
-        y0, y1 = y - rows // 2 - MARGIN_PX, y + rows + rows // 2 + MARGIN_PX
+def _kind(
+    one: _Traced, axis_ratio: float | None, residual: float | None, wander: float | None, tint: float, clutter: float
+) -> Kind:
+    """Return the kind of a spot: the first reason against an isolated highlight."""
+    area, flat = one.spot.area_px, one.clipped_px
+    allowed = RESIDUAL_CLIPPED if one.white_px >= MIN_CLIPPED_PX else RESIDUAL
+    fine = residual is not None and residual <= allowed and wander is not None and wander <= WANDER
+    small = area < MIN_SHAPE_PX
+    # One ellipse is one highlight, whatever the outline of its clipped pixels.
+    if len(one.spot.peaks) > 1 and not (one.spot.melted and fine and not small):
+        return Kind.CLUSTER
+    if one.at_border:
+        return Kind.BORDER
+    if tint < TINT:
+        return Kind.INTER_REFLECTION
+    if one.spot.touches or one.sets[0] is None:
+        return Kind.MERGED
+    if not small and axis_ratio is not None and axis_ratio < LEAST_AXIS_RATIO:
+        return Kind.ELONGATED
+    if not (small or fine):
+        return Kind.MERGED
+    if clutter > CLUTTER:
+        return Kind.UNCLEAR
+    if flat >= LEAST_CLIPPED_PX and flat >= CLIPPED_SHARE * area:
+        return Kind.CLIPPED
+    return Kind.SMALL if small else Kind.ISOLATED
+
+
+def _outline(one: _Traced, shape: tuple[int, ...]) -> tuple[Array, Box]:
+    """Return the isophote at half height, or the border of the pixels, and the region of interest around them."""
+    half, (x, y), (rows, columns) = one.sets[0], one.spot.corner, one.spot.mask.shape
+    outline = border_of(one.spot.mask) + one.spot.corner
+    if half is not None:
+        outline = half.polygon() + PIXEL_CENTRE + one.corner
+    x0, x1 = x - columns // 2 - MARGIN_PX, x + columns + columns // 2 + MARGIN_PX
+    y0, y1 = y - rows // 2 - MARGIN_PX, y + rows + rows // 2 + MARGIN_PX
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])
     return outline, (x0, y0, x1 - x0, y1 - y0)
+
+
+def border_of(mask: Mask) -> Array:
+    """Return the border of a mask's largest part along the edges of its pixels, closed, shape (N, 2)."""
+    # Thrice as fine, so that the contour, which runs through pixels, lies within a third of one.
+    fine = np.kron(mask, np.ones((3, 3), dtype=bool)).astype(np.uint8)
+    contours, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contour = max(contours, key=cv2.contourArea)[:, 0]
+    corners = np.rint((contour + 0.5) / 3)
+    corners = np.concatenate([corners, corners[:1]])
+    return corners[np.append(True, (corners[1:] != corners[:-1]).any(axis=1))]
+
+
+def _at_border(spot: Spot, shape: tuple[int, ...], seen: Mask | None) -> bool:
+    """Return whether the picture's edge or the view's border may cut a spot."""
+    (x, y), (height, width) = spot.corner, spot.mask.shape
+    if x <= 0 or y <= 0 or x + width >= shape[1] or y + height >= shape[0]:
+        return True
+    if seen is None:
+        return False
+    reach = _WIDE.shape[0] // 2
+    left, top = max(x - reach, 0), max(y - reach, 0)
+    around = ~seen[top : y + height + reach, left : x + width + reach]
+    if not around.any():
+        return False
+    own = np.zeros(around.shape, dtype=np.uint8)
+    own[y - top : y - top + height, x - left : x - left + width] = spot.mask
+    return bool((cv2.dilate(own, _WIDE) > 0)[around].any())
 
 
 def _near_edge(outline: Array, shape: tuple[int, ...]) -> bool:
@@ -293,14 +326,14 @@ def _near_edge(outline: Array, shape: tuple[int, ...]) -> bool:
     return bool((outline < EDGE_PX).any() or (outline > edge).any())
 
 
-def _shape(peak: _Peak, fits: list[FittedConic | None]) -> tuple[float | None, float | None, float | None]:
+def _shape(one: _Traced, fits: list[FittedConic | None]) -> tuple[float | None, float | None, float | None]:
     """Return axis ratio, residual and wander (see `Highlight`); None where the ellipse at half height is missing."""
-    half, contour = fits[0], peak.sets[0]
+    half, contour = fits[0], one.sets[0]
     if half is None or contour is None:
         return None, None, None
     # ellipses outwards in, up to the first that is missing
     centres, residuals = [], []
-    for conic, part in zip(fits, peak.sets, strict=True):
+    for conic, part in zip(fits, one.sets, strict=True):
         if conic is None or part is None:
             break
         away = conic.relative_radii(crossings([part]).points) - 1
@@ -311,22 +344,28 @@ def _shape(peak: _Peak, fits: list[FittedConic | None]) -> tuple[float | None, f
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)
 
 
-def _around(peak: _Peak, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float]:
-    """Return tint and clutter of a highlight (see `Highlight`); the channels are ranked by the tissue around it."""
+def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float, float]:
+    """Return tint and clutter of a highlight (see `Highlight`), and the light of its surroundings over its own.
+
+    The channels are ranked by the tissue around it.
+    """
     x, y, width, height = box
     crop = np.s_[y : y + height, x : x + width]
     values, specular = linear[crop], light.specular[crop]
     # surroundings: away from all highlights
-    bright = mask[crop] | (specular > HIGHLIGHT_ISOVALUE * peak.value)
+    bright = mask[crop] | (specular > HIGHLIGHT_ISOVALUE * spot.value)
     around = cv2.dilate(bright.astype(np.uint8), _WIDE) == 0
     if np.count_nonzero(around) < MIN_AREA_PX:
-        return 1.0, 0.0
-    clutter = float(np.percentile(specular[around], CLUTTER_PERCENTILE)) / peak.value
-    # gain of each channel, on the rim: channels near full scale have lost it
-    shown = (specular >= 0.3 * peak.value) & (values.max(axis=2) < UNCLIPPED)
-    if np.count_nonzero(shown) < MIN_AREA_PX:
-        return 1.0, clutter
+        return 1.0, 0.0, 0.0
+    clutter = float(np.percentile(specular[around], CLUTTER_PERCENTILE)) / spot.value
     tissue = np.median(values[around], axis=0)
+    own = np.median(linear[spot.crop][spot.mask], axis=0)
+    brighter = float(np.percentile(values[around].mean(axis=1), PALE_PERCENTILE))
+    surround = brighter / max(float(own.mean()), 1e-6)
+    # gain of each channel, on the rim: channels near full scale have lost it
+    shown = (specular >= 0.3 * spot.value) & (values.max(axis=2) < UNCLIPPED)
+    if np.count_nonzero(shown) < MIN_AREA_PX:
+        return 1.0, clutter, surround
     gain = values[shown].mean(axis=0) - tissue
     weakest, strongest = float(gain[tissue.argmin()]), float(gain[tissue.argmax()])
-    return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter
+    return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter, surround

@@ -6,22 +6,61 @@ import cv2
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
+from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import MIN_AREA_PX, Highlight, highlights_of
+from simtest.detection.blobs import Highlight, classify
 from simtest.detection.detector import Detection
-from simtest.detection.light_split import SplitLight, split_light
+from simtest.detection.foreign import find_foreign
+from simtest.detection.light_split import SplitLight, fill, split_light
+from simtest.detection.spots import Spot, find_spots
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import InputError
-from simtest.geometry import Camera, Image, Mask
+from simtest.geometry import Camera, Image, Mask, smooth
+
+SMOOTHING_PX = 0.35
+"""Smoothing before highlights are told apart and their shape is measured; a wider one rounds small ones off."""
+
+NOISE_LEFT = 0.8
+"""What this smoothing leaves of white noise, 1 / (2 sqrt(pi) width)."""
 
 NOISE_FACTOR = 4.0
 """Specular light above so many standard deviations is more than noise."""
 
-FAINT_RATIO = 0.6
-"""Highlights are searched for where the specular light is this share of the tissue's; their pixels are those above
-`SPECULAR_DIFFUSE_RATIO`."""
+PEAK_NOISE = 10.0
+"""A highlight's peak stands at least so many standard deviations high."""
 
-LEAST_SPECULAR = 0.01
+FAINT_RATIO = 0.25
+"""At a highlight's peak the specular light is at least this share of the tissue's: a fifth of all light, as for a
+visible highlight (theory.md 7.1b)."""
+
+TEXTURE_FACTOR = 6.0
+"""... and so many times the spread of that share over the frame: tissue whose colour varies looks like faint
+highlights."""
+
+TEXTURE_LIGHT = 0.02
+"""Tissue darker than this share of full scale does not count for the spread."""
+
+MIN_TEXTURE_PX = 100
+
+RISE = 0.7
+"""At the peak the light is brighter than the tissue around by this share of the least ratio: pale tissue is not."""
+
+_WIDE = np.ones((5, 5), dtype=np.uint8)
+
+FOOT_REACH = 0.8
+"""A highlight's foot reaches this share of its radius at half height beyond that: a Gaussian's at a tenth of it."""
+
+PLATEAU, GLARE = 0.97, 0.7
+"""All channels are clipped above this share of the clipped value, and where a spot's shape is judged above the second:
+demosaicing and JPEG round them off."""
+
+ON_FOREIGN = 0.5
+"""A spot of which more than this share lies on text or an instrument is none of the tissue's."""
+
+FOOT = 0.4
+"""Its pixels are searched for down to this share of that."""
+
+LEAST_SPECULAR = 0.02
 """Least specular light, share of full scale: two steps of an 8-bit sRGB picture at mid tones."""
 
 
@@ -59,30 +98,98 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
         The pixels inside the view; default all.
     """
     light = split_light(linear, clipped, seen)
-    least = max(LEAST_SPECULAR, NOISE_FACTOR * light.noise)
-    seen_light = light.specular >= least
-    mask = _above_own_peak(seen_light & (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue), light.specular)
-    # A small highlight, blurred by lens and sensor, may nowhere be as bright as the tissue under it.
-    wider = _above_own_peak(seen_light & (light.specular >= FAINT_RATIO * light.tissue), light.specular)
-    return ColourDetection(light, mask, highlights_of(wider, light, linear, clipped, seen))
+    smoothed = smooth(light.specular, SMOOTHING_PX, seen)
+    tissue = smooth(light.tissue, SMOOTHING_PX, seen)
+    noise = NOISE_LEFT * light.noise
+    # candidates: pixels that may belong to a highlight, and what its peak must have
+    ratio = max(FAINT_RATIO, TEXTURE_FACTOR * _texture(smoothed, tissue, clipped, seen))
+    candidates = smoothed >= np.maximum(max(FOOT * LEAST_SPECULAR, NOISE_FACTOR * noise), FOOT * ratio * tissue)
+    if seen is not None:
+        candidates &= seen
+    least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
+    flat = _all_clipped(linear, clipped, PLATEAU)
+    spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
+    spots = _brighter_than_around(spots, smoothed + tissue, candidates, ratio, seen)
+    bright = _pixels(spots, candidates.shape)
+    foreign = find_foreign(bright)
+    if foreign.any():
+        spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
+    made = classify(spots, smoothed, light, linear, bright, flat, _all_clipped(linear, clipped, GLARE), seen)
+    kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
+    # pixels that show a highlight
+    mask = _pixels([spot for spot, _ in kept], candidates.shape)
+    more = (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue) & candidates & ~foreign
+    mask |= _feet([spot for spot, _ in kept], mask, light.specular, more)
+    return ColourDetection(light, mask, [highlight for _, highlight in kept])
 
 
-def _above_own_peak(above: Mask, specular: Image) -> Mask:
-    """Remove specks, and pixels far below their highlight's own peak."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
-    if count < 2:
-        return above
-    # peak of each connected part
-    rows, columns = np.nonzero(above)
-    number = labels[rows, columns]
-    peaks = np.zeros(count, dtype=np.float32)
-    np.maximum.at(peaks, number, specular[rows, columns])
-    # reject small parts and low pixels
-    large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA_PX
-    kept = large[number] & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peaks[number])
-    mask = np.zeros(above.shape, dtype=bool)
-    mask[rows[kept], columns[kept]] = True
+def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
+    """Return the pixels of spots."""
+    mask = np.zeros(shape, dtype=bool)
+    for spot in spots:
+        mask[spot.crop] |= spot.mask
     return mask
+
+
+def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
+    """Return the robust spread of specular light over the tissue's, where the tissue's colour varies by itself."""
+    sound = ~clipped & (tissue > TEXTURE_LIGHT)
+    if seen is not None:
+        sound &= seen
+    values = specular[::2, ::2][sound[::2, ::2]] / tissue[::2, ::2][sound[::2, ::2]]
+    if len(values) < MIN_TEXTURE_PX:
+        return 0.0
+    middle = float(median(values))
+    return MAD_TO_SIGMA * float(median(np.abs(values - middle)))
+
+
+def _brighter_than_around(
+    spots: list[Spot], total: Image, candidates: Mask, ratio: float, seen: Mask | None
+) -> list[Spot]:
+    """Leave out spots that are paler than the tissue around, but no brighter."""
+    if not spots:
+        return spots
+    known = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
+    if seen is not None:
+        known &= seen
+    around = fill(total, known)
+    rows, columns = (np.array([spot.peaks[0][i] for spot in spots]) for i in (1, 0))
+    rise = total[rows, columns] - around[rows, columns]
+    return [
+        spot
+        for spot, more, below in zip(spots, rise, around[rows, columns], strict=True)
+        if more >= RISE * ratio * below
+    ]
+
+
+def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:
+    """Return which of more pixels belong to the nearest spot: near it, and not far below its peak."""
+    if not spots:
+        return mask
+    number = np.zeros(mask.shape, dtype=np.int32)
+    for i, spot in enumerate(spots):
+        number[spot.crop][spot.mask] = i
+    away, nearest = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    rows, columns = np.nonzero(more & ~mask)
+    owner = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    owner[nearest[mask]] = number[mask]
+    mine = owner[nearest[rows, columns]]
+    reach = np.array([FOOT_REACH * np.sqrt(spot.area_px / np.pi) + 1 for spot in spots])
+    peak = np.array([spot.value for spot in spots])
+    near = (away[rows, columns] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
+    feet = np.zeros(mask.shape, dtype=bool)
+    feet[rows[near], columns[near]] = True
+    return feet
+
+
+def _all_clipped(linear: Image, clipped: Mask, share: float) -> Mask:
+    """Return where all channels are above a share of the least value that a clipped one has."""
+    if not clipped.any():
+        return clipped
+    most = linear.max(axis=2)
+    return np.asarray(linear.min(axis=2) >= share * most[clipped].min())
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,10 @@ SIDE_PX = 1.5
 UNFILLED, FILLED = 0.01, 0.6
 """Largest share of the picture that may be dark inside the sides, and least share that lies inside them."""
 
+NOTCH, NOTCH_DARK = 0.1, 0.98
+"""An inset's black box has at least this share of the view's height and width, and that share of it is dark: a cut
+corner is dark by half."""
+
 MARGIN = 0.012
 """Width of the rim that belongs to the border, as a share of the picture's longer side: bright edges, stray light."""
 
@@ -71,6 +75,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         return WHOLE
     tolerance = max(1.5, TOLERANCE * max(size))
     ratio = np.array([width / size[0], height / size[1]])
+    inside, notch = _without_notch(inside)
     hull = cv2.convexHull(np.argwhere(inside)[:, ::-1].astype(np.int32).reshape(-1, 1, 2))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
     # Cut corners also lie on a circle, within a pixel or two, so straight sides are tried first.
@@ -87,7 +92,9 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         found = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
     else:
         found = None
+    filled &= ~notch
     # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
+    filled &= ~_bars(small if small.ndim == 2 else small.max(axis=2))
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
     depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
     return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), found)
@@ -114,6 +121,46 @@ def _inside(brightness: Image) -> Mask | None:
     if count < 2:
         return None
     return np.asarray(labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _without_notch(inside: Mask) -> tuple[Mask, Mask]:
+    """Return the lit part with the black box that an inset picture leaves in a corner filled, and that box.
+
+    The box is a dark part in a corner of the lit part's bounding box that has straight, upright sides.
+    """
+    none = np.zeros(inside.shape, dtype=bool)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+    dark = ~inside[top:bottom, left:right]
+    height, width = dark.shape
+    for flip in (np.s_[:, :], np.s_[::-1, :], np.s_[:, ::-1], np.s_[::-1, ::-1]):
+        corner = dark[flip]
+        # how far the dark goes along the two sides, and the box that these span
+        down, across = _run(corner[:, 0]), _run(corner[0])
+        if not (NOTCH * height <= down < height and NOTCH * width <= across < width):
+            continue
+        box = np.zeros(dark.shape, dtype=bool)
+        box[flip][:down, :across] = True
+        if dark[box].mean() >= NOTCH_DARK:
+            notch = none.copy()
+            notch[top:bottom, left:right] = cv2.dilate(box.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            return inside | notch, notch
+    return inside, none
+
+
+def _bars(brightness: Image) -> Mask:
+    """Return the black bars along the sides of a picture, which cut a round view there."""
+    bars = np.zeros(brightness.shape, dtype=bool)
+    for turned, part in ((brightness, bars), (brightness.T, bars.T)):
+        dark = turned.max(axis=1) < DARK
+        part[: _run(dark)] = True
+        part[len(dark) - _run(dark[::-1]) :] = True
+    return bars
+
+
+def _run(line: Mask) -> int:
+    """Return how many elements of a line are set before the first that is not."""
+    return int(np.argmin(np.append(line, False)))
 
 
 def _border(inside: Mask) -> Array:

@@ -1,5 +1,6 @@
 """`bisector`: with the light's position known, the normal bisects the directions to light and camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from simtest.calibration import NO_PRIORS, Distribution, Normal, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, line_covariance
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.prior_parts import add_camera_and_falloff
 from simtest.estimators.protocol import Estimate
@@ -42,6 +43,10 @@ class Bisector:
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, self.isovalues)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told.
 
@@ -49,11 +54,12 @@ class Bisector:
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
         mean square of what the single lights would give. Fails as `cone_axis` does, and with ``not_known`` without
-        lights.
+        lights. In a highlight too small for isophotes s is the sightline of its centre, flagged ``unresolved``, and no
+        axis ratio is stated.
         """
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
-        family = fit_isophote_family(patch, camera, self.isovalues)
+        family = fit_highlight(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
         lights, flags = priors.lights, family.flags
@@ -85,7 +91,7 @@ class Bisector:
 bisector = Bisector()
 
 
-def _mean_normal(family: IsophoteFamily, light: Array, distance: Distribution) -> tuple[Array, Array]:
+def _mean_normal(family: HighlightAxis, light: Array, distance: Distribution) -> tuple[Array, Array]:
     """Return normal and sightline of the BP: at the distance's mean, or their mean over a distribution of any shape."""
     if isinstance(distance, Normal):
         normals, sightlines = _normals(family, light, np.array([distance.mean]))
@@ -95,7 +101,7 @@ def _mean_normal(family: IsophoteFamily, light: Array, distance: Distribution) -
     return normal / np.linalg.norm(normal), sightline / np.linalg.norm(sightline)
 
 
-def _normals(family: IsophoteFamily, light: Array, distances: Array, turn: Array | None = None) -> tuple[Array, Array]:
+def _normals(family: HighlightAxis, light: Array, distances: Array, turn: Array | None = None) -> tuple[Array, Array]:
     """Return normals and sightlines of the BP at distances, shape (D,), both (D, 3).
 
     `turn`, rad in the family's basis, moves the measured sightline.
@@ -116,7 +122,7 @@ def _normals(family: IsophoteFamily, light: Array, distances: Array, turn: Array
     return bisect(d * sightlines, light), sightlines
 
 
-def _budget(family: IsophoteFamily, light: Array, distance: Distribution, normal: Array) -> Budget | None:
+def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal: Array) -> Budget | None:
     """Return the budget of the normal: that of the axis at the peak, and the distance."""
     if family.peak_budget is None:
         return None
@@ -128,7 +134,7 @@ def _budget(family: IsophoteFamily, light: Array, distance: Distribution, normal
     return {**own, "distance": _distance_part(family, light, distance, across)}
 
 
-def _distance_part(family: IsophoteFamily, light: Array, distance: Distribution, across: Array) -> Array:
+def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:
     """Return the covariance of the normal by the distance, shape (2, 2), rad^2, in the basis `across`."""
     if isinstance(distance, Normal):
         near_and_far = distance.mean * np.array([1.0, 1 + STEP])

@@ -8,6 +8,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
+from simtest.estimators.highlight_fit import fit_small
 from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.estimators.protocol import Estimate
@@ -88,7 +89,8 @@ class CirclePoseEstimator:
         centres' distance: usually the light is at the camera, and the two-fold model does not apply. `region` holds the
         normals that the isophote's noise allows: about both candidates, which near the branch point are one region. It
         is stated only where the surface is known to be a plane: on a curved one the isophote is no circle, and the
-        normal is off by tens of degrees (theory.md section 4), whatever the light.
+        normal is off by tens of degrees (theory.md section 4), whatever the light. Fails with
+        ``unresolved`` where a highlight is too small for its isophotes to carry its shape.
         """
         return self.estimate_batch([patch], camera, priors)[0]
 
@@ -96,7 +98,9 @@ class CirclePoseEstimator:
         self, patches: Sequence[Patch], camera: Camera, priors: Priors = NO_PRIORS
     ) -> list[Estimate | Failure]:
         """Estimate several normals at once, many times faster than one by one where regions are left out."""
-        fitted = fit_isophote_of_each(patches, camera, self.isovalue)
+        small = fit_small(patches, camera)
+        resolved = [patch if spot is None else spot.no_shape for patch, spot in zip(patches, small, strict=True)]
+        fitted = fit_isophote_of_each(resolved, camera, self.isovalue)
         pairs = zip(patches, fitted, strict=True)
         pending = [(patch, isophote) for patch, isophote in pairs if not isinstance(isophote, Failure)]
         posed = zip(pending, _pose(pending, camera), strict=True)

@@ -1,11 +1,12 @@
 """`cone_axis`: the axis of the isophotes' back-projected cones carries the normal (theory.md section 3, item 4)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.isophote_family import fit_isophote_family
+from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch
@@ -25,14 +26,20 @@ class ConeAxis:
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, self.isovalues)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate and looks along the axis. Isovalues without a closed isophote are left out and
         flagged ``missing_isovalues``; with fewer than 2 left it fails for the first one's reason. The covariance is
-        that of the noise and, where the axis drifts with the isovalue by more than noise, of the drift.
+        that of the noise and, where the axis drifts with the isovalue by more than noise, of the drift. A highlight
+        too small for isophotes gets the normal of its centre, without axis ratio, flagged ``unresolved``
+        (`simtest.estimators.small_spot`).
         """
-        family = fit_isophote_family(patch, camera, self.isovalues)
+        family = fit_highlight(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
         estimate = Estimate(

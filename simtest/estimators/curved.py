@@ -1,6 +1,7 @@
 """`curved`: the isophotes' centre carries the normal, their shape the curvature (theory.md section 3)."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,11 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
+from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
+from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Patch
 
 STREAK_GAIN = 0.1
@@ -40,16 +43,23 @@ class Curved:
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, self.isovalues)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate normal and curvature (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate, the flags of `cone_axis`, and ``round`` where noise hides the principal
         directions. Fails as `cone_axis` does; with ``degenerate_conic`` where the moments at the peak are not those of
-        a lobe, and with ``streak`` where 1 + d k is near 0.
+        a lobe, and with ``streak`` where 1 + d k is near 0. A highlight too small for isophotes gets the normal of its
+        centre, flagged ``unresolved``, and no curvature.
         """
-        family = fit_isophote_family(patch, camera, self.isovalues)
+        family = fit_highlight(patch, camera, self.isovalues)
         if isinstance(family, Failure):
             return family
+        if isinstance(family, SmallSpot):
+            return add_untold_parts(family.estimate(), camera, priors, family)
         found = _curvature(family, None if priors.lobe_curvature is None else priors.lobe_curvature.mean)
         if isinstance(found, Failure):
             return found

@@ -7,7 +7,6 @@ extrapolated to the peak by a straight line (theory.md section 3, items 3 and 4;
 isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.extrapolation`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,17 +15,15 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
+from simtest.estimators.clipping import hidden_peak_moments, plateau_area_px
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_crossings import FamilyCrossings
-from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote, fit_isophotes
+from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
-from simtest.geometry import Array, Camera, CirclePose, Patch, circle_poses, cone_axes
+from simtest.geometry import Array, Camera, CirclePose, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
-
-MIN_ISOPHOTES = 2
-"""One isophote alone may be an accident of the background."""
 
 DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
 """Squared Mahalanobis distances beyond which the axis's drift is more than noise, or may be: 0.1 % and 20 % of normal
@@ -43,6 +40,12 @@ of the generated colon, on viewpoints that no published figure uses."""
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
+
+HOLDS_OTHERS = "holds other highlights"
+"""End of the detail of a Failure of an isophote that was left out for it."""
+
+MIN_CLIPPED_PX = 3
+"""Fewer clipped pixels change a smoothed peak by less than its noise."""
 
 NOISE_FACTOR = 2.0
 """Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
@@ -164,6 +167,15 @@ class IsophoteFamily:
         """The same without extrapolation, shape (2, 2): less noisy, with the same principal directions."""
         return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
 
+    @cached_property
+    def seen_moments(self) -> Array:
+        """The lobe's second moments as seen, with what smoothing adds, rad^2, in the basis, shape (2, 2).
+
+        Without a fit of the peak's value, which takes as long as all else: for shifts that need no precision.
+        """
+        levels = -np.log([isophote.isovalue for isophote in self.isophotes])
+        return np.asarray(self._tangent_moments.sum(axis=0) / (2 * levels.sum()))
+
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
         return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self._px2)
@@ -210,6 +222,13 @@ class IsophoteFamily:
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
         return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
+    def at(self, isovalue: float) -> "IsophoteFamily | None":
+        """Return the family of one of the isophotes alone, if it is whole."""
+        for isophote, pose in zip(self.isophotes, self.poses, strict=True):
+            if isophote.isovalue == isovalue and not isophote.cut:
+                return IsophoteFamily(self.patch, self.camera, (isophote,), (pose,), ())
+        return None
+
     def conic(self, k: int) -> Array:
         """Return (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
         return self._crossings.conics[k]
@@ -229,14 +248,14 @@ class IsophoteFamily:
 
     @property
     def axis_budget(self) -> Budget | None:
-        """Budget of the mean axis in the basis: noise, and shape where the drift may be more than noise."""
+        """Budget of the mean axis in the basis: noise, shape where the drift may be more, resolution if clipped."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
+        budget = {"noise": covariance[:2, :2], **self.clipping}
         if self._drift_chi2 <= SUSPECT_CHI2:
-            return {"noise": covariance[:2, :2]}
-        shape = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
-        return {"noise": covariance[:2, :2], "shape": shape}
+            return budget
+        return {**budget, "shape": MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error}
 
     @property
     def drift_excess(self) -> float:
@@ -248,14 +267,23 @@ class IsophoteFamily:
 
     @property
     def peak_budget(self) -> Budget | None:
-        """Budget of the axis at the peak in the basis: noise, and shape where a straight line misses the drift."""
+        """Budget of the axis at the peak in the basis: noise, shape where a line misses the drift, resolution."""
         covariance = self.axes_covariance
         if covariance is None:
             return None
         both = np.hstack([np.eye(2), np.eye(2)])
-        noise = np.asarray(both @ covariance @ both.T)
+        budget = {"noise": np.asarray(both @ covariance @ both.T), **self.clipping}
         # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
-        return {"noise": noise, "shape": self._line_error} if self.drift_is_real else {"noise": noise}
+        return {**budget, "shape": self._line_error} if self.drift_is_real else budget
+
+    @cached_property
+    def clipping(self) -> dict[str, Array]:
+        """Part of the budget for a clipped peak, which the isophotes below do not show; empty if none is clipped."""
+        area = plateau_area_px(self.patch, float(self._crossings.isovalues.min()))
+        if area < MIN_CLIPPED_PX:
+            return {}
+        innermost = float(self.residuals[-1])
+        return {"resolution": hidden_peak_moments(area, self._tangent_moments.sum(axis=0), self._px2, innermost)}
 
     @property
     def _line_error(self) -> Array:
@@ -266,6 +294,17 @@ class IsophoteFamily:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         return self._crossings.tangents(points).T
 
+    @property
+    def least(self) -> float:
+        """Isovalue below which the isophotes hold other highlights too; 0 where none does."""
+        others = any(failure.detail.endswith(HOLDS_OTHERS) for failure in self.failures)
+        return self.isophotes[0].isovalue if others else 0.0
+
+    @property
+    def residuals(self) -> Array:
+        """RMS distance of each isophote's points from its conic, over its mean radius, shape (K,)."""
+        return self._crossings.residuals
+
     @cached_property
     def is_bent(self) -> bool:
         """Whether an isophote differs from an ellipse by more than a point highlight's does, noise included."""
@@ -275,7 +314,7 @@ class IsophoteFamily:
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
         by_noise = left / (-2 * isovalues * np.log(isovalues))
-        return bool((self._crossings.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
+        return bool((self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise)).any())
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -316,47 +355,3 @@ class IsophoteFamily:
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
-
-
-def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
-    """Fit the isophotes of one highlight.
-
-    Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
-    fitted too; with fewer than 2 of either kind the result is the first one's Failure.
-    """
-    # whole isophotes
-    fitted, failures = fit_isophotes(patch, camera, isovalues)
-    kept, poses, failures = _with_poses(fitted, failures)
-    least = min(MIN_ISOPHOTES, len(isovalues))
-    if len(poses) < least:
-        # too few: add arcs of those that the border or the view cuts
-        whole = {isophote.isovalue for isophote in kept}
-        arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in whole]
-        cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
-        if len(kept) + len(cut) < least:
-            return failures[0]
-        failed = [arc for arc in arcs if isinstance(arc, Failure)]
-        kept, poses, failed = _with_poses(sorted([*kept, *cut], key=lambda i: i.isovalue), failed)
-        if len(poses) < least:
-            return failures[0]
-        failures = failed
-    return IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures))
-
-
-def _with_poses(
-    fitted: list[FittedIsophote], failures: list[Failure]
-) -> tuple[list[FittedIsophote], list[CirclePose], list[Failure]]:
-    """Return the isophotes whose cones have a pose, their poses, and the failures, those of the others added."""
-    if not fitted:
-        return [], [], failures
-    found = circle_poses(
-        np.array([isophote.cone for isophote in fitted]), np.array([isophote.sightline for isophote in fitted])
-    )
-    kept, poses = [], []
-    for isophote, pose in zip(fitted, (found[i] for i in range(len(fitted))), strict=True):
-        if isinstance(pose, Failure):
-            failures = [*failures, pose]
-        else:
-            kept.append(isophote)
-            poses.append(pose)
-    return kept, poses, failures

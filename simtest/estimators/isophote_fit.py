@@ -73,9 +73,21 @@ def fit_isophotes(
 
     Returns those that succeeded and the failures of the others.
     """
-    results = _fit(isovalues, patch.crossings_of(isovalues), camera)
-    fitted = [result for result in results if isinstance(result, FittedIsophote)]
-    return fitted, [result for result in results if isinstance(result, Failure)]
+    return fit_isophotes_of_each([patch], camera, isovalues)[0]
+
+
+def fit_isophotes_of_each(
+    patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
+) -> list[tuple[list[FittedIsophote], list[Failure]]]:
+    """Return what `fit_isophotes` returns of each patch, all ellipses fitted at once."""
+    contours = [contour for patch in patches for contour in patch.crossings_of(isovalues)]
+    results = iter(_fit([*isovalues] * len(patches), contours, camera))
+    fitted: list[tuple[list[FittedIsophote], list[Failure]]] = []
+    for _ in patches:
+        own = [next(results) for _ in isovalues]
+        kept = [result for result in own if isinstance(result, FittedIsophote)]
+        fitted.append((kept, [result for result in own if isinstance(result, Failure)]))
+    return fitted
 
 
 def fit_isophote_of_each(

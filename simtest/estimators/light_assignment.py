@@ -3,7 +3,7 @@
 import numpy as np
 
 from simtest.calibration import Priors
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.geometry import Array
 
 LARGEST_MISFIT = 0.25
@@ -13,7 +13,7 @@ CLEAR = 2.0
 """The next best light must fit this many times worse for the choice to be clear."""
 
 
-def light_of_highlight(family: IsophoteFamily, priors: Priors) -> int | None:
+def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     """Return the index of the light that made a highlight; None where that is not clear.
 
     The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
@@ -58,7 +58,7 @@ def _misfit(seen: Array, offsets: Array) -> float:
     return best
 
 
-def _other_peaks(family: IsophoteFamily) -> Array:
+def _other_peaks(family: HighlightAxis) -> Array:
     """Return the offsets of the other highlights, the nearest first, tangents in the basis, shape (K, 2)."""
     others, peak = np.array(family.patch.others_px).reshape(-1, 2), family.patch.peak_px
     order = np.argsort(np.linalg.norm(others - peak, axis=1), kind="stable")

@@ -40,6 +40,15 @@ class PeakValue:
 
 
 def fit_peak_value(patch: Patch) -> PeakValue:
+    """Return the apex of a patch, fitted once (see `_fit`)."""
+    _, kept = patch.kept.get("peak value", (None, None))
+    if not isinstance(kept, PeakValue):
+        kept = _fit(patch)
+        patch.kept["peak value"] = (None, kept)
+    return kept
+
+
+def _fit(patch: Patch) -> PeakValue:
     """Fit a paraboloid to the logarithm of a patch above t = 0.8 and return its apex.
 
     Where pixels there are clipped, the ring around them down to t = 0.5 is fitted. Where the region does not close, is

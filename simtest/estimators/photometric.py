@@ -1,5 +1,6 @@
 """`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,14 @@ from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.goodness import excess_of_misfit, is_misfit
-from simtest.estimators.isophote_family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
+from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
+from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
 
@@ -33,6 +36,10 @@ COARSE = 4
 MISFIT_SHARE = 0.9
 """Variance of a misfitting lobe's normal over the squared shift of its misfit, or the squared drift of the isophotes'
 axis; fitted to 614 highlights of the generated colon (`simtest.estimators.isophote_family`)."""
+
+MISFIT_FACTOR = 1.5
+"""A misfit is told where it makes the stated standard deviation this many times larger: texture and lobes of another
+form leave structure in nearly every real highlight, and it seldom matters."""
 
 SAME_RAD = 1e-3
 """Two fits closer than this are one."""
@@ -65,18 +72,25 @@ class Photometric:
     What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
 
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
+
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
-        and ``misfit`` where the residuals hold more structure than the frame's noise; the covariance then includes how
-        far the normal moves when only the pixels around the peak are fitted. It also includes the drift of the
-        isophotes' axis where that is more than noise.
+        and ``misfit`` where the residuals hold more structure than the frame's noise and the stated error is larger by
+        half or more for it: the covariance then includes how far the normal moves when only the pixels around the peak
+        are fitted. It also includes the drift of the isophotes' axis where that is more than noise. A
+        highlight too small for isophotes gets the normal of its centre, flagged ``unresolved``.
         """
-        family = fit_isophote_family(patch, camera, CONE_AXIS_ISOVALUES)
+        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
         if isinstance(family, Failure):
             return family
-        pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in family.isophotes))
+        if isinstance(family, SmallSpot):
+            return add_untold_parts(family.estimate(), camera, priors, family)
+        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
         if isinstance(pixels, Failure):
             return pixels
         fitted = fit_lobe(_quadric(family, pixels.rays), pixels.observed, pixels.clipped)
@@ -85,20 +99,21 @@ class Photometric:
         e, f, s = fitted.model.frame
         covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
         # beyond noise: a misfit, or a drift of the isophotes' axis
-        flags, excess = family.flags, family.drift_excess
+        excess, misfit = family.drift_excess, False
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
+            misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
-            flags = (*flags, "misfit")
         estimate = Estimate(
             normal=fitted.model.normal,
             candidates=fitted.model.normal[None],
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)},
-            flags=flags,
+            budget={"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2), **family.clipping},
+            flags=family.flags,
         )
-        return add_untold_parts(estimate, camera, priors, family)
+        estimate = add_untold_parts(estimate, camera, priors, family)
+        return _with_misfit_told(estimate, 2 * MISFIT_SHARE * excess) if misfit else estimate
 
 
 @dataclass(frozen=True)
@@ -170,9 +185,20 @@ class PhotometricPlane:
 photometric, photometric_plane = Photometric(), PhotometricPlane()
 
 
-def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False) -> HighlightPixels | Failure:
-    """Gather the pixels of the first region that closes; for a cut highlight, those that are seen."""
-    closed = (t for t in REGIONS if not isinstance(patch.crossings(t), Failure))
+def _with_misfit_told(estimate: Estimate, added: float) -> Estimate:
+    """Add the flag ``misfit`` where what it adds to the covariance's trace, rad^2, makes a difference."""
+    if estimate.covariance is None:
+        return estimate
+    without = float(np.trace(estimate.covariance)) - added
+    if added < (MISFIT_FACTOR**2 - 1) * without:
+        return estimate
+    return replace(estimate, flags=(*estimate.flags, "misfit"))
+
+
+def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: float = 0.0) -> HighlightPixels | Failure:
+    """Gather the pixels of the first region from isovalue `least` on that closes; for a cut highlight, those seen."""
+    tried = (t for t in (*REGIONS, least) if t > 0 and t >= least)
+    closed = (t for t in tried if not isinstance(patch.crossings(t), Failure))
     t = next(closed, CUT_REGION if cut else None)
     if t is None:
         return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak up to t = {REGIONS[-1]:g}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
 from simtest.estimators.budget import CONFIDENCE, equivalent_variance
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
@@ -31,6 +31,8 @@ NEGLIGIBLE = 0.1
 STEP_PX = 0.5
 """Step of the sightline's central differences."""
 
+STEPS_PX = STEP_PX * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+
 SPOT_SPREAD, SPOT_ONSET = math.radians(3.2), math.radians(1.3)
 """Highlights lie wider about the base's brightest point than the relief's slope says, since a lobe of finite width
 lights points that miss the light: by this much an axis on wet tissue (lobes of 1 to 2 deg half-angle), in squares,
@@ -42,7 +44,7 @@ SHARES = (np.arange(64) + 0.5) / 64
 
 
 def add_untold_parts(
-    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
     """Add what nobody told to the budget of a normal that is a reversed sightline.
 
@@ -60,28 +62,37 @@ def add_untold_parts(
         Calibration.
     priors : Priors
         What is told.
-    family : IsophoteFamily, optional
+    family : HighlightAxis, optional
         The highlight's isophotes: their moments say how far a falloff moves the peak.
     """
     if priors.lights_mm:
-        estimate = _with_told_lights(estimate, priors)
-    elif estimate.budget is not None:
-        estimate = estimate.with_parts(light_offset=light_offset_part(estimate.normal, priors))
-    return add_camera_and_falloff(estimate, camera, priors, family)
+        return add_camera_and_falloff(_with_told_lights(estimate, priors), camera, priors, family)
+    if estimate.budget is None:
+        return estimate
+    light = light_offset_part(estimate.normal, priors)
+    return estimate.with_parts(light_offset=light, **_camera_and_falloff(estimate, camera, priors, family))
 
 
 def add_camera_and_falloff(
-    estimate: Estimate, camera: Camera, priors: Priors, family: IsophoteFamily | None = None
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
     """Add the parts ``camera`` and ``response`` to the budget of an estimate that has one."""
     if estimate.budget is None:
         return estimate
+    parts = _camera_and_falloff(estimate, camera, priors, family)
+    return estimate.with_parts(**parts) if parts else estimate
+
+
+def _camera_and_falloff(
+    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None
+) -> dict[str, Array]:
+    """Return the parts ``camera`` and ``response``, where the priors leave them open."""
     parts = {}
     if not priors.camera.is_exact:
         parts["camera"] = camera_part(estimate, camera, priors.camera)
     if priors.falloff_power is not None and family is not None:
         parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
-    return estimate.with_parts(**parts) if parts else estimate
+    return parts
 
 
 def light_offset_part(normal: Array, priors: Priors) -> Array:
@@ -101,21 +112,20 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     reach2 = (from_centre[0] / camera.fx) ** 2 + (from_centre[1] / camera.fy) ** 2
     radial = prior.focal_sd**2 + (prior.distortion_sd * reach2) ** 2
     in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * np.eye(2)
-    steps = STEP_PX * np.eye(2)
-    ahead, behind = (camera.unproject(estimate.look_px + sign * steps) for sign in (1.0, -1.0))
-    J = basis_across(estimate.normal) @ ((ahead - behind) / (2 * STEP_PX)).T
+    rays = camera.unproject(estimate.look_px + STEPS_PX)
+    J = basis_across(estimate.normal) @ ((rays[:2] - rays[2:]) / (2 * STEP_PX)).T
     return np.nan_to_num(J @ in_pixels @ J.T)
 
 
-def falloff_part(normal: Array, family: IsophoteFamily, power: Distribution) -> Array:
+def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:
     """Return the covariance of the normal by a falloff cos^k that is left in the frame, shape (2, 2), rad^2.
 
     Its slope, k tan(phi) towards the optical axis, moves the peak by the lobe's moments 1/H times the slope (theory.md
-    section 4).
+    section 4). The moments are those as seen, so that highlights of few pixels get a little too much.
     """
     sightline = family.axis
     slope = family.basis[:, 2] / max(float(sightline[2]), 1e-3)  # grad log cos(phi) across the sightline
-    shift = basis_across(normal) @ family.basis.T @ (family.moments @ slope)
+    shift = basis_across(normal) @ family.basis.T @ (family.seen_moments @ slope)
     return np.asarray(_unit_variance(power) * np.outer(shift, shift))
 
 

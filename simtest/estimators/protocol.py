@@ -9,6 +9,7 @@ import numpy as np
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure
 from simtest.estimators.budget import STATED, Budget, total
+from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.pose_region import PoseRegion
@@ -72,6 +73,8 @@ class Estimate:
     target : {"fine", "base"}
         Which surface's normal is stated: that of the fine one with its relief, or of the base without (theory.md
         section 7).
+    cloud : CloudShape, optional
+        The cloud of highlights that the estimate stands on, where it is not that of a single one.
     """
 
     normal: Array
@@ -86,6 +89,7 @@ class Estimate:
     region: PoseRegion | None = None
     budget: Budget | None = None
     target: Target = "fine"
+    cloud: CloudShape | None = None
 
     def __post_init__(self) -> None:
         if self.budget is not None and self.covariance is None:
@@ -146,6 +150,14 @@ class BatchEstimator(Estimator, Protocol):
 
 
 @runtime_checkable
+class PreparedEstimator(Estimator, Protocol):
+    """Estimates the normal at one highlight from fits that it makes of several at once, kept with their patches."""
+
+    def prepare(self, patches: Sequence[Patch], camera: Camera, /) -> None:
+        """Fit patches at once; `estimate` then finds the fit with its patch."""
+
+
+@runtime_checkable
 class FrameEstimator(Protocol):
     """Estimates normals from the whole frame, as clouds of highlights, networks and foreign cores do."""
 
@@ -167,6 +179,15 @@ class FrameEstimator(Protocol):
         sequence of Estimate, or Failure
             In any order and number, each looking at a pixel of the frame (`Estimate.look_px`), or why there is none.
         """
+
+
+@runtime_checkable
+class CloudEstimator(FrameEstimator, Protocol):
+    """Estimates the base's normal from clouds of highlights: its estimates have a `cloud` each, and are of no patch."""
+
+    @property
+    def least_spots(self) -> int:
+        """Fewest highlights of a cloud."""
 
 
 AnyEstimator = Estimator | FrameEstimator

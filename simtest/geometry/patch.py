@@ -1,6 +1,6 @@
 """A region of interest of a smoothed frame around one peak, and the isophotes in it."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,6 +46,8 @@ class Patch:
         Peaks of the frame's other specularities, px.
     tracer : IsophoteTracer, optional
         Made from the fields above, unless it is one that was.
+    kept : dict
+        What estimators have fitted to this patch, by a name, each with the camera; a copy starts without.
     """
 
     values: Image | Array
@@ -60,6 +62,7 @@ class Patch:
     smoothing_px: float = 0.0
     others_px: tuple[tuple[float, float], ...] = ()
     tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
+    kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.

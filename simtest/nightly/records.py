@@ -57,9 +57,10 @@ settings'. Canaries (`experiment` the canary's name, `low`, `high` its bounds) a
 """
 
 OUTCOMES = ("same", "equivalent", "undecided", "better", "worse", "new", "gone")
-"""same: equal bytes; equivalent: the interval, or every single pair, lies within the margin; worse: beyond the margin
-at the corrected level, or a cell, highlights or a canary that tonight lacks (a regression); better: its mirror image;
-undecided: neither shown; new: the baseline lacks it; gone: tonight has nothing to say of the quantity."""
+"""same: equal bytes, and the same figures of them; equivalent: the interval, or every single pair, lies within the
+margin; worse: beyond the margin at the corrected level, a cell, highlights or a canary that tonight lacks, or another
+figure of the same results (a regression); better: its mirror image; undecided: neither shown; new: the baseline lacks
+it; gone: tonight has nothing to say of the quantity."""
 
 
 class Figure(NamedTuple):

@@ -16,7 +16,8 @@ VERSION = 1
 
 ABOUT = (
     "For constraint i the surface point on the ray depth * sightline[i] through pixel[i] has the unit normal "
-    "normal[i], which faces the camera. Camera frame: x right, y down, z forward; pixel centres at integer + 0.5. "
+    "normal[i], which faces the camera; target[i] says whether it is that of the fine surface with its relief, or of "
+    "the base without. Camera frame: x right, y down, z forward; pixel centres at integer + 0.5. "
     "covariance[i] is that of the normal, rad^2, in its tangent basis[i] (two unit vectors); NaN (null) where the "
     "estimator gives none. "
     "candidates[i] holds all normals that the data allow."
@@ -41,6 +42,7 @@ class Constraint:
     candidates: Array
     score: float | None
     flags: tuple[str, ...]
+    target: str
 
 
 def constraints_of(spots: Sequence[SpecularityRecord]) -> list[Constraint]:
@@ -58,6 +60,7 @@ def constraints_of(spots: Sequence[SpecularityRecord]) -> list[Constraint]:
             candidates=spot.normals.get("circle_pose", best).candidates,
             score=spot.score,
             flags=best.flags,
+            target=best.target,
         )
         for spot in spots
         if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
@@ -74,7 +77,7 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
     """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
 
     id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3) with
-    NaN where there is no second, estimator (N,) as text.
+    NaN where there is no second, estimator and target (N,) as text.
     """
     made = constraints_of(record.specularities)
     stacked = {}
@@ -85,12 +88,15 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
     candidates = np.full((len(made), 2, 3), np.nan)
     for pair, constraint in zip(candidates, made, strict=True):
         pair[: len(constraint.candidates)] = constraint.candidates[:2]
-    ids, estimators = ([getattr(constraint, name) for constraint in made] for name in ("id", "estimator"))
+    ids, estimators, targets = (
+        [getattr(constraint, name) for constraint in made] for name in ("id", "estimator", "target")
+    )
     return {
         "version": np.array(VERSION),
         "id": np.array(ids, dtype=int),
         **stacked,
         "candidates": candidates,
         "estimator": np.array(estimators, dtype=str),
+        "target": np.array(targets, dtype=str),
         "K": record.camera.K,
     }

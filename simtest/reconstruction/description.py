@@ -17,7 +17,7 @@ from simtest.estimators.protocol import Estimate, Target, drawable
 from simtest.geometry import Camera
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.ranking import StatedErrors, best_of, stated_errors
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
@@ -166,6 +166,11 @@ class PictureRecord:
     smoothing_px: float | None = None
     inferred: Sequence[str] = ()
 
+    @property
+    def stated(self) -> StatedErrors | None:
+        """What the best estimates state, with the medians of their budgets; None where none states anything."""
+        return stated_errors([best for each in self.specularities if (best := each.best_estimate) is not None])
+
     def to_json(self) -> JsonObject:
         """Return the content of normals.json."""
         others = [
@@ -182,8 +187,10 @@ class PictureRecord:
             "view": _view_json(self.view),
             "warnings": self.warnings,
             "assumed": self.assumed,
+            "stated": self.stated,
             "frame": FRAME,
             "specularities": self.specularities,
+            "clouds": [entry for spot in self.specularities for entry in _clouds_json(spot)],
             "other_highlights": others,
             "provenance": provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),
@@ -214,7 +221,7 @@ def _describe(
     drawings = {
         name: Drawing(
             [(t, np.round(points, 3).tolist()) for t, points in result.contours(patch)],
-            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
+            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes] + _cloud_outline(result, camera),
         )
         for name, result in estimates.items()
         if isinstance(result, Estimate)
@@ -234,6 +241,33 @@ def _view_json(view: View) -> JsonObject | None:
     contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
     return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
+
+
+def _cloud_outline(result: Estimate, camera: Camera) -> list[Points]:
+    """Return the outline of an estimate's cloud, px, as curves to draw; none where it has no cloud."""
+    if result.cloud is None:
+        return []
+    look = camera.unproject(result.look_px)
+    return [drawable(camera.project(result.cloud.outline(result.normal, look)))]
+
+
+def _clouds_json(spot: SpecularityRecord) -> list[JsonObject]:
+    """Describe the clouds of highlights that estimates of a specularity stand on."""
+    return [
+        {
+            "specularity": spot.id,
+            "estimator": name,
+            "highlights": len(cloud.points_px),
+            "points_px": np.round(cloud.points_px, 2),
+            "covariance": cloud.covariance,
+            "axis_ratio": cloud.axis_ratio,
+            "seen": cloud.seen,
+            "slope_deg": {end: float(np.degrees(getattr(cloud.slope, end))) for end in ("value", "low", "high")},
+            "outline": spot.drawings[name].curves[0] if name in spot.drawings else None,
+        }
+        for name, result in spot.normals.items()
+        if (cloud := result.cloud) is not None
+    ]
 
 
 def _highlight_json(highlight: Highlight) -> JsonObject:

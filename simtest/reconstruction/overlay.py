@@ -55,7 +55,11 @@ def _draw_spot(
     canvas: Picture, spot: SpecularityRecord, palette: dict[str, Colour], size: tuple[int, float],
     shown: dict[str, Colour],
 ) -> None:  # fmt: skip
-    """Draw the isophote at half height, the ellipses and candidates of circle_pose, and the best normal."""
+    """Draw the isophote at half height, the ellipses and candidates of circle_pose, clouds, and the best normal."""
+    for of_cloud in (name for name, estimate in spot.normals.items() if estimate.cloud is not None):
+        for curve in spot.drawings[of_cloud].curves:
+            _polyline(canvas, curve, palette[of_cloud], size[0])
+        shown[of_cloud] = palette[of_cloud]
     for name in dict.fromkeys(("circle_pose", spot.best)):
         result = spot.normals.get(name) if name else None
         if name is None or result is None:

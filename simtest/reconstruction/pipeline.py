@@ -17,6 +17,7 @@ from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
+from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
@@ -33,7 +34,7 @@ from simtest.reconstruction.picture_values import check_frame, check_roi, check_
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
 
-DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
+DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
 SMALL_RADIUS = 3.0
@@ -237,7 +238,8 @@ def reconstruct_colour(
     Returns
     -------
     Reconstruction
-        Estimates of highlights that smoothing has made rounder have the flag ``small``.
+        Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
+        to have a shape ``unresolved``.
     """
     return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
 
@@ -335,10 +337,14 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     rounded_px = SMALL_RADIUS * frame.smoothing_px
     small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
-        estimates = {name: _flagged(each.of_patches[i], patch, limited, small[i]) for name, each in made.items()}
+        own = {name: each.of_patches[i] for name, each in made.items()}
+        estimates = {
+            name: _flagged(result, patch, limited, small[i]) for name, result in own.items() if result is not None
+        }
         result.specularities.append(Specularity(region, patch, estimates))
     undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
-    result.specularities.extend(undetected)
+    # Clouds stand last.
+    result.specularities.extend(sorted(undetected, key=_is_of_cloud))
     return result
 
 
@@ -357,12 +363,24 @@ def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
     return replace(made, specularities=based)
 
 
+def _is_of_cloud(specularity: Specularity) -> bool:
+    return any(isinstance(e, Estimate) and e.cloud is not None for e in specularity.estimates.values())
+
+
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
-    """Return the specularity of a frame estimator's result that no patch takes: one pixel, and no patch."""
+    """Return the specularity of a frame estimator's result that no patch takes: it has none.
+
+    Its region is one pixel, or the box around a cloud's highlights.
+    """
     height, width = frame.encoded.shape[:2]
     x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
-    no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
-    return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    if estimate.cloud is None:
+        no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
+        return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
+    low, high = (end(estimate.cloud.points_px, axis=0).astype(int).tolist() for end in (np.min, np.max))
+    box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
+    no_patch = Failure(Reason.NO_PEAK, f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one")
+    return Specularity(Region(box, (x, y), None), no_patch, {name: estimate})
 
 
 def _flagged(
@@ -377,7 +395,8 @@ def _flagged(
         (x, y), (height, width) = patch.origin_px, patch.values.shape
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
-    flags = ("small",) if small else ()
+    # An unresolved highlight states no shape that smoothing could have changed.
+    flags = ("small",) if small and UNRESOLVED not in result.flags else ()
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))

@@ -1,11 +1,12 @@
 """Which of a highlight's estimates is the best one, and why: the one with the smallest stated error."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from simtest.errors import Failure
-from simtest.estimators.budget import dominant
+from simtest.estimators.budget import deviations, dominant
 from simtest.estimators.protocol import Estimate, Target
 
 WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "brightest_point")
@@ -17,6 +18,47 @@ and `circle_pose` last, which takes a curved surface for a plane."""
 def deviation_deg(estimate: Estimate) -> float | None:
     """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
     return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
+
+
+@dataclass(frozen=True)
+class StatedErrors:
+    """What the best estimates of a picture state, deg: medians of the standard deviation and of each part's.
+
+    Parameters
+    ----------
+    count, silent : int
+        Best estimates that state an uncertainty, and others.
+    median_deg : float
+        Of the square root of the covariance's trace.
+    parts_deg : dict
+        The same of each part of the budget, the largest first.
+    """
+
+    count: int
+    silent: int
+    median_deg: float
+    parts_deg: dict[str, float]
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{name} {value:.2g}" for name, value in self.parts_deg.items())
+        left = f"; {self.silent} state none" if self.silent else ""
+        return f"median ± {self.median_deg:.2g} deg of {self.count} best normals ({parts}){left}"
+
+
+def stated_errors(best: Sequence[Estimate]) -> StatedErrors | None:
+    """Summarise the uncertainties of a picture's best estimates; None where none states any."""
+    stated = [each for each in best if each.covariance is not None]
+    if not stated:
+        return None
+    parts: dict[str, list[float]] = {}
+    for each in stated:
+        for name, value in deviations(each.budget or {}).items():
+            parts.setdefault(name, []).append(float(np.degrees(value)))
+    # A part that some estimates do not have is 0 there.
+    medians = {name: float(np.median(values + [0.0] * (len(stated) - len(values)))) for name, values in parts.items()}
+    median = float(np.median([deviation_deg(each) for each in stated]))
+    ordered = dict(sorted(medians.items(), key=lambda item: -item[1]))
+    return StatedErrors(len(stated), len(best) - len(stated), median, ordered)
 
 
 def best_of(estimates: Mapping[str, Estimate | Failure], target: Target = "fine") -> tuple[str | None, str]:

@@ -62,7 +62,7 @@ def rows(
     for i, specularity in enumerate(specularities):
         true_id = matched.get(i)
         truth = None if true_id is None else truths[true_id]
-        row = replace(_scene_row(scene, common, truth), specularity=i, true_id=true_id)
+        row = replace(scene_row(scene, common, truth), specularity=i, true_id=true_id)
         row = rough.filled(row, i, truth)
         if on_instrument is not None:
             row = replace(row, swept={**row.swept, ON_INSTRUMENT: on_instrument[i]})
@@ -73,7 +73,7 @@ def rows(
             if isinstance(result, Failure):
                 made.append(replace(row, estimator=name, status=str(result.reason), flags=result.detail))
                 continue
-            answered = _estimate_row(replace(row, estimator=name), result)
+            answered = estimate_row(replace(row, estimator=name), result)
             made.append(
                 answered
                 if truth is None
@@ -83,14 +83,14 @@ def rows(
     held = {(row.true_id, row.estimator) for row in made}
     for j, truth in enumerate(truths):
         if missing := [name for name in estimators if (j, name) not in held]:
-            row = replace(_scene_row(scene, common, truth), true_id=j, status=unfound)
+            row = replace(scene_row(scene, common, truth), true_id=j, status=unfound)
             row = rough.filled(row, None, truth)
             made += [replace(row, estimator=name) for name in missing]
     return made
 
 
-def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> ResultRow:
-    """Fill in the scene and, unless the detection is false, the true highlight."""
+def scene_row(scene: Scene, common: ResultRow, truth: HighlightPoint | None) -> ResultRow:
+    """Fill in the scene and, unless the detection is false, the true highlight or the centre of the true cloud."""
     # Scene.
     row = replace(
         common,
@@ -115,7 +115,7 @@ def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> 
         kd_min_base=truth.kd_min_base,
         kd_max_base=truth.kd_max_base,
         eps_over_d=float(np.linalg.norm(light)) / truth.distance,
-        peak_snr=truth.peak_snr if np.isfinite(truth.peak_snr) else None,
+        peak_snr=truth.peak_snr if isinstance(truth, TrueHighlight) and np.isfinite(truth.peak_snr) else None,
         axis_ratio_law=float(laws.axis_ratio(truth.kd_min, truth.kd_max)),
         bp_true_x_px=float(truth.bp_px[0]),
         bp_true_y_px=float(truth.bp_px[1]),
@@ -125,7 +125,7 @@ def _scene_row(scene: Scene, common: ResultRow, truth: TrueHighlight | None) -> 
     )
 
 
-def _estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
+def estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
     """Fill in an estimate."""
     isovalues = [isophote.isovalue for isophote in estimate.isophotes]
     normal_x, normal_y, normal_z = estimate.normal.tolist()

@@ -12,6 +12,7 @@ from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
+from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.results_table import ResultRow
@@ -88,13 +89,16 @@ def realise(
     dark = view.full_scale <= 0
     # Without light whatever is found is noise; no highlight counts as isolated, and all count as failures.
     specularities = [] if dark else reconstruct(frame, view.calibration, estimators, isolated=case.isolated)
+    # What is of clouds is judged by the base's highlight points, the rest by the true highlights.
+    cloud_names = of_clouds(estimators)
+    singles, of_base, refused = apart(specularities, cloud_names)
     counted = [i for i, truth in enumerate(view.highlights) if truth.isolated or not case.isolated or dark]
     truths = [view.highlights[i] for i in counted]
-    matched = match(specularities, [truth.bp_px for truth in truths])
+    matched = match(singles, [truth.bp_px for truth in truths])
     rough = None
     if view.is_rough:
         # Detection is scored on what can be seen: the relief melts and hides glints.
-        seen = match(specularities, [spot.peak_px for spot in view.visible_highlights])
+        seen = match(singles, [spot.peak_px for spot in view.visible_highlights])
         rough = rough_truth(session, view, counted, seen)
     common = ResultRow(
         experiment=experiment.name,
@@ -106,6 +110,9 @@ def realise(
         swept={**case.swept, **drawn},
     )
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
-    metal = on_instruments(specularities, matched, view)
-    made = rows(session, common, specularities, truths, matched, list(estimators), unfound, rough, metal)
+    metal = on_instruments(singles, matched, view)
+    single_names = [name for name in estimators if name not in cloud_names]
+    made = rows(session, common, singles, truths, matched, single_names, unfound, rough, metal)
+    if cloud_names:
+        made += cloud_rows(session, view, common, of_base, refused, {} if rough is None else rough.clouds)
     return Realisation(number, view, made, frame, specularities, truths, matched)

@@ -104,7 +104,7 @@ class RoughTruth:
             alone = None if row.true_id is None else self.alone_px.get(row.true_id)
             row = replace(row, pool=truth.pool, radius_px=alone, radius_law_px=law)
         cloud = None if row.cloud is None else self.clouds.get(row.cloud)
-        return row if cloud is None else _cloud_row(row, cloud)
+        return row if cloud is None else filled_with_cloud(row, cloud)
 
 
 def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
@@ -112,7 +112,8 @@ def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
     return [spot for spot in visible if spot.peak_snr >= HIGHLIGHT_CONTRAST_SIGMA]
 
 
-def _cloud_row(row: ResultRow, cloud: Cloud) -> ResultRow:
+def filled_with_cloud(row: ResultRow, cloud: Cloud) -> ResultRow:
+    """Fill the columns of a cloud that is wholly in view."""
     covariance = cloud.covariance
     return replace(
         row,

@@ -11,7 +11,7 @@ from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera
-from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
 from simtest.spec import load_camera, load_experiment, load_scene, parse_settings, scene_from_dict
 from simtest.spec.surface import AnatomySurface
 from simtest.surfaces import make_surface
@@ -583,7 +583,7 @@ def test_frames_without_a_highlight_give_an_empty_list(name):
 def test_a_region_without_a_peak_is_a_failure(name):
     frame = NOTHING_TO_SEE["black"] - 1 if name == "negative" else NOTHING_TO_SEE[name]
     (found,) = reconstruct(frame, EYE, roi=(4, 4, 20, 16))
-    assert len(found.estimates) == 3
+    assert len(found.estimates) == len(DEFAULT_ESTIMATORS)
     assert all(isinstance(e, Failure) and e.reason == Reason.NO_PEAK for e in found.estimates.values())
 
 

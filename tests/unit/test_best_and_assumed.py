@@ -10,7 +10,7 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.reconstruction.assumptions import FOCAL_SD, assumptions, calibration_of_view
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.ranking import best_of, stated_errors
 from simtest.runtime.files import write_json
 from simtest.spec import load_calibration
 
@@ -59,6 +59,16 @@ def test_the_best_is_one_that_states_the_wanted_surface():
 def test_the_largest_part_is_named():
     light = {"light_offset": np.radians(4.0) ** 2 * np.eye(2)}
     assert "mostly light_offset" in best_of({"cone_axis": stating(1.0).with_parts(**light)})[1]
+
+
+def test_the_stated_errors_of_a_picture():
+    light = {"light_offset": np.radians(4.0) ** 2 / 2 * np.eye(2)}
+    told = stated_errors([stating(3.0).with_parts(**light), stating(1.0), stating(2.0), stating()])
+    assert (told.count, told.silent) == (3, 1)
+    assert told.median_deg == pytest.approx(2.0)
+    assert told.parts_deg == pytest.approx({"noise": 2.0, "light_offset": 0.0})
+    assert str(told) == "median ± 2 deg of 3 best normals (noise 2, light_offset 0); 1 state none"
+    assert stated_errors([stating()]) is None
 
 
 # What is assumed ------------------------------------------------------------------------------------------------------
@@ -139,6 +149,8 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     deviations = {name: np.degrees(np.sqrt(np.trace(part))) for name, part in parts.items()}
     assert max(deviations, key=deviations.get) == ("light_offset" if target == "fine" else "relief")
     assert f"mostly {max(deviations, key=deviations.get)}" in found["best_because"]
+    assert document["stated"]["count"] == 1
+    assert next(iter(document["stated"]["parts_deg"])) == max(deviations, key=deviations.get)
     # Not 0.009 deg: between a few deg and what the priors allow.
     stated = np.degrees(np.sqrt(np.trace(found["estimates"]["cone_axis"]["covariance"])))
     assert 4 < stated < (7 if target == "fine" else 12)

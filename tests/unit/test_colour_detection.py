@@ -63,9 +63,9 @@ def test_tissue_without_highlights_shows_none(tissue):
     ("specular", "expected"),
     [
         (lobe(160, 120, 16.0, 2.5, 0.4), Kind.ELONGATED),
-        (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.MERGED),
+        (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.CLUSTER),
         (lobe(3, 120, 5.0), Kind.BORDER),
-        (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.MERGED),
+        (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.CLUSTER),
     ],
 )
 def test_other_kinds_are_told_apart(specular, expected):
@@ -125,8 +125,19 @@ def test_small_highlights_are_flagged():
         picture(lobe(100, 100, 1.3) + lobe(220, 100, 6.0)), Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
     )
     flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
+    assert "unresolved" in flags[100]
+    assert not {"small", "unresolved"} & set(flags[220])
+
+
+def test_highlights_that_smoothing_has_rounded_are_flagged():
+    made = reconstruct_colour(
+        picture(lobe(100, 100, 3.0) + lobe(220, 100, 8.0)),
+        Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT)),
+        smoothing_px=2.0,
+    )
+    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
     assert "small" in flags[100]
-    assert "small" not in flags[220]
+    assert not {"small", "unresolved"} & set(flags[220])
 
 
 # The view's border ------------------------------------------------------------------------------------------------

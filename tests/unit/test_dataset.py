@@ -8,20 +8,22 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.card import make_card
-from simtest.dataset.index import TABLES
-from simtest.dataset.manifest import NAME, FileEntry, new_manifest, read_manifest
+from simtest.dataset.index import TABLES, write_shard_tables, write_tables
+from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import repair_files, verify
 from simtest.errors import InputError, SimtestError
+from simtest.pages.markdown import escaped, yaml_string
 from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.cluster import cores_per_task
 from simtest.spec import load_dataset, scene_from_dict
@@ -324,6 +326,72 @@ def test_shards_that_the_manifest_lacks_after_a_kill_are_not_made_again(copy, ma
     monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
     write_dataset(tiny(**SIX), copy, make_engine())
     assert contents(copy) == contents(made)
+
+
+def test_tables_from_the_rows_of_workers_are_those_from_the_shards(copy):
+    plan = read_manifest(copy).plan()
+    before = contents(copy)
+    for shard in plan.shards:
+        write_shard_tables(plan, copy, shard)
+    parts = sorted(path.name for path in copy.glob("*.part"))
+    assert len(parts) == len(TABLES) * len(plan.shards)
+    # one cut short, one missing: both are made from their shard
+    (copy / parts[0]).write_bytes((copy / parts[0]).read_bytes()[:50])
+    (copy / parts[1]).unlink()
+    for name in TABLES:
+        (copy / name).unlink()
+    write_tables(plan, copy)
+    assert {name: digest for name, digest in contents(copy).items() if name in before} == before
+    # Negative control: the rows of the workers are what is joined.
+    told = pl.read_parquet(copy / parts[-1])
+    told.clear().write_parquet(copy / parts[-1])
+    write_tables(plan, copy)
+    changed = {name for name, digest in contents(copy).items() if before.get(name, digest) != digest}
+    assert changed == {name for name in TABLES if name in parts[-1]}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: c["shards"].update({"../secret.tar": {"bytes": 1, "sha256": "0"}}), "lists ../secret.tar; must be"),
+        (lambda c: c["shards"].update({"/etc/passwd": {"bytes": 1, "sha256": "0"}}), "inside the folder"),
+        (lambda c: c["tables"].update({"..": {"bytes": 1, "sha256": "0"}}), "inside the folder"),
+        (lambda c: c["tables"].update({"x.parquet": {"bytes": "1", "sha256": "0"}}), "must hold bytes, an integer"),
+        (lambda c: c["tables"].update({"x.parquet": {"bytes": 1}}), "must hold bytes, an integer"),
+        (lambda c: c.update(shards=["train-000000.tar"]), "shards must be a table of files"),
+        (lambda c: c.update(origin="here"), "origin must be a table"),
+    ],
+)
+def test_a_manifest_with_a_digest_that_fits_is_not_trusted(copy, change, said):
+    content = json.loads((copy / NAME).read_text())
+    del content["digest"]
+    change(content)
+    (copy / NAME).write_text(json.dumps({**content, "digest": _digest(content)}))
+    with pytest.raises(InputError) as raised:
+        list(read(copy))
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_the_card_of_a_strange_recipe_holds_no_markup():
+    title = 'a"b: [c]\n# d | e <script>alert(1)</script>'
+    dataset = tiny(title=title, description="![x](http://a.b/c)\n\n# head\n- [y](z) @all `code`")
+    plan = Plan(dataset)
+    card = make_card(plan, new_manifest(plan, "llvm_ad_rgb"))
+    head = yaml.safe_load(card.split("---")[1])
+    assert head["pretty_name"] == " ".join(title.split())
+    assert set(head) == {"pretty_name", "tags", "configs"}
+    assert "<script" not in card.split("---", 2)[2]
+    assert "](" not in card.split("## Reading")[0]
+    assert "@all" not in card
+    # Negative control: plain words stay as they are.
+    assert "Rendered by simtest" in card
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_one_line_and_a_string_of_yaml(text):
+    assert "\n" not in escaped(text)
+    assert yaml.safe_load(f"key: {yaml_string(text)}") == {"key": json.loads(yaml_string(text))}
 
 
 def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):

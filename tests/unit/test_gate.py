@@ -1,5 +1,7 @@
 """The gate's verdict on nights that were made up: every kind of change has its stated outcome."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -25,6 +27,25 @@ def test_the_same_night_is_the_same_without_a_test():
     assert set(verdict.comparisons["outcome"]) == {"same"}
     assert set(verdict.comparisons["method"]) == {"equal"}
     assert verdict.comparisons["p"].null_count() == verdict.comparisons.height
+
+
+def test_another_figure_of_the_same_results_is_worse():
+    table = rows(estimators=("cone_axis", "circle_pose"), settings=("a", "b"))
+    tonight, baseline = night(table), night(table)
+    cone = (pl.col("estimator") == "cone_axis") & (pl.col("setting") == "a")
+    # what a mean that became a median looks like, and a figure that is computed no more
+    medians = tonight.figures.filter(cone, quantity="median_deg")["value"].item()
+    value = pl.when(cone & (pl.col("quantity") == "mean_deg")).then(medians).otherwise("value")
+    lost = cone & (pl.col("quantity") == "p95_deg")
+    changed_figures = tonight.figures.with_columns(value=value).filter(~lost)
+    verdict = compare(replace(tonight, figures=changed_figures), baseline)
+    assert (verdict.state, verdict.bit_equal) == ("regression", True)
+    assert set(verdict.regressions["quantity"]) == {"mean_deg", "p95_deg"}
+    assert one(verdict, "mean_deg", estimator="cone_axis")["tonight"] == medians
+    assert one(verdict, "mean_deg", estimator="circle_pose")["outcome"] == "same"
+    # Rounding is no other figure.
+    rounded = tonight.figures.with_columns(value=pl.col("value") * (1 + 1e-15))
+    assert compare(replace(tonight, figures=rounded), baseline).state == "fine"
 
 
 def test_a_rise_of_one_estimator_is_worse_and_of_no_other():

@@ -174,6 +174,7 @@ def noted(path, out):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         result = reconstruct_sequence(path, out, Options(fov_deg=FOV))
+    assert [each.what for each in result.assumed][:2] == ["light", "distance of the tissue"]
     return result, " ".join(str(w.message) for w in caught)
 
 

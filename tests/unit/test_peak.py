@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2, fit_isophote_family
+from simtest.estimators.family_fit import fit_isophote_family
+from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
 

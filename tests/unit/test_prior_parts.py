@@ -9,17 +9,20 @@ from scipy.stats import chi2
 from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import InputError
 from simtest.estimators.budget import equivalent_variance, line_covariance
+from simtest.estimators.isophote_family import fit_isophote_family
 from simtest.estimators.prior_parts import (
     SPOT_ONSET,
     SPOT_SPREAD,
     add_untold_parts,
+    falloff_part,
     light_offset_part,
     relief_part,
     to_base,
 )
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera
-from simtest.geometry.vectors import basis_across, bisect
+from simtest.estimators.registry import load_estimators
+from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 
 LIMIT = chi2.ppf(0.95, 2)
 WIDE = Camera.from_fov(120.0, 640, 480)
@@ -185,3 +188,45 @@ def test_malformed_priors_are_refused(given, said):
         Priors(**given)
     with pytest.raises(InputError, match="focal_sd = -1"):
         CameraPrior(focal_sd=-1)
+
+
+# The falloff ----------------------------------------------------------------------------------------------------------
+
+
+def falloff_frame(power, camera, widths=(7.0, 10.0)):
+    """Return a Gaussian lobe off the optical axis under a falloff cos^k."""
+    x, y = np.moveaxis(camera.pixel_centres(), -1, 0)
+    lobe = np.exp(-((x - 222.3) ** 2) / 2 / widths[0] ** 2 - (y - 70.8) ** 2 / 2 / widths[1] ** 2)
+    return (lobe * camera.unproject(camera.pixel_centres())[..., 2] ** power).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["cone_axis", "brightest_point", "curved"])
+def test_a_falloff_that_nobody_told_is_covered(name):
+    camera = Camera.from_fov(80.0, 320, 240)
+    powers = (np.arange(20) + 0.5) / 5  # evenly over the prior, 0 to 4
+    estimator = load_estimators([name])[name]
+
+    def estimated(power, priors):
+        values = smooth(falloff_frame(power, camera), 1.0)
+        patch = Patch.cut(values, (180, 30, 90, 90), noise=1e-4, smoothing_px=1.0)
+        return estimator.estimate(patch, camera, priors)
+
+    right = estimated(0.0, LIGHT_AT_CAMERA)
+    told = replace(LIGHT_AT_CAMERA, falloff_power=Priors().falloff_power)
+    moves = np.array([tangent_coordinates(right.normal, estimated(k, LIGHT_AT_CAMERA).normal) for k in powers])
+    family = fit_isophote_family(
+        Patch.cut(smooth(falloff_frame(0.0, camera), 1.0), (180, 30, 90, 90), noise=1e-4, smoothing_px=1.0),
+        camera, (0.5,),
+    )  # fmt: skip
+    part = falloff_part(right.normal, family, told.falloff_power)
+    along = np.linalg.eigh(part)[1][:, 1]
+    # The law: k tan(phi) times the lobe's moments.
+    exact = falloff_part(right.normal, family, exactly(4.0)) / equivalent_variance(np.ones(8))
+    largest = float(np.abs(tangent_coordinates(right.normal, estimated(4.0, LIGHT_AT_CAMERA).normal) @ along))
+    limit = {"cone_axis": 0.05, "curved": 0.05, "brightest_point": 0.3}[name]
+    assert np.sqrt(exact[0, 0] + exact[1, 1]) == pytest.approx(largest, rel=limit)
+    if name != "brightest_point":
+        # All but the strongest falloffs lie in the region, and these do not by much.
+        inside = np.mean((moves @ along) ** 2 <= LIMIT * np.trace(part))
+        assert 0.9 <= inside <= 1
+        assert set(estimated(2.0, told).budget) - set(estimated(2.0, LIGHT_AT_CAMERA).budget) == {"response"}

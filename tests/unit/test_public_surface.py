@@ -116,7 +116,7 @@ def test_a_picture_is_reconstructed_without_slow_packages(known, tmp_path):
     assert ("pydantic" in loaded) == (known == "camera")
     records = json.loads((tmp_path / "out" / "normals.json").read_text())["specularities"]
     assert len(records) == 1
-    assert set(records[0]["estimates"]) == {"circle_pose", "brightest_point", "cone_axis"}
+    assert set(records[0]["estimates"]) == {"circle_pose", "brightest_point", "cone_axis", "curved"}
 
 
 def test_estimators_that_are_registered():
@@ -129,4 +129,4 @@ def test_estimators_that_are_registered():
     assert {"peaks", "colour"} <= set(registered[DETECTORS.group])
     for group in (ESTIMATORS, DETECTORS):
         assert set(registered[group.group]) <= set(group.names())
-    assert DEFAULT_ESTIMATORS == ("circle_pose", "brightest_point", "cone_axis")
+    assert DEFAULT_ESTIMATORS == ("circle_pose", "brightest_point", "cone_axis", "curved")

@@ -19,6 +19,9 @@ from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun,
 
 DEFAULTS = Limits()
 
+ROUNDING = 1e-12
+"""Two figures of the same results that differ by less, as a share, are the same: sums may be taken in another order."""
+
 _WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
 """Columns of comparisons before `_judged`: `better` is the p-value of the mirror image, `within` as in `Outcomes`; an
 outcome that is set already stands."""
@@ -47,7 +50,10 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
         bit_equal = first.select(*CELL, "digest").equals(second.select(*CELL, "digest"))
         shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
         equal = pl.col("digest") == pl.col("digest_2")
-        made += [missing_cells(first, second), _same(shared.filter(equal).select(CELL), tonight.figures, limits)]
+        made += [
+            missing_cells(first, second),
+            _same(shared.filter(equal).select(CELL), baseline.figures, tonight.figures, limits),
+        ]
         tested, unmatched, short = _tested(baseline, tonight, shared.filter(~equal).select(CELL), limits)
         made += tested
         notes = notes_on(baseline, tonight, bit_equal, unmatched, short, limits)
@@ -58,18 +64,34 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
     return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.record)
 
 
-def _same(equal: pl.DataFrame, figures: pl.DataFrame, limits: Limits) -> pl.DataFrame:
-    """Compare cells whose results are the same bytes."""
+def _same(equal: pl.DataFrame, baseline: pl.DataFrame, tonight: pl.DataFrame, limits: Limits) -> pl.DataFrame:
+    """Compare the figures of cells whose results are the same bytes, each run's as it is stored.
+
+    From the same results the same figures come. One that differs, or is missing tonight, was computed in another way,
+    and is worse until it is accepted: what is published has changed.
+    """
     margins = pl.DataFrame(
         [(name, own.unit, own.relative, own.absolute) for name, own in quantities(limits).items()],
         schema=["quantity", "unit", "relative", "absolute"], orient="row",
     )  # fmt: skip
-    values = figures.filter(pl.col("kind") == "setting").select(*CELL, "quantity", "n", "value")
-    found = equal.join(values, on=CELL, maintain_order="left_right").join(margins, on="quantity", maintain_order="left")
-    value, zero = pl.col("value"), pl.lit(0.0)
+    key = (*CELL, "quantity")
+    before, after = (
+        run.filter(pl.col("kind") == "setting").select(*key, "n", "value").join(equal, on=CELL, how="semi")
+        for run in (baseline, tonight)
+    )
+    both = before.join(after, on=key, how="full", coalesce=True, suffix="_2", maintain_order="left_right")
+    found = both.join(margins, on="quantity", how="left", maintain_order="left")
+    was, now, zero = pl.col("value"), pl.col("value_2"), pl.lit(0.0)
+    alike = (now - was).abs() <= ROUNDING * pl.max_horizontal(was.abs(), now.abs())
+    outcome = (
+        pl.when(was.is_null()).then(pl.lit("new"))
+        .when(alike & (pl.col("n") == pl.col("n_2"))).then(pl.lit("same")).otherwise(pl.lit("worse"))
+    )  # fmt: skip
+    difference = pl.when(alike).then(zero).otherwise(now - was)
     return found.select(
-        *CELL, "quantity", "unit", "n", method=pl.lit("equal"), baseline=value, tonight=value, difference=zero,
-        low=zero, high=zero, margin=pl.max_horizontal(pl.col("relative") * value, "absolute"), outcome=pl.lit("same"),
+        *CELL, "quantity", pl.col("unit").fill_null(""), pl.coalesce("n_2", "n").alias("n"), method=pl.lit("equal"),
+        baseline=was, tonight=now, difference=difference, low=difference, high=difference,
+        margin=pl.max_horizontal(pl.col("relative") * was, "absolute"), outcome=outcome,
     )  # fmt: skip
 
 

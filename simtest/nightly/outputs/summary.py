@@ -6,21 +6,22 @@ import polars as pl
 
 from simtest.nightly.phrases import cell_name, headline, plain, short_commit
 from simtest.nightly.records import OUTCOMES, JudgedRun, Verdict
+from simtest.pages.markdown import escaped
 
 MAX_CHARACTERS = 60_000
 """A comment on GitHub may have 65,536."""
 
-MAX_ROWS, MAX_NOTES, MAX_TEXT = 20, 20, 300
+MAX_ROWS, MAX_NOTES = 20, 20
 
 
 def summary(judged: JudgedRun) -> str:
     """Return the summary as Markdown text of at most `MAX_CHARACTERS`."""
     record, verdict = judged.run.record, judged.verdict
-    notes = [f"- {_safe(note)}" for note in verdict.notes[:MAX_NOTES]]
+    notes = [f"- {escaped(note)}" for note in verdict.notes[:MAX_NOTES]]
     if len(verdict.notes) > MAX_NOTES:
         notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
     parts = [
-        f"## Nightly {_safe(record.profile)}: {headline(verdict)}",
+        f"## Nightly {escaped(record.profile)}: {headline(verdict)}",
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),
         *_changes("Worse", judged.with_outcome("worse")),
@@ -28,8 +29,8 @@ def summary(judged: JudgedRun) -> str:
         *_changes("Better", judged.with_outcome("better")),
         "### By experiment",
         _by_experiment(judged),
-        f"{_safe(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
-        f"{_safe(record.processor)}; run `{_safe(record.id)}`",
+        f"{escaped(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
+        f"{escaped(record.processor)}; run `{escaped(record.id)}`",
     ]
     text = "\n\n".join(parts) + "\n"
     # A cut table is still readable, a comment that GitHub refuses is not.
@@ -44,8 +45,8 @@ def _compared(verdict: Verdict) -> str:
     if baseline is None:
         return "There is no baseline to compare with."
     equal = {True: "Bit-equal to", False: "Not bit-equal to", None: "Compared with"}[verdict.bit_equal]
-    reason = f': "{_safe(baseline.reason)}"' if baseline.reason else ""
-    return f"{equal} the baseline of {_safe(baseline.started)}, commit {short_commit(baseline.commit)}{reason}."
+    reason = f': "{escaped(baseline.reason)}"' if baseline.reason else ""
+    return f"{equal} the baseline of {escaped(baseline.started)}, commit {short_commit(baseline.commit)}{reason}."
 
 
 def _changes(title: str, changes: pl.DataFrame) -> list[str]:
@@ -82,13 +83,4 @@ def _by_experiment(judged: JudgedRun) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str | int | None]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join("" if cell is None else _safe(cell) for cell in line) + " |" for line in lines)
-
-
-def _safe(value: object) -> str:
-    """Return a text on one line, without the signs of Markdown or HTML."""
-    text = " ".join(str(value).split())
-    text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
-    for sign, safe in (("\\", "\\\\"), ("|", "\\|"), ("`", "'"), ("&", "&amp;"), ("<", "&lt;"), ("@", "&#64;")):
-        text = text.replace(sign, safe)
-    return text
+    return "\n".join("| " + " | ".join("" if cell is None else escaped(cell) for cell in line) + " |" for line in lines)

@@ -1,0 +1,53 @@
+"""What clipping hides of a highlight: its pixels, and how far the peak may lie from where the isophotes put it."""
+
+import math
+
+import numpy as np
+
+from simtest.geometry import Array, Mask, Patch
+
+NEARLY_CLIPPED = 0.93
+"""Pixels above this share of the clipped ones' intensity count as clipped: coding blurs the plateau."""
+
+PLATEAU_SHARE, BENT_SHARE, BENT_RESIDUAL = 0.01, 0.5, 0.05
+"""Variance of the axis over that of a point anywhere on the plateau: where the isophotes below are ellipses, and what
+is added where the innermost differs from one by this share of its radius: peaks have then melted under the plateau.
+Fitted to 121 clipped highlights with one glint each, on relief, colons and livers, of seeds that no figure quotes."""
+
+
+def clipped_pixels(patch: Patch) -> Mask | None:
+    """Return the clipped pixels of a patch, and those as bright as they are, shape (h, w); None where there is none."""
+    if patch.saturated is None or not patch.saturated.any():
+        return None
+    raw = patch.values if patch.raw is None else patch.raw
+    return np.asarray(patch.saturated | (raw >= NEARLY_CLIPPED * np.median(raw[patch.saturated])))
+
+
+def plateau_area_px(patch: Patch, isovalue: float) -> int:
+    """Return how many pixels inside an isophote are clipped."""
+    clipped = clipped_pixels(patch)
+    return 0 if clipped is None else int(np.count_nonzero(clipped & patch.inside(isovalue)))
+
+
+def hidden_peak_moments(area_px: int, moments: Array, px2: Array, residual: float) -> Array:
+    """Return the covariance of the peak's sightline about the isophotes' axis, rad^2, shape (2, 2).
+
+    The peak lies somewhere on the clipped plateau, which has the isophotes' shape.
+
+    Parameters
+    ----------
+    area_px : int
+        Pixels of the plateau.
+    moments : ndarray, shape (2, 2)
+        Second moments of the isophotes, rad^2, of any scale.
+    px2 : ndarray, shape (2, 2)
+        1 px^2 in squared tangents.
+    residual : float
+        RMS distance of the innermost isophote from its ellipse, over its radius.
+    """
+    # a uniform ellipse of area A has moments of determinant (A / 4 pi)^2
+    scale = area_px / (4 * math.pi) * math.sqrt(max(float(np.linalg.det(px2)), 0.0))
+    size = math.sqrt(max(float(np.linalg.det(moments)), 0.0))
+    shape = moments / size if size > 0 else px2 / math.sqrt(float(np.linalg.det(px2)))
+    share = PLATEAU_SHARE + BENT_SHARE * min(residual / BENT_RESIDUAL, 1.0) ** 3
+    return np.asarray(share * scale * shape)

@@ -1,0 +1,66 @@
+"""What the estimators share of a highlight: its isophotes or, where it is small, its centre; each fitted once."""
+
+from collections.abc import Hashable, Sequence
+
+from simtest.errors import Failure
+from simtest.estimators.family_fit import fit_isophote_families
+from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.small_spot import SmallSpot, fit_small_spots, is_small
+from simtest.geometry import Camera, Patch
+
+HighlightAxis = IsophoteFamily | SmallSpot
+"""What states a highlight's axis, with its moments and its budget."""
+
+Fitted = HighlightAxis | Failure
+
+
+def fit_highlight(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Fitted:
+    """Fit a highlight's isophotes, or its centre where it is small (see `fit_highlights`)."""
+    return fit_highlights([patch], camera, isovalues)[0]
+
+
+def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]) -> list[Fitted]:
+    """Fit each highlight: its centre where it is small (`is_small`), else its isophotes (`fit_isophote_families`).
+
+    What was fitted is kept with the patch, for the next estimator that asks.
+    """
+    small, name = fit_small(patches, camera), tuple(isovalues)
+    pending = [
+        patch
+        for patch, spot in zip(patches, small, strict=True)
+        if spot is None and _recall(patch, name, camera) is _NOTHING
+    ]
+    for patch, family in zip(pending, fit_isophote_families(pending, camera, isovalues), strict=True):
+        _keep(patch, name, camera, family)
+    return [spot or _family(patch, name, camera) for patch, spot in zip(patches, small, strict=True)]
+
+
+def fit_small(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot | None]:
+    """Fit the centres of the small highlights among some, all at once; None for the others."""
+    pending = [patch for patch in patches if _recall(patch, "small", camera) is _NOTHING]
+    small = [patch for patch in pending if is_small(patch)]
+    for patch in pending:
+        _keep(patch, "small", camera, None)
+    for patch, spot in zip(small, fit_small_spots(small, camera), strict=True):
+        _keep(patch, "small", camera, spot)
+    found = [_recall(patch, "small", camera) for patch in patches]
+    return [spot if isinstance(spot, SmallSpot) else None for spot in found]
+
+
+def _family(patch: Patch, isovalues: tuple[float, ...], camera: Camera) -> IsophoteFamily | Failure:
+    found = _recall(patch, isovalues, camera)
+    assert isinstance(found, IsophoteFamily | Failure)
+    return found
+
+
+_NOTHING = object()
+
+
+def _recall(patch: Patch, name: Hashable, camera: Camera) -> object:
+    """Return what was kept under a name for this camera, or `_NOTHING`."""
+    of, what = patch.kept.get(name, (None, _NOTHING))
+    return what if of is camera else _NOTHING
+
+
+def _keep(patch: Patch, name: Hashable, camera: Camera, what: object) -> None:
+    patch.kept[name] = (camera, what)

@@ -1,0 +1,1 @@
+"""How near estimator `cloud` comes to the base's normal and to the relief's slope: python -m studies.clouds."""

@@ -1,0 +1,56 @@
+"""Rows of estimator `cloud` in results: against the base's highlight point, found, missed and refused."""
+
+import numpy as np
+import pytest
+
+from simtest.estimators.cloud import CloudCentre, cloud
+from simtest.geometry.vectors import angle_deg
+from simtest.spec import Experiment
+from simtest.spec.spec_model import validate
+from simtest.validation.cases import expand
+from simtest.validation.cloud_rows import match_cloud
+from simtest.validation.realisation import Realiser
+
+PLANE = {
+    "surface.tilt_deg": 25.0, "surface.distance_mm": 25.0, "reflectance.exponent": 400.0, "camera.width": 512,
+    "camera.height": 512, "camera.fx": 300.0, "camera.fy": 300.0, "sensor.noise_sigma": 0.01,
+    "sensor.point_spread_px": 0.7, "surface.relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.5}]},
+}  # fmt: skip
+
+
+def made_of(estimators, **settings):
+    group = {"scene": "plane", "set": PLANE | settings}
+    data = {"name": "clouds", "seed": 3, "realisations": 1, "estimators": ["cone_axis"], "groups": [group]}
+    experiment = validate(Experiment, data, "experiment")
+    realiser = Realiser(None)
+    return realiser.make(experiment, expand(experiment)[0], 0, estimators), realiser.session
+
+
+@pytest.mark.render
+def test_a_cloud_is_measured_against_the_base():
+    made, session = made_of({"cloud": cloud})
+    (row,) = [row for row in made.rows if row.estimator == "cloud"]
+    (centre,) = [point for point in made.view.clouds if point.lit]
+    assert row.status == "ok"
+    assert row.target == "base"
+    assert row.cloud == row.true_id == made.view.clouds.index(centre)
+    # The normal of a plane 25 deg off the optical axis.
+    normal = np.array([row.normal_x, row.normal_y, row.normal_z])
+    assert row.error_deg == row.error_base_deg == pytest.approx(float(angle_deg(normal, centre.normal_base)))
+    assert row.error_deg < 3.0
+    assert row.error_look_deg == pytest.approx(row.error_deg, abs=1e-6)
+    assert row.error_fine_deg is None
+    assert row.cloud_visible is not None
+    assert dict(row.budget)["budget_relief_deg"] > 0
+    # Where no estimate is of it, the vote is empty.
+    estimate = made.specularities[-1].estimates["cloud"]
+    assert match_cloud(session, made.view, estimate) == [row.cloud]
+
+
+@pytest.mark.render
+def test_a_cloud_that_is_not_answered_is_a_row_with_its_reason():
+    made, _ = made_of({"cloud": CloudCentre(least_spots=500)})
+    (row,) = [row for row in made.rows if row.estimator == "cloud"]
+    assert row.status == "no_estimate"
+    assert row.error_deg is None
+    assert "a cloud takes 500" in row.flags
