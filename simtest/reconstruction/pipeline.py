@@ -11,7 +11,7 @@ from simtest.calibration import Calibration, Frame, Priors
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.colour import ColourDetector
-from simtest.detection.detector import Detection, Detector, load_detector
+from simtest.detection.detector import Detection, Detector, load_detector, run_detector
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import run_in_frame
@@ -282,32 +282,10 @@ def _run(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection = _detect(detector, frame) if box is None else _cut_region(frame, box)
+    detection = run_detector(detector, frame) if box is None else _cut_region(frame, box)
     # estimate
     made = _estimate(detection, chosen)
     return made if target == "fine" else _at_base(made, calibration.priors)
-
-
-def _detect(detector: Detector, frame: Frame) -> Detection:
-    """Run a detector; raise `InputError` with its name where it fails or returns what is no detection of the frame."""
-    name, (height, width) = type(detector).__qualname__, frame.encoded.shape[:2]
-    try:
-        found = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"detector {name}: {type(error).__name__}: {error}") from error
-    if not isinstance(found, Detection):
-        raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
-    if len(found.highlights) not in (0, len(found.regions)):
-        raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
-    for box in (region.box for region in found.regions):
-        if not (isinstance(box, tuple) and len(box) == 4 and all(isinstance(v, int) for v in box)):
-            raise InputError(f"detector {name}: box {shown(box, 80)}: must be a tuple of four integers x, y, w, h")
-        x, y, w, h = box
-        if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
-            raise InputError(f"detector {name}: box {box} leaves the frame of {width} x {height} px")
-    return found
 
 
 def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
