@@ -115,8 +115,8 @@ def reconstruct(
         emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
         known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
-        Names as registered, or the estimators themselves by name; default circle_pose, brightest_point and cone_axis,
-        and in pictures all that the calibration states enough for (`default_estimators`).
+        Names as registered, or the estimators themselves by name; default `DEFAULT_ESTIMATORS`, and in pictures all
+        that the calibration states enough for (`default_estimators`).
     roi : tuple of int, optional
         Column, row, width, height of the one region of interest; default: regions detected in the frame.
     smoothing_px : float, optional
