@@ -10,6 +10,7 @@ from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.entry_points import EntryPointGroup
+from simtest.runtime.resources import shown
 
 DETECTORS = EntryPointGroup("simtest.detectors", "detector")
 
@@ -68,3 +69,25 @@ def load_detector(detector: str | object) -> Detector:
     if isinstance(given, type) or not isinstance(given, Detector):
         raise InputError(f"detector {name!r}: {given!r} is no object with a method detect(frame, camera, priors)")
     return given
+
+
+def run_detector(detector: Detector, frame: Frame) -> Detection:
+    """Run a detector; raise `InputError` with its name where it fails or returns what is no detection of the frame."""
+    name, (height, width) = type(detector).__qualname__, frame.encoded.shape[:2]
+    try:
+        found = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"detector {name}: {type(error).__name__}: {error}") from error
+    if not isinstance(found, Detection):
+        raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
+    if len(found.highlights) not in (0, len(found.regions)):
+        raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
+    for box in (region.box for region in found.regions):
+        if not (isinstance(box, tuple) and len(box) == 4 and all(isinstance(v, int) for v in box)):
+            raise InputError(f"detector {name}: box {shown(box, 80)}: must be a tuple of four integers x, y, w, h")
+        x, y, w, h = box
+        if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
+            raise InputError(f"detector {name}: box {box} leaves the frame of {width} x {height} px")
+    return found

@@ -12,7 +12,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.blobs import Kind
 from simtest.detection.colour import ColourDetector
-from simtest.detection.detector import Detection, Detector, load_detector
+from simtest.detection.detector import Detection, Detector, load_detector, run_detector
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
@@ -116,8 +116,8 @@ def reconstruct(
         emission. A camera alone is taken as exact. A number is the horizontal field of view, deg, where nothing else is
         known: focal length, centre and lens are then guesses, and their spread is in the uncertainty.
     estimators : sequence of str, or mapping
-        Names as registered, or the estimators themselves by name; default circle_pose, brightest_point and cone_axis,
-        and in pictures all that the calibration states enough for (`default_estimators`).
+        Names as registered, or the estimators themselves by name; default `DEFAULT_ESTIMATORS`, and in pictures all
+        that the calibration states enough for (`default_estimators`).
     roi : tuple of int, optional
         Column, row, width, height of the one region of interest; default: regions detected in the frame.
     smoothing_px : float, optional
@@ -283,32 +283,10 @@ def _run(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection = _detect(detector, frame) if box is None else _cut_region(frame, box)
+    detection = run_detector(detector, frame) if box is None else _cut_region(frame, box)
     # estimate
     made = _estimate(detection, chosen)
     return made if target == "fine" else _at_base(made, calibration.priors)
-
-
-def _detect(detector: Detector, frame: Frame) -> Detection:
-    """Run a detector; raise `InputError` with its name where it fails or returns what is no detection of the frame."""
-    name, (height, width) = type(detector).__qualname__, frame.encoded.shape[:2]
-    try:
-        found = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"detector {name}: {type(error).__name__}: {error}") from error
-    if not isinstance(found, Detection):
-        raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
-    if len(found.highlights) not in (0, len(found.regions)):
-        raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
-    for box in (region.box for region in found.regions):
-        if not (isinstance(box, tuple) and len(box) == 4 and all(isinstance(v, int) for v in box)):
-            raise InputError(f"detector {name}: box {shown(box, 80)}: must be a tuple of four integers x, y, w, h")
-        x, y, w, h = box
-        if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
-            raise InputError(f"detector {name}: box {box} leaves the frame of {width} x {height} px")
-    return found
 
 
 def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:

@@ -19,7 +19,7 @@ from simtest.errors import Failure
 from simtest.geometry import Camera
 from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
-from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
+from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct, reconstruct_colour
 
 CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
 FRAMES = Path(__file__).resolve().parents[3] / "shared" / "data" / "frames"
@@ -173,7 +173,7 @@ def test_the_choices_say_what_was_inferred():
     assert choices.inferred == ("encoding", "saturation_level", "detector", "smoothing_px", "estimators")
     assert str(choices) == (
         "encoding srgb (inferred), clipped at 1 (inferred), detector colour (inferred), smoothing 1 px (inferred), "
-        "estimators circle_pose brightest_point cone_axis curved (inferred)"
+        f"estimators {' '.join(DEFAULT_ESTIMATORS)} (inferred)"
     )
 
 
