@@ -38,10 +38,10 @@ LARGELY_SEEN = 0.98
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
 
-BENDS, BENDS_LONG = 0.12, 0.4
+BENDS, BENDS_LONG = 0.35, 0.4
 """How far the centre may be off since the base's gains change inside the cloud, standard deviation as a share of the
-cloud's extent: in any direction, and along a cloud that is longer than wide by what it is longer. Where the base bends
-as much as its distance, so does the gain; a round cloud speaks for a flat base."""
+cloud's extent: in any direction, and along a cloud that is longer than wide by what it is longer. Livers and colons
+need as much; a plane, where it is told to be one, none."""
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""
@@ -166,8 +166,8 @@ def _budget(cloud: Cloud, window: Window, independent: float, priors: Priors) ->
     # The bases across a direction and its reverse are not the same.
     turn = basis_across(normal) @ half.T
     sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
-    bends = BENDS**2 * cloud.covariance
-    if _is_long(cloud.covariance, independent):
+    bends = np.zeros((2, 2)) if priors.plane else BENDS**2 * cloud.covariance
+    if not priors.plane and _is_long(cloud.covariance, independent):
         bends = bends + BENDS_LONG**2 * _longer(cloud.covariance)
     budget = {"relief": turn @ sampling @ turn.T, "shape": turn @ bends @ turn.T}
     if not priors.lights_mm:

@@ -201,9 +201,19 @@ def test_estimate_of_a_cloud():
     assert len(found.cloud.points_px) == 24
     assert angle_deg(found.normal, -CAMERA.unproject(points.mean(axis=0))) < 0.5
     # s / sqrt(N) of an extent of 16 px at 200 px, over 24 spots
-    stated = math.degrees(math.sqrt(np.trace(found.covariance)))
+    stated = math.degrees(math.sqrt(np.trace(found.budget["relief"])))
     assert 0.8 < stated / math.degrees(math.sqrt(2) * 16 / 200 / math.sqrt(24)) < 1.8
     assert set(found.budget) == {"relief", "shape"}
+
+
+def test_a_plane_that_is_told_does_not_bend():
+    points = spread_points(np.random.default_rng(5), 24)
+    plane = Priors(lights_mm=((0.0, 0.0, 0.0),), falloff_power=None, plane=True)
+    (flat,) = cloud.estimate_frame(frame_of(picture_of(points), plane), CAMERA, plane)
+    (bent,) = cloud.estimate_frame(frame_of(picture_of(points)), CAMERA, LIGHT_AT_CAMERA)
+    assert not flat.budget["shape"].any()
+    assert np.trace(bent.covariance) > np.trace(flat.covariance)
+    assert np.array_equal(flat.normal, bent.normal)
 
 
 def test_what_nobody_told_of_the_light_is_in_the_budget():
