@@ -199,7 +199,8 @@ def _malformed(estimate: Estimate) -> Failure | None:
     if estimate.region is not None and not np.isfinite(estimate.region.statistic(estimate.candidates)).all():
         return Failure(Reason.NOT_FINITE, "region: the statistic of a candidate is not finite")
     # unit vectors, the proposed one first
-    lengths = np.linalg.norm(np.concatenate([estimate.normal[None], estimate.candidates]), axis=1)
+    vectors = np.concatenate([estimate.normal[None], estimate.candidates])
+    lengths = np.sqrt(np.sum(vectors * vectors, axis=1))
     if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
         return Failure(Reason.ESTIMATOR_ERROR, f"normal or candidate of length {lengths.max():g}: must be unit vectors")
     if np.abs(estimate.candidates[0] - estimate.normal).max() > UNIT_TOLERANCE:
@@ -217,9 +218,12 @@ def _malformed_budget(estimate: Estimate) -> Failure | None:
     for name, part in budget.items():
         if not isinstance(part, np.ndarray) or part.shape != (2, 2):
             return Failure(Reason.ESTIMATOR_ERROR, f"budget {name}: must be an array of shape (2, 2)")
-        if not np.isfinite(part).all():
-            return Failure(Reason.NOT_FINITE, f"budget {name} holds NaN or infinity")
-    if estimate.covariance is not None and not _equal(total(budget), estimate.covariance):
+    # One test of the sum; only where it fails are the parts looked at one by one.
+    whole = total(budget)
+    if not np.isfinite(whole).all():
+        bad = next((name for name, part in budget.items() if not np.isfinite(part).all()), "")
+        return Failure(Reason.NOT_FINITE, f"budget {bad} holds NaN or infinity")
+    if estimate.covariance is not None and not _equal(whole, estimate.covariance):
         return Failure(Reason.ESTIMATOR_ERROR, "covariance: must be the sum of the budget's parts")
     return None
 

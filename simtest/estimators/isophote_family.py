@@ -170,7 +170,8 @@ class IsophoteFamily:
     def _moments_at(self, shift: float) -> Array:
         """Return the moments with all levels shifted."""
         levels = self.levels + shift
-        return np.asarray(np.einsum("k,kij->ij", weights_at_zero(levels) / (2 * levels), self._narrowed(levels)))
+        weights = weights_at_zero(levels) / (2 * levels)
+        return (weights @ self._narrowed(levels).reshape(-1, 4)).reshape(2, 2)
 
     @property
     def mean_moments(self) -> Array:
