@@ -19,7 +19,7 @@ from simtest.geometry import Array, Camera, Patch
 PIXEL_PX2 = 0.005
 """Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""
 
-GAP_SHARE, RIPPLES = 0.95, 4.5
+GAP_SHARE, RIPPLES = 1.5, 7.0
 """Variances of the peak over its squared gap from the isophotes' axis followed to t -> 1, which is usually nearer to
 the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
 no published figure uses (docs/uncertainty.md)."""
