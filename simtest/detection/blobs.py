@@ -208,7 +208,8 @@ def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | N
     sets = none
     if (len(spot.peaks) == 1 or spot.melted) and not spot.touches:
         column, row = int(spot.peaks[0, 0]) - left, int(spot.peaks[0, 1]) - top
-        sets = tuple(level_set_around(smoothed[crop], (column, row), t * spot.value, visible) for t in NESTED_ISOVALUES)
+        peak = float(smoothed[crop][row, column])
+        sets = tuple(level_set_around(smoothed[crop], (column, row), t * peak, visible) for t in NESTED_ISOVALUES)
         # A lower, separate bump may hang on below the mask's pixels: then the isophote is not the spot's own.
         if sets[0] is not None and np.count_nonzero(sets[0].inside) > LEAK * spot.area_px + LEAK_PX:
             sets = none

@@ -18,7 +18,10 @@ from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask, smooth
 
 SMOOTHING_PX = 0.35
-"""Smoothing before highlights are told apart and their shape is measured; a wider one rounds small ones off."""
+"""Smoothing before highlights are told apart; a wider one melts small ones."""
+
+SHAPE_PX = 0.7
+"""The same before their shape is measured."""
 
 NOISE_LEFT = 0.8
 """What this smoothing leaves of white noise, 1 / (2 sqrt(pi) width)."""
@@ -114,7 +117,7 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     foreign = find_foreign(bright)
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
-    made = classify(spots, smoothed, light, linear, bright, flat, white, seen)
+    made = classify(spots, smooth(light.specular, SHAPE_PX, seen), light, linear, bright, flat, white, seen)
     kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
     # pixels that show a highlight
     mask = _pixels([spot for spot, _ in kept], candidates.shape)
