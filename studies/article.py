@@ -224,9 +224,11 @@ def selection(views: Sequence[View], model: Model) -> str:
             (view.lit_px, view.lit, everything),
             (np.array(list(view.glints_px.values())).reshape(-1, 2), list(view.glints.values()), shown),
         ):
+            if not len(px):
+                continue
             pairs = zip(normals, reference.normals_at(px, view.spots[0].camera), strict=True)
             made += [float(angle_deg(a, b)) for a, b in pairs if np.isfinite(b).all()]
-    cells = [f"{np.mean(x):.2f} ± {np.std(x):.2f} ({len(x)})" for x in (everything, shown)]
+    cells = [f"{np.mean(x):.2f} ± {np.std(x):.2f} ({len(x)})" if x else "none" for x in (everything, shown)]
     return f"glints that are lit: {cells[0]}; that a specularity shows: {cells[1]}"
 
 
