@@ -143,7 +143,7 @@ class ResultRow:
 
     def to_row(self) -> dict[str, Value]:
         """Return the value of each column; a swept parameter gives way to a column of the same name."""
-        row = {**self.swept, **vars(self), **self.budget}
+        row = {**self.swept, **vars(self), **dict.fromkeys(BUDGET_COLUMNS), **self.budget}
         del row["swept"], row["budget"]
         return row
 

@@ -265,6 +265,7 @@ def test_render_writes_its_files_with_the_documented_keys(frames):
         "truth.npz",
         "frame.json",
         "camera.toml",
+        "calibration.toml",
     }
     assert (first / "frame.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     with np.load(first / "truth.npz", allow_pickle=False) as truth:

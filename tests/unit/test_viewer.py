@@ -24,7 +24,7 @@ def test_content_is_the_scene(content):
     normals = {}
     for name, start, end in zip(content.names, content.starts, content.ends, strict=True):
         normals.setdefault(name, []).append((end - start) / np.linalg.norm(end - start))
-    assert set(normals) == {"camera", "true normal", "circle_pose", "brightest_point", "cone_axis"}
+    assert set(normals) == {"camera", "true normal", "circle_pose", "brightest_point", "cone_axis", "curved"}
     assert len(normals["camera"]) == 8
     assert len(normals["true normal"]) == 1
     assert float(normals["cone_axis"][0] @ normals["true normal"][0]) > 0.99999
