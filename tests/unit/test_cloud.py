@@ -148,6 +148,7 @@ def test_told_lights_are_parts_of_one_cloud():
     assert np.sqrt(np.linalg.eigvalsh(only.covariance)).max() < 0.06
 
 
+@pytest.mark.slow
 def test_regions_of_independent_spots_hold_95_percent():
     """Hotelling's factor: 12 and 40 spots, extent from the same spots."""
     window = window_of(CAMERA)
