@@ -14,6 +14,7 @@ import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure, Reason
+from simtest.estimators.bends import MEAN_BENDS, PEAK_BENDS, bend_variance
 from simtest.estimators.budget import Budget
 from simtest.estimators.clipping import hidden_peak_moments, plateau_area_px
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
@@ -270,14 +271,15 @@ class IsophoteFamily:
         """Budget of the mean axis in the basis.
 
         Noise; resolution, where the peak is clipped, or the isophotes ripple by more than noise; shape, where the drift
-        may be more than noise.
+        may be more than noise, or an isophote is bent.
         """
         covariance = self.axes_covariance
         if covariance is None:
             return None
         parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error + self.clipping}
+        parts["shape"] = self.bend_error()
         if self.drift_is_suspect:
-            parts["shape"] = MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
+            parts["shape"] = parts["shape"] + MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
         return _present(parts)
 
     @property
@@ -295,10 +297,15 @@ class IsophoteFamily:
         if covariance is None:
             return None
         parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error + self.clipping}
+        parts["shape"] = self.bend_error(PEAK_BENDS)
         # Noise that makes a large drift is already in this axis's noise, so a drift that may be noise adds nothing.
         if self.drift_is_real:
-            parts["shape"] = self._line_error
+            parts["shape"] = parts["shape"] + self._line_error
         return _present(parts)
+
+    def bend_error(self, slope: float = MEAN_BENDS) -> Array:
+        """Covariance of the centre by the bend of the isophotes, rad^2, shape (2, 2) (`simtest.estimators.bends`)."""
+        return bend_variance(self.residuals, self._residuals_by_noise, self.mean_moments, slope) * np.eye(2)
 
     @cached_property
     def clipping(self) -> Array:
@@ -330,15 +337,19 @@ class IsophoteFamily:
         return self._crossings.residuals
 
     @cached_property
-    def is_bent(self) -> Mask:
-        """Whether each isophote differs from an ellipse by more than a point highlight's does, noise included, (K,)."""
+    def _residuals_by_noise(self) -> Array:
+        """What of the residuals may be noise, shape (K,)."""
         noise = self.patch.noise
         at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
         left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
-        by_noise = left / (-2 * isovalues * np.log(isovalues))
-        return np.asarray(self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, NOISE_FACTOR * by_noise))
+        return np.asarray(NOISE_FACTOR * left / (-2 * isovalues * np.log(isovalues)))
+
+    @property
+    def is_bent(self) -> Mask:
+        """Whether each isophote differs from an ellipse by more than a point highlight's does, noise included, (K,)."""
+        return np.asarray(self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, self._residuals_by_noise))
 
     @property
     def flags(self) -> tuple[str, ...]:

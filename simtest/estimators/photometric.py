@@ -103,7 +103,7 @@ class Photometric:
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
-        budget = {"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2)}
+        budget = {"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2) + family.bend_error()}
         if family.clipping.any():
             budget["resolution"] = family.clipping
         estimate = Estimate(
