@@ -35,6 +35,9 @@ from simtest.runtime.seeds import from_integer
 CROP_PX, SHIFT_PX, CROPS = 64, 8, 24
 """Side of a crop, greatest shift of its centre from the highlight, and crops of a frame at most."""
 
+LEAST_PX = 2
+"""Pixels above half height of a highlight that is cropped: one pixel alone is a shoulder of another highlight."""
+
 JPEG_QUALITY = 75
 RIDGE, NEWTON_STEPS = 1.0, 50
 SPLITS, RESAMPLES = 10, 2000
@@ -116,8 +119,9 @@ def crops(picture: Picture, seed: int) -> list[Picture]:
     assert found.view is not None
     seen = np.ones((height, width), bool) if found.view.seen is None else found.view.seen
     rng, cut = from_integer(seed), []
-    for i in rng.permutation(len(found.highlights)):
-        x, y = np.array(found.highlights[i].region.peak) + rng.integers(-SHIFT_PX, SHIFT_PX + 1, 2) - CROP_PX // 2
+    shown = [highlight for highlight in found.highlights if highlight.area_px >= LEAST_PX]
+    for i in rng.permutation(len(shown)):
+        x, y = np.array(shown[i].region.peak) + rng.integers(-SHIFT_PX, SHIFT_PX + 1, 2) - CROP_PX // 2
         inside = 0 <= x <= width - CROP_PX and 0 <= y <= height - CROP_PX
         if inside and seen[y : y + CROP_PX, x : x + CROP_PX].all():
             cut.append(picture[y : y + CROP_PX, x : x + CROP_PX])

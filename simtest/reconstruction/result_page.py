@@ -40,8 +40,11 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
     }  # fmt: skip
     height, width = picture.shape[:2]
     address = _data_address(picture)
-    title = Path(record.image).name
-    write_page(path, "picture.html.j2", data, record=record, picture=address, title=title, width=width, height=height)
+    title, stated = Path(record.image).name, str(record.stated or "")
+    write_page(
+        path, "picture.html.j2", data, record=record, stated=stated, picture=address, title=title, width=width,
+        height=height,
+    )  # fmt: skip
 
 
 def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequence[Track]) -> None:
