@@ -40,7 +40,9 @@ class StatedErrors:
     parts_deg: dict[str, float]
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{name} {value:.2g}" for name, value in self.parts_deg.items())
+        # Parts below a hundredth of the whole change nothing that is shown.
+        told = {name: value for name, value in self.parts_deg.items() if value >= 0.01 * self.median_deg}
+        parts = ", ".join(f"{name} {value:.2g}" for name, value in told.items())
         left = f"; {self.silent} state none" if self.silent else ""
         return f"median ± {self.median_deg:.2g} deg of {self.count} best normals ({parts}){left}"
 
