@@ -67,7 +67,7 @@ def test_the_stated_errors_of_a_picture():
     assert (told.count, told.silent) == (3, 1)
     assert told.median_deg == pytest.approx(2.0)
     assert told.parts_deg == pytest.approx({"noise": 2.0, "light_offset": 0.0})
-    assert str(told) == "median ± 2 deg of 3 best normals (noise 2, light_offset 0); 1 state none"
+    assert str(told) == "median ± 2 deg of 3 best normals (noise 2); 1 state none"
     assert stated_errors([stating()]) is None
 
 
