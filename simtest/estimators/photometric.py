@@ -103,7 +103,8 @@ class Photometric:
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
-        budget = {"noise": covariance, "shape": MISFIT_SHARE * excess * np.eye(2) + family.bend_error()}
+        shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error()
+        budget = {"noise": covariance, "shape": shape}
         if family.clipping.any():
             budget["resolution"] = family.clipping
         estimate = Estimate(
@@ -116,7 +117,8 @@ class Photometric:
             flags=family.flags,
         )
         estimate = add_untold_parts(estimate, camera, priors, family)
-        return _with_misfit_told(estimate, 2 * MISFIT_SHARE * excess) if misfit else estimate
+        # A bend of the isophotes and the residuals of the fit show the same structure.
+        return _with_misfit_told(estimate, float(np.trace(shape))) if misfit else estimate
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ photometric, photometric_plane = Photometric(), PhotometricPlane()
 
 
 def _with_misfit_told(estimate: Estimate, added: float) -> Estimate:
-    """Add the flag ``misfit`` where what it adds to the covariance's trace, rad^2, makes a difference."""
+    """Add the flag ``misfit`` where what structure adds to the covariance's trace, rad^2, makes a difference."""
     if estimate.covariance is None:
         return estimate
     without = float(np.trace(estimate.covariance)) - added

@@ -60,6 +60,15 @@ def test_a_single_step_shows_no_bar(bars):
     assert bars == []
 
 
+@pytest.fixture
+def interruptible():
+    """Have Ctrl-C raise `KeyboardInterrupt`: a run in the background of a shell ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_a_stop_waits_for_the_next_step(bars):
     def stopped_between_steps():
         with progress_bar() as move:
