@@ -11,6 +11,7 @@ from enum import StrEnum
 import cv2
 import numpy as np
 
+from simtest.calibration.calibration import brightest_channel
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.light_split import BLOCKS, NEIGHBOURHOOD, SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
@@ -375,7 +376,7 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     brighter = _ranked(values[around].mean(axis=1), PALE_SHARE)
     surround = brighter / max(float(own.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
-    shown = (specular >= 0.3 * spot.value) & (values.max(axis=2) < UNCLIPPED)
+    shown = (specular >= 0.3 * spot.value) & (brightest_channel(values) < UNCLIPPED)
     if np.count_nonzero(shown) < MIN_AREA_PX:
         return 1.0, clutter, surround
     gain = values[shown].mean(axis=0) - tissue

@@ -56,6 +56,10 @@ class FittedConic:
 
     def centre_and_matrix(self) -> tuple[Array, Array]:
         """Return centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
+        return self._centre_and_matrix
+
+    @cached_property
+    def _centre_and_matrix(self) -> tuple[Array, Array]:
         C, T = self.normalised, self.normalised_from_image
         centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
         level = -(C[2, 2] + C[:2, 2] @ centre)
