@@ -53,8 +53,8 @@ def figures(dataset: Dataset | None = None, rounds: int = ROUNDS) -> list[Figure
 
 
 def _warming(dataset: Dataset) -> Dataset:
-    """Return a part of the dataset, of which each node makes something."""
-    return dataset.model_copy(update={"samples": max(4, dataset.samples // 4)})
+    """Return a part of the dataset, of which each node makes something: an anatomy for each of the three splits."""
+    return dataset.model_copy(update={"samples": max(dataset.samples // 4, 3 * dataset.samples_per_anatomy)})
 
 
 @contextmanager
