@@ -215,7 +215,7 @@ def report(pools: dict[str, list[View]], model: Model) -> None:
 
 
 def selection(views: Sequence[View], model: Model) -> str:
-    """Say how far all lit glints are off the liver's normal, and those that a specularity shows, mean ± deviation."""
+    """Return how far lit glints are off the liver's normal, of all and of those that a specularity shows, as text."""
     everything: list[float] = []
     shown: list[float] = []
     for view in views:

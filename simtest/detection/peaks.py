@@ -1,6 +1,5 @@
 """`peaks`: the isolated peaks of a frame that have the shape of a point highlight."""
 
-import math
 from dataclasses import dataclass
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
@@ -9,6 +8,7 @@ from simtest.detection.regions import Region, detect
 from simtest.detection.shape import flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Mask
+from simtest.geometry.gaussian_smoothing import share_of_noise
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,6 @@ def _is_highlight(region: Region, frame: Frame, flat: Mask | None) -> bool:
     """Return whether nothing in a peak's shape speaks against one point highlight."""
     patch, noise, (column, row) = frame.patch(region.box, region.peak), frame.noise, region.peak
     at_peak = noise if isinstance(noise, float) else float(noise[row, column])
-    # A Gaussian of width s leaves 1 / (2 sqrt(pi) s) of white noise, where it is wide.
-    left = 1 / math.sqrt(1 + 4 * math.pi * frame.smoothing_px**2)
-    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, left * at_peak, flat)
+    left = share_of_noise(frame.smoothing_px) * at_peak
+    shape = patch if isinstance(patch, Failure) else peak_shape(patch, region, left, flat)
     return isinstance(shape, Failure) or shape.is_highlight

@@ -15,6 +15,7 @@ from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
+from simtest.geometry.gaussian_smoothing import slope_divisor_px2
 
 PIXEL_PX2 = 0.005
 """Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""
@@ -23,9 +24,6 @@ GAP_SHARE, RIPPLES = 1.5, 7.0
 """Variances of the peak over its squared gap from the isophotes' axis followed to t -> 1, which is usually nearer to
 the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
 no published figure uses (docs/uncertainty.md)."""
-
-LEAST_SMOOTHING_PX = 0.5
-"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +80,11 @@ def _budget(family: IsophoteFamily) -> Budget | None:
 def _noise(family: IsophoteFamily) -> Array:
     """Return the covariance of the peak by the sensor's noise, shape (2, 2), rad^2.
 
-    Noise sigma, smoothed by s, has a slope of variance sigma^2 / (8 pi s^4) an axis. The peak lies where it balances
-    that of the lobe, I0 / V, with V the second moments of the smoothed lobe.
+    The peak lies where the smoothed noise's slope balances that of the lobe, I0 / V, with V the second moments of the
+    smoothed lobe.
     """
     patch = family.patch
-    known = patch.noise
-    sigma = float(known[patch.peak_pixel[::-1]]) if isinstance(known, np.ndarray) else float(known or 0.0)
-    slope = sigma / (np.sqrt(8 * np.pi) * max(patch.smoothing_px, LEAST_SMOOTHING_PX) ** 2 * patch.peak_value)
+    slope = (patch.noise_at_peak or 0.0) / (slope_divisor_px2(patch.smoothing_px) * patch.peak_value)
     lobe = family.seen_moments
     return np.asarray(slope**2 * lobe @ np.linalg.solve(family.px2, lobe))
 

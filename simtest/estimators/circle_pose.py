@@ -13,6 +13,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_poses
+from simtest.geometry.gaussian_smoothing import slope_divisor_px2
 
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
 """Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""
@@ -24,9 +25,6 @@ AMBIGUOUS_MARGIN = 2.0
 
 MIN_SEPARATION = 0.35
 """A circle's peak lies at one centre, not half-way: below this share of the centres' distance the lead is no choice."""
-
-LEAST_SMOOTHING_PX = 0.5
-"""What the parabola through three pixels amounts to, where the frame is not smoothed."""
 
 
 @dataclass(frozen=True)
@@ -191,22 +189,14 @@ def _peak_deviation(
 ) -> Array:
     """Return the standard deviation of the lead, px, shape (N,): twice that of the peak along the line of the centres.
 
-    Noise sigma, smoothed by s, has a slope of variance sigma^2 / (8 pi s^4). That slope over the lobe's second
-    derivative at its peak, I0 (-2 ln t) / r^2, r the isophote's radius along the line, is the peak's shift.
+    The smoothed noise's slope over the lobe's second derivative at its peak, I0 (-2 ln t) / r^2, r the isophote's
+    radius along the line, is the peak's shift.
     """
-    known = np.array([p.noise if isinstance(p.noise, float) else _at_peak(p) for p in patches])
-    smoothing = np.array([max(p.smoothing_px, LEAST_SMOOTHING_PX) for p in patches])
+    known = np.array([p.noise_at_peak for p in patches], dtype=float)  # NaN where it is not known
+    divisor = slope_divisor_px2([p.smoothing_px for p in patches])
     height = np.array([p.peak_value for p in patches])
     # shift of the peak: noise slope over the lobe's curvature
     level = -2 * np.log([isophote.isovalue for isophote in isophotes])
     ends = camera.project(np.stack([poses.axes + poses.narrow, poses.axes - poses.narrow]))
     radius = np.linalg.norm(ends[0] - ends[1], axis=1) / 2
-    return np.asarray(2 * known / (np.sqrt(8 * np.pi) * smoothing**2) * radius**2 / (height * level))
-
-
-def _at_peak(patch: Patch) -> float:
-    """Return the noise at a patch's peak; NaN where it is not known."""
-    if patch.noise is None:
-        return float("nan")
-    column, row = patch.peak_pixel
-    return float(np.asarray(patch.noise)[row, column]) if isinstance(patch.noise, np.ndarray) else float(patch.noise)
+    return np.asarray(2 * known / divisor * radius**2 / (height * level))

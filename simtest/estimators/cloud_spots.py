@@ -11,6 +11,7 @@ import numpy as np
 from simtest.calibration import Frame
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.geometry import Array, Image, smooth
+from simtest.geometry.gaussian_smoothing import share_of_noise
 
 SMOOTHING_PX = 0.7
 """Gaussian smoothing before maxima are looked for: that of a lens, so that one spot of noise is no maximum."""
@@ -94,9 +95,7 @@ def _light(frame: Frame) -> tuple[Image, float]:
         # The noise of the mean is known; the minimum has about that of one channel.
         factor = float(np.sqrt(frame.encoded.shape[2]))
     noise = factor * float(np.median(frame.noise))
-    # A Gaussian of width s leaves about 1 / (2 sqrt(pi) s) of white noise.
-    left = 1 / np.sqrt(1 + 4 * np.pi * SMOOTHING_PX**2)
-    return smooth(values, SMOOTHING_PX, frame.seen), noise * left
+    return smooth(values, SMOOTHING_PX, frame.seen), noise * share_of_noise(SMOOTHING_PX)
 
 
 def _background(light: Image) -> tuple[Image, Image]:

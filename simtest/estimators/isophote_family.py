@@ -24,6 +24,7 @@ from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
 from simtest.estimators.ripples import excess
 from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, cone_axes
+from simtest.geometry.gaussian_smoothing import share_of_noise
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import basis_across
 
@@ -205,10 +206,7 @@ class IsophoteFamily:
     @cached_property
     def px2(self) -> Array:
         """1 px^2 about the axis's pixel in the basis, rad^2, shape (2, 2)."""
-        pixel = self.camera.project(self.axis)
-        steps = np.array([[0.5, 0.0], [0.0, 0.5]])
-        ahead, behind = self.camera.unproject(pixel + steps), self.camera.unproject(pixel - steps)
-        J = self.basis @ (ahead - behind).T
+        J = self.basis @ self.camera.step_of_pixels(self.camera.project(self.axis)).T
         return np.asarray(J @ J.T)
 
     @cached_property
@@ -339,9 +337,8 @@ class IsophoteFamily:
     @cached_property
     def _residuals_by_noise(self) -> Array:
         """What of the residuals may be noise, shape (K,)."""
-        noise = self.patch.noise
-        at_peak = float(noise[self.patch.peak_pixel[::-1]]) if isinstance(noise, np.ndarray) else noise or 0.0
-        left = at_peak / np.sqrt(1 + 4 * np.pi * self.patch.smoothing_px**2) / self.patch.peak_value
+        at_peak = self.patch.noise_at_peak or 0.0
+        left = at_peak * share_of_noise(self.patch.smoothing_px) / self.patch.peak_value
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
         isovalues = self._crossings.isovalues
         return np.asarray(NOISE_FACTOR * left / (-2 * isovalues * np.log(isovalues)))

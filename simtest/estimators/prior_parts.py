@@ -28,11 +28,6 @@ NEAR_SHARE = 0.05
 NEGLIGIBLE = 0.1
 """A squared error below this share of the stated variance is left out."""
 
-STEP_PX = 0.5
-"""Step of the sightline's central differences."""
-
-STEPS_PX = STEP_PX * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-
 SPOT_SPREAD, SPOT_ONSET = math.radians(3.2), math.radians(1.3)
 """Highlights lie wider about the base's brightest point than the relief's slope says, since a lobe of finite width
 lights points that miss the light: by this much an axis on wet tissue (lobes of 1 to 2 deg half-angle), in squares,
@@ -112,8 +107,7 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     reach2 = (from_centre[0] / camera.fx) ** 2 + (from_centre[1] / camera.fy) ** 2
     radial = prior.focal_sd**2 + (prior.distortion_sd * reach2) ** 2
     in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * np.eye(2)
-    rays = camera.unproject(estimate.look_px + STEPS_PX)
-    J = basis_across(estimate.normal) @ ((rays[:2] - rays[2:]) / (2 * STEP_PX)).T
+    J = basis_across(estimate.normal) @ camera.step_of_pixels(estimate.look_px).T
     return np.nan_to_num(J @ in_pixels @ J.T)
 
 

@@ -98,9 +98,7 @@ class SmallSpot:
     @cached_property
     def _by_pixel(self) -> Array:
         """Derivative of the axis, in the basis, by the centre's pixel coordinates, rad / px, shape (2, 2)."""
-        steps = np.array([[0.5, 0.0], [0.0, 0.5]])
-        ahead, behind = self.camera.unproject(self.centre_px + steps), self.camera.unproject(self.centre_px - steps)
-        return np.asarray(self.basis @ (ahead - behind).T)
+        return np.asarray(self.basis @ self.camera.step_of_pixels(self.centre_px).T)
 
     @cached_property
     def moments(self) -> Array:
@@ -250,11 +248,7 @@ def _spot(i: int, patch: Patch, camera: Camera, windows: SpotWindows, fits: Spot
         return SmallSpot(patch, camera, patch.peak_px, variance, np.zeros((2, 2)), anywhere)
     p = fits.parameters[i]
     variance = np.linalg.inv(np.array([[p[XX], p[XY]], [p[XY], p[YY]]]))
-    noise = 0.0
-    if patch.noise is not None:
-        column, row = patch.peak_pixel
-        noise = float(patch.noise[row, column] if isinstance(patch.noise, np.ndarray) else patch.noise)
-    by_noise = fits.covariance[i] * (noise / patch.peak_value) ** 2
+    by_noise = fits.covariance[i] * ((patch.noise_at_peak or 0.0) / patch.peak_value) ** 2
     own = max(radius**2 - GAUSSIAN_RADIUS2 * patch.smoothing_px**2, 0.0)
     gaps = np.linalg.norm(np.reshape(patch.others_px, (-1, 2)) - patch.peak_px, axis=1)
     near = NEIGHBOUR_PX4 / max(float(gaps.min(initial=np.inf)), LEAST_GAP_PX) ** 4

@@ -218,6 +218,14 @@ class Camera:
         rays /= np.sqrt(x * x + y * y + 1.0)[..., None]
         return rays
 
+    def step_of_pixels(self, point_px: Array) -> Array:
+        """Return how the unit sightline moves by a pixel along x and along y, rows, shape (2, 3), at a pixel, (2,).
+
+        Central differences over half a pixel either way.
+        """
+        steps = np.array([[0.5, 0.0], [0.0, 0.5]])
+        return self.unproject(point_px + steps) - self.unproject(point_px - steps)
+
     def project(self, points: npt.ArrayLike) -> Array:
         """Return the pixels, shape (..., 2), at which the lens images points or directions, shape (..., 3).
 

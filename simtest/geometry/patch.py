@@ -219,6 +219,13 @@ class Patch:
         found = self._isophotes.closed(isovalue)
         return None if isinstance(found, Failure) else int(np.count_nonzero(found.inside))
 
+    @property
+    def noise_at_peak(self) -> float | None:
+        """Standard deviation of the noise before smoothing at the peak's pixel; None where it is not known."""
+        if isinstance(self.noise, np.ndarray):
+            return float(self.noise[self.peak_pixel[::-1]])
+        return None if self.noise is None else float(self.noise)
+
     def saturated_share(self, isovalue: float) -> float | None:
         """Return the share of the pixels inside an isophote that are clipped; None where that is not known."""
         if self.saturated is None:

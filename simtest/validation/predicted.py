@@ -141,11 +141,8 @@ def _takes_ratio_as_seen(estimate: Estimate) -> bool:
 
 def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
     """Compute the angle of a pixel at a BP, rad: the root of its solid angle."""
-    camera = scene.camera.model()
-    # Half a pixel along x and along y.
-    steps = np.array([[0.5, 0.0], [0.0, 0.5]])
-    ahead, behind = camera.unproject(highlight.bp_px + steps), camera.unproject(highlight.bp_px - steps)
-    return float(np.sqrt(np.linalg.norm(np.cross(*(ahead - behind)))))
+    steps = scene.camera.model().step_of_pixels(highlight.bp_px)
+    return float(np.sqrt(np.linalg.norm(np.cross(*steps))))
 
 
 def look_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> float | None:

@@ -23,7 +23,7 @@ from simtest.estimators.dispatch import run
 from simtest.runtime.files import make_folder
 from studies.hard.cases import Case, calibration_of, load, save
 from studies.hard.measure import Frames, Record, record
-from studies.hard.rows import ROWS, Row
+from studies.hard.rows import GROUPS, ROWS, Row
 from studies.hard.scenes import SPLITS, kind_of
 from studies.hard.table import lines, text
 
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if records:
         table = pl.DataFrame(records, infer_schema_length=None)
         table.write_parquet(given.out / f"{given.split}.parquet")
-        print(text(lines(table, [row.name for row in rows])))
+        print(text(lines(table, [row.name for row in rows], GROUPS)))
     return 0
 
 

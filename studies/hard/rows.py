@@ -170,3 +170,16 @@ def _rows() -> tuple[Row, ...]:
 
 
 ROWS = _rows()
+
+GROUPS = {
+    "relief 0 to 4 deg, all told": tuple(row.name for row in ROWS if row.name.startswith("relief")),
+    "vessels, camera chain and lens, all told": tuple(
+        row.name
+        for row in ROWS
+        if row.name.startswith(("vessels", "JPEG", "mosaic", "sharpening", "motion", "clipping", "wide"))
+    ),
+    "light told": tuple(row.name for row in ROWS if row.name.startswith("light") and row.told.light),
+    "light untold": tuple(row.name for row in ROWS if row.name.startswith("light") and not row.told.light),
+    "all rows": tuple(row.name for row in ROWS),
+}
+"""Rows whose highlights are counted together."""

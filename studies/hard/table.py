@@ -1,13 +1,15 @@
 """The study's table: coverage, size and silent errors of each row and estimator."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-CHI2_95 = -2 * math.log(0.05)
+from simtest.geometry import chi_squared
+
+CHI2_95 = chi_squared.quantile(0.95, 2)
 """95 % quantile of the chi-squared distribution with two degrees of freedom."""
 
 SILENT = 4.0
@@ -48,11 +50,11 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def lines(table: pl.DataFrame, rows: Sequence[str]) -> list[Line]:
-    """Return the figures of all rows, in their order, and of all rows together."""
+def lines(table: pl.DataFrame, rows: Sequence[str], groups: Mapping[str, Sequence[str]] | None = None) -> list[Line]:
+    """Return the figures of all rows, in their order, and of groups of rows together, by the groups' names."""
     made = []
-    for row in (*rows, "all rows"):
-        part = table if row == "all rows" else table.filter(pl.col("row") == row)
+    for row, members in {**{row: [row] for row in rows}, **(groups or {})}.items():
+        part = table.filter(pl.col("row").is_in(list(members)))
         for estimator in table["estimator"].unique(maintain_order=True):
             own = part.filter(pl.col("estimator") == estimator)
             if own.height:

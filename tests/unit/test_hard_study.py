@@ -11,7 +11,7 @@ from simtest.estimators.protocol import Estimate
 from simtest.geometry import Patch
 from studies.hard.cases import Case, calibration_of, load, save, scene_of
 from studies.hard.measure import record
-from studies.hard.rows import ROWS
+from studies.hard.rows import GROUPS, ROWS
 from studies.hard.scenes import KINDS, SPLITS, base_scene
 from studies.hard.table import CHI2_95, lines, text, wilson
 
@@ -66,5 +66,11 @@ def test_the_table_counts_what_is_covered_silent_and_failed():
     assert (line.answers, line.stated, line.failures, line.covered) == (4, 4, 1, 75.0)
     assert line.silent == 0  # the case's pixels are clipped, and that is said
     assert "JPEG 80" in text([line])
+    # Groups count their rows together, and each row belongs to one of them or stands alone.
+    table = pl.DataFrame(made, infer_schema_length=None)
+    alone, together = lines(table, [], {"told": ["JPEG 80", "mosaic"], "none": ["mosaic"]})[0], line
+    assert replace(alone, row="JPEG 80") == together
+    assert set(GROUPS["all rows"]) == {row.name for row in ROWS}
+    assert not set(GROUPS["light told"]) & set(GROUPS["light untold"])
     assert wilson(95, 100)[0] < 0.95 < wilson(95, 100)[1]
     assert pytest.approx(5.991, abs=1e-3) == CHI2_95
