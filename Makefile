@@ -3,13 +3,15 @@ PYTHON ?= python3
 VENV ?= .venv
 WORKERS ?= auto
 BIN := $(VENV)/bin
+TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo test test-all bench bench-cycles lint format clean
+.PHONY: help demo test test-all test-ci bench bench-cycles lint format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
+	@echo "make test-ci   fast tests and those of all extras, which it installs"
 	@echo "make bench     speeds, as ratios within one run"
 	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
@@ -24,6 +26,13 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 
 $(VENV)/.tests: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	@touch $@
+
+# The CPU build of torch comes from a wheel beside the registry or not at all: the registry's own drags in gigabytes of CUDA.
+$(VENV)/.ci: $(VENV)/.tests
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,ci]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "torch==$(TORCH)+cpu" || \
+		echo "no CPU build of torch $(TORCH) was found: tests that need it are skipped"
 	@touch $@
 
 $(VENV)/.benchmarks: $(VENV)/.installed
@@ -43,6 +52,9 @@ test: $(VENV)/.tests
 
 test-all: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+test-ci: $(VENV)/.ci
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow or extra" -rs
 
 bench: $(VENV)/.benchmarks
 	$(BIN)/python -m benchmarks

@@ -20,7 +20,7 @@ from simtest.runtime.engines import make_engine
 from simtest.spec import load_dataset
 
 # Others warn as they like.
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.slow, pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -13,7 +13,7 @@ from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.runtime.engines import make_engine  # noqa: E402
 from simtest.spec import load_dataset  # noqa: E402
 
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
 
 
 @pytest.fixture(scope="module")

@@ -188,6 +188,7 @@ def test_bad_options_are_one_line(tmp_path, against, more, words):
 
 
 @pytest.mark.slow
+@pytest.mark.extra
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this system")
 def test_page_in_a_browser(tmp_path):
     """No complaint, nothing asked of the network, no sideways scrolling on a desktop and on a phone."""

@@ -31,6 +31,7 @@ def test_content_is_the_scene(content):
 
 
 @pytest.mark.slow
+@pytest.mark.extra
 @pytest.mark.render
 def test_tissue_is_shown_in_its_colours_with_its_relief(content, tmp_path):
     assert content.normal.shape == content.colour.shape == (0, 3)
@@ -66,6 +67,7 @@ def test_content_survives_its_file(content, tmp_path):
     assert list(again.names) == list(content.names)
 
 
+@pytest.mark.extra
 @pytest.mark.render
 def test_a_screenshot_needs_no_display(content, tmp_path, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
