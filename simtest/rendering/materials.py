@@ -7,17 +7,14 @@ from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
 from simtest.spec.reflectance import (
     PhongReflectance,
     PrincipledReflectance,
+    Reflectance,
     RoughConductorReflectance,
     RoughPlasticReflectance,
     TissueReflectance,
 )
 
-AnyReflectance = (
-    PhongReflectance | RoughPlasticReflectance | PrincipledReflectance | RoughConductorReflectance | TissueReflectance
-)
 
-
-def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool) -> MitsubaDict:
+def bsdf_dict(reflectance: Reflectance, phong_plugin: str, diffuse_only: bool) -> MitsubaDict:
     """Describe a reflectance to `mi.load_dict`; `phong_plugin` is the registered name of the Phong plugin.
 
     With `diffuse_only` the specular part is left out: the difference between both radiances is the specular one. Not
@@ -74,19 +71,19 @@ def bsdf_dict(reflectance: AnyReflectance, phong_plugin: str, diffuse_only: bool
             }
 
 
-def parts_alone(reflectance: AnyReflectance) -> bool:
+def parts_alone(reflectance: Reflectance) -> bool:
     """Return whether components 0 and 1 of the BSDF are the lobe and the base."""
     return isinstance(reflectance, PhongReflectance | TissueReflectance)
 
 
-def compiled_form(reflectance: AnyReflectance) -> tuple[object, ...]:
+def compiled_form(reflectance: Reflectance) -> tuple[object, ...]:
     """Return what of a reflectance is compiled into the kernels."""
     if isinstance(reflectance, TissueReflectance):
         return type(reflectance), reflectance.film.distribution
     return type(reflectance), getattr(reflectance, "normalised", None)
 
 
-def parameter_updates(mi: Any, reflectance: AnyReflectance) -> MitsubaDict:
+def parameter_updates(mi: Any, reflectance: Reflectance) -> MitsubaDict:
     """Return the values that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
 
     The paths hold for the whole BSDF and for its diffuse base; Phong's lobe has no base of its own.

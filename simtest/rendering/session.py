@@ -5,8 +5,7 @@ structure is new, and write the values that may differ. Then it renders radiance
 the ground truth.
 """
 
-import weakref
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,15 +14,16 @@ from simtest.errors import InputError
 from simtest.rendering import adaptive, backend, block_truth, emission, found_highlights, glints, phong, tissue
 from simtest.rendering import exact_points as exact
 from simtest.rendering.albedo import AlbedoKernel
+from simtest.rendering.built_scene import BuiltScene, build
 from simtest.rendering.camera_motion import mean_over
-from simtest.rendering.direct import DirectLight, Material
+from simtest.rendering.direct import Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.hit_refinement import Refinement
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.instrument_kernel import InstrumentKernel
 from simtest.rendering.instruments import Cover, cover_of, place, shade
 from simtest.rendering.integrate import Progress, Tracer, as_radiance
-from simtest.rendering.materials import bsdf_dict, compiled_form, parameter_updates, parts_alone
+from simtest.rendering.materials import compiled_form
 from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.misfit_grid import MisfitGrid, trace_grid
 from simtest.rendering.misfit_maps import trace_misfits, trace_tiles
@@ -31,7 +31,6 @@ from simtest.rendering.placement_checks import check_camera, check_lights, check
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
-from simtest.rendering.shapes import make_shape
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.spec.motion import Motion
 from simtest.spec.rig import is_at_camera
@@ -41,19 +40,6 @@ from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import TissuePattern
-
-
-@dataclass
-class _Built:
-    """The Mitsuba objects of a scene's structure, and what their parameters were last set to."""
-
-    key: tuple[Any, ...]
-    scene: Any
-    parameters: Any
-    base: Any
-    base_parameters: Any
-    labels: ShapeLabels | None = None
-    edges: MeshEdges | None = None
 
 
 class Session:
@@ -136,7 +122,7 @@ class Session:
         if self._labelled:
             self._shape_labels()
         # Values.
-        self._apply(self._built)
+        self._write_values()
         try:
             self._instruments, self._cover = place(self), None
         except InputError:
@@ -189,62 +175,22 @@ class Session:
         lights = tuple(emission.kind_of(light) for light in self.scene.rig.lights)
         return self._shape.key, relief, material, self._pattern is not None, lights
 
-    def _build(self, key: tuple[Any, ...]) -> _Built:
+    def _build(self, key: tuple[Any, ...]) -> BuiltScene:
         self.rebuilds += 1
-        reflectance = self.scene.reflectance
-        shape = make_shape(self.mi, self._shape, bsdf_dict(reflectance, self.plugin, diffuse_only=False))
-        # Surface and lights; `_apply` writes the values of the lights.
-        kinds = (emission.kind_of(light) for light in self.scene.rig.lights)
-        lights = {f"light_{i}": emission.emitter_dict(kind) for i, kind in enumerate(kinds)}
-        # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
-        # would share a parameter, and an update of one would change both.
-        scene = self.mi.load_dict({"type": "scene", "surface": shape, **lights}, optimize=False)
-        # The base alone, where the BSDF cannot evaluate its parts separately.
-        base = None
-        if not parts_alone(reflectance):
-            base = self.mi.load_dict(bsdf_dict(reflectance, self.plugin, diffuse_only=True), optimize=False)
-        return _Built(key, scene, self.mi.traverse(scene), base, base and self.mi.traverse(base))
+        return build(self.mi, key, self._shape, self.scene.reflectance, self.scene.rig.lights, self.plugin)
 
-    def _apply(self, built: _Built) -> None:
+    def _write_values(self) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
-        parameters = built.parameters
-        # Shape.
-        if "to_model" in self._shape.parameters:
-            matrix = self._shape.parameters["to_model"]
-            _set(parameters, "surface.to_world", self.mi.AffineTransform4f(matrix.tolist()))
-        # Material: the whole and its base alone.
-        for name, value in parameter_updates(self.mi, self.scene.reflectance).items():
-            _set(parameters, f"bsdf.{name}", value)
-            if built.base is not None:
-                built.base_parameters[name] = value
-        self._place_lights(built, self.surface.model_from_camera)
-        if built.base is not None:
-            built.base_parameters.update()
-        self._apply_tissue(built)
-
-    def _place_lights(self, built: _Built, model_from_camera: Array) -> None:
-        """Write the lights of the rig at a pose of the camera into the Mitsuba scene and the kernels."""
-        lights, rotation = self.scene.rig.lights, model_from_camera[:3, :3]
-        positions = self.scene.rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
-        axes = np.array([light.axis for light in lights]) @ rotation.T
-        poses = [
-            emission.LightPose(position, axis, light.across @ rotation.T)
-            for light, position, axis in zip(lights, positions, axes, strict=True)
-        ]
-        for i, light in enumerate(lights):
-            for name, value in emission.emitter_values(self.mi, light, poses[i]).items():
-                _set(built.parameters, f"light_{i}.{name}", value)
-        built.parameters.update()
-        self._light = DirectLight(self.mi, self.scene.rig, poses)
-
-    def _apply_tissue(self, built: _Built) -> None:
-        """Upload the pattern of the tissue, unless it is there, and let bounces find the albedo by their own points."""
+        self._built.write(self.mi, self._shape, self.scene.reflectance)
+        self._place_lights(self.surface.model_from_camera)
+        # The pattern of the tissue, unless it is there.
         if self._albedo is None or self._albedo.pattern is not self._pattern:
             self._albedo = AlbedoKernel(self.mi, self._pattern) if self._pattern else None
-        if self._pattern is not None:
-            # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
-            albedo = weakref.proxy(self._albedo)
-            built.scene.shapes()[0].bsdf().albedo_at = lambda si, active: albedo.at(si.p, active)
+        if self._albedo is not None:
+            self._built.let_bounces_find(self._albedo)
+
+    def _place_lights(self, model_from_camera: Array) -> None:
+        self._light = self._built.place_lights(self.mi, self.scene.rig, model_from_camera)
 
     def to_model(self, points: Array) -> Array:
         """Transform points, shape (N, 3), from the camera frame to the model frame, mm."""
@@ -321,13 +267,13 @@ class Session:
 
         def at(middle_from_moment: Array) -> Tracer:
             pose = middle @ middle_from_moment
-            self._place_lights(self._built, pose)
+            self._place_lights(pose)
             return self._tracer(Sightlines(self.mi, self.camera, pose))
 
         try:
             return mean_over(motion, self.scene.render, at, bounces, progress)
         finally:
-            self._place_lights(self._built, middle)
+            self._place_lights(middle)
 
     def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
         built, mesh = self._built, self._shape.mesh
@@ -484,10 +430,3 @@ class Session:
         if self._instruments is not None:
             found = shade(self, self._instruments, found)
         return list(found) if radiance is None else found_highlights.lit_by(radiance, found)
-
-
-def _set(parameters: Any, suffix: str, value: Any) -> None:
-    """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
-    paths = [path for path in parameters.keys() if path.endswith(suffix)]  # noqa: SIM118 - no plain dict
-    assert len(paths) == 1, (suffix, list(parameters.keys()))
-    parameters[paths[0]] = value

@@ -1,0 +1,111 @@
+"""The Mitsuba objects of a scene's structure: built once, then only their values are written.
+
+What is compiled into the kernels (shape, BSDF, kinds of lights) is the structure. Everything else is a parameter, which
+costs less than a millisecond to write.
+"""
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from simtest.rendering import emission
+from simtest.rendering.albedo import AlbedoKernel
+from simtest.rendering.direct import DirectLight
+from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
+from simtest.rendering.mesh_edges import MeshEdges
+from simtest.rendering.shape_labels import ShapeLabels
+from simtest.rendering.shapes import make_shape
+from simtest.runtime.arrays import Array
+from simtest.spec.reflectance import Reflectance
+from simtest.spec.rig import LightSpec, Rig
+from simtest.surfaces import Shape
+
+
+@dataclass
+class BuiltScene:
+    """A built Mitsuba scene.
+
+    Parameters
+    ----------
+    key : tuple
+        Its structure.
+    scene, parameters
+        The Mitsuba scene with surface and lights, and its parameters.
+    base, base_parameters
+        The BSDF's base alone and its parameters; None where the BSDF evaluates its parts separately.
+    labels : ShapeLabels, optional
+        What traces the labels of its shape; made when first needed.
+    edges : MeshEdges, optional
+        Edges of its mesh; made when first needed.
+    """
+
+    key: tuple[Any, ...]
+    scene: Any
+    parameters: Any
+    base: Any
+    base_parameters: Any
+    labels: ShapeLabels | None = None
+    edges: MeshEdges | None = None
+
+    def write(self, mi: Any, shape: Shape, reflectance: Reflectance) -> None:
+        """Write pose and material of the surface."""
+        # Shape.
+        if "to_model" in shape.parameters:
+            matrix = shape.parameters["to_model"]
+            self._set("surface.to_world", mi.AffineTransform4f(matrix.tolist()))
+        # Material: the whole and its base alone.
+        for name, value in parameter_updates(mi, reflectance).items():
+            self._set(f"bsdf.{name}", value)
+            if self.base is not None:
+                self.base_parameters[name] = value
+        if self.base is not None:
+            self.base_parameters.update()
+
+    def place_lights(self, mi: Any, rig: Rig, model_from_camera: Array) -> DirectLight:
+        """Write the lights of a rig at a pose of the camera, shape (4, 4), and all that was set before.
+
+        Returns the lights' own kernel.
+        """
+        lights, rotation = rig.lights, model_from_camera[:3, :3]
+        positions = rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
+        axes = np.array([light.axis for light in lights]) @ rotation.T
+        poses = [
+            emission.LightPose(position, axis, light.across @ rotation.T)
+            for light, position, axis in zip(lights, positions, axes, strict=True)
+        ]
+        for i, light in enumerate(lights):
+            for name, value in emission.emitter_values(mi, light, poses[i]).items():
+                self._set(f"light_{i}.{name}", value)
+        self.parameters.update()
+        return DirectLight(mi, rig, poses)
+
+    def let_bounces_find(self, albedo: AlbedoKernel) -> None:
+        """Let bounced light find the albedo of tissue by its own points."""
+        # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
+        found = weakref.proxy(albedo)
+        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: found.at(si.p, active)
+
+    def _set(self, suffix: str, value: Any) -> None:
+        """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
+        paths = [path for path in self.parameters.keys() if path.endswith(suffix)]  # noqa: SIM118 - no plain dict
+        assert len(paths) == 1, (suffix, list(self.parameters.keys()))
+        self.parameters[paths[0]] = value
+
+
+def build(
+    mi: Any, key: tuple[Any, ...], shape: Shape, reflectance: Reflectance, lights: Sequence[LightSpec], plugin: str
+) -> BuiltScene:
+    """Build the Mitsuba scene of a structure; `plugin` is the name of the Phong BSDF."""
+    surface = make_shape(mi, shape, bsdf_dict(reflectance, plugin, diffuse_only=False))
+    emitters = {f"light_{i}": emission.emitter_dict(emission.kind_of(light)) for i, light in enumerate(lights)}
+    # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
+    # would share a parameter, and an update of one would change both.
+    scene = mi.load_dict({"type": "scene", "surface": surface, **emitters}, optimize=False)
+    # The base alone, where the BSDF cannot evaluate its parts separately.
+    base = None
+    if not parts_alone(reflectance):
+        base = mi.load_dict(bsdf_dict(reflectance, plugin, diffuse_only=True), optimize=False)
+    return BuiltScene(key, scene, mi.traverse(scene), base, base and mi.traverse(base))
