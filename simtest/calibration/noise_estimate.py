@@ -17,6 +17,9 @@ CLEAR_SIDE_PX = 7
 MIN_CLEAR = 100
 """With fewer pixels clear of clipped ones, all pixels are the better sample."""
 
+SAMPLE = 2048
+"""So many values show where the median of many more lies."""
+
 
 def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask | None = None) -> float:
     """Estimate the standard deviation of white noise in a frame before smoothing, robust against edges and highlights.
@@ -57,6 +60,23 @@ def median(values: npt.NDArray[np.float32]) -> np.float32:
     if np.isnan(values.max()):
         return np.float32(np.nan)
     middle = len(values) // 2
-    if len(values) % 2:
-        return np.float32(np.partition(values, middle)[middle])
-    return np.float32(np.mean(np.partition(values, (middle - 1, middle))[middle - 1 : middle + 1]))
+    lower = middle if len(values) % 2 else middle - 1
+    below, near = _around_median(values)
+    if not below <= lower <= middle < below + len(near):
+        below, near = 0, values
+    ordered = np.partition(near, (lower - below, middle - below))
+    if lower == middle:
+        return np.float32(ordered[middle - below])
+    return np.float32(np.mean(ordered[lower - below : middle - below + 1]))
+
+
+def _around_median(values: npt.NDArray[np.float32]) -> tuple[int, npt.NDArray[np.float32]]:
+    """Return the values in a range that usually holds the median of many, and how many lie below it.
+
+    The tenth of the values about the median of a sample: the rest need not be put in order.
+    """
+    if len(values) < 16 * SAMPLE:
+        return 0, values
+    sample = np.sort(values[:: len(values) // SAMPLE])
+    low, high = sample[int(0.45 * len(sample))], sample[int(0.55 * len(sample))]
+    return int(np.count_nonzero(values < low)), values[(values >= low) & (values <= high)]
