@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simtest.geometry.pixel_sets import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -56,7 +57,7 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     shape = values.shape
     # pixels of the mask, numbered; a margin of one pixel spares the borders
     number = np.full((shape[0] + 2, shape[1] + 2), -1, dtype=np.int64)
-    rows, columns = np.nonzero(mask)
+    rows, columns = rows_and_columns(mask)
     count = len(rows)
     number[rows + 1, columns + 1] = np.arange(count)
     height = values[rows, columns].astype(np.float64)
