@@ -195,7 +195,7 @@ def level_set_around(
     box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
     # reject what touches unseen pixels, then fill the holes
     around = (marks[box] == _REGION).view(np.uint8)
-    if seen is not None and (cv2.dilate(around, _NEIGHBOURS) > 0)[~seen[box]].any():
+    if seen is not None and not (known := seen[box]).all() and (cv2.dilate(around, _NEIGHBOURS) > 0)[~known].any():
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     return LevelSet(values, around != _OUTSIDE, level, (x - 1, y - 1))
