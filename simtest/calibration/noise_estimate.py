@@ -67,7 +67,7 @@ def median(values: npt.NDArray[np.float32]) -> np.float32:
     ordered = np.partition(near, (lower - below, middle - below))
     if lower == middle:
         return np.float32(ordered[middle - below])
-    return np.float32(np.mean(ordered[lower - below : middle - below + 1]))
+    return np.float32((ordered[lower - below] + ordered[middle - below]) / np.float32(2))
 
 
 def _around_median(values: npt.NDArray[np.float32]) -> tuple[int, npt.NDArray[np.float32]]:
