@@ -55,10 +55,11 @@ def estimate_noise(frame: npt.ArrayLike, seen: Mask | None = None, clipped: Mask
     return float(MAD_TO_SIGMA * median(np.abs(response)) / 6.0)
 
 
-def median(values: npt.NDArray[np.float32]) -> np.float32:
-    """Return the median of values, shape (n,), as `np.median` does, which loads `numpy.ma` first."""
-    if np.isnan(values.max()):
-        return np.float32(np.nan)
+def median(values: npt.NDArray[np.floating]) -> np.floating:
+    """Return the median of real numbers, shape (n,), as `np.median` does, which loads `numpy.ma` first."""
+    largest: np.floating = values.max()
+    if np.isnan(largest):
+        return largest
     middle = len(values) // 2
     lower = middle if len(values) % 2 else middle - 1
     below, near = _around_median(values)
@@ -66,11 +67,11 @@ def median(values: npt.NDArray[np.float32]) -> np.float32:
         below, near = 0, values
     ordered = np.partition(near, (lower - below, middle - below))
     if lower == middle:
-        return np.float32(ordered[middle - below])
-    return np.float32((ordered[lower - below] + ordered[middle - below]) / np.float32(2))
+        return values.dtype.type(ordered[middle - below])
+    return values.dtype.type((ordered[lower - below] + ordered[middle - below]) / values.dtype.type(2))
 
 
-def _around_median(values: npt.NDArray[np.float32]) -> tuple[int, npt.NDArray[np.float32]]:
+def _around_median(values: npt.NDArray[np.floating]) -> tuple[int, npt.NDArray[np.floating]]:
     """Return the values in a range that usually holds the median of many, and how many lie below it.
 
     The tenth of the values about the median of a sample: the rest need not be put in order.

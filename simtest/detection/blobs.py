@@ -387,7 +387,7 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
 
 
 def _medians(values: Image) -> Image:
-    """Return the median of each channel of some pixels, shape (n, 3), as `np.median` does, in a fraction of the time."""
+    """Return the median of each channel of some pixels, shape (n, 3), as `np.median` does; faster."""
     return np.array([median(channel) for channel in values.T.copy()])
 
 

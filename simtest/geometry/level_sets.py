@@ -6,6 +6,7 @@ without it they are found several times faster than by tracing.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -116,6 +117,10 @@ class LevelSet:
 
         A pixel whose value is the level is passed each time that the border comes to it.
         """
+        return self._polygon
+
+    @cached_property
+    def _polygon(self) -> Array:
         # Traced on the region itself: on the values, contours that meet at such a pixel would separate there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)
