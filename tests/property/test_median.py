@@ -33,7 +33,8 @@ def test_that_of_many_values_is_numpys_too(kind, odd):
         "doubles": noise.astype(np.float64) / 3,
     }[kind]
     found = median(values)
-    assert found == np.median(values) and found.dtype == values.dtype
+    assert found == np.median(values)
+    assert found.dtype == values.dtype
 
 
 @given(arrays(float, st.integers(1, 70), elements=st.floats(0, 1e30)), st.floats(0.01, 0.99))

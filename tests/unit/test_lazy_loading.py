@@ -116,4 +116,4 @@ def test_a_page_needs_neither_scipy_nor_pillow_s_other_formats(tmp_path):
     )
     modules = loaded(code)
     assert "PIL.AvifImagePlugin" in modules
-    assert not modules & {"scipy", "scipy.special", "PIL.PdfImagePlugin", "PIL.WebPImagePlugin"}
+    assert not modules & {"scipy", "scipy.special", "numpy.ma", "PIL.PdfImagePlugin", "PIL.WebPImagePlugin"}
