@@ -102,7 +102,8 @@ class Response:
 
         # A table of all 16-bit values is faster than the curve at each pixel, and exact for pictures of 8 and 16 bits.
         table = self.decode(np.linspace(0, 1, _LEVELS)).astype(np.float32)
-        return np.asarray(table[cv2.multiply(values, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)])
+        # `take` needs half the time of an index.
+        return np.asarray(table.take(cv2.multiply(values, (_LEVELS - 1,) * 4, dtype=cv2.CV_16U)))
 
 
 def check_table(light: tuple[float, ...], value: tuple[float, ...]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simtest.geometry.pixel_sets import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -56,7 +57,7 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     shape = values.shape
     # pixels of the mask, numbered; a margin of one pixel spares the borders
     number = np.full((shape[0] + 2, shape[1] + 2), -1, dtype=np.int64)
-    rows, columns = np.nonzero(mask)
+    rows, columns = rows_and_columns(mask)
     count = len(rows)
     number[rows + 1, columns + 1] = np.arange(count)
     height = values[rows, columns].astype(np.float64)
@@ -69,7 +70,7 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     up = _highest_neighbour(order, pixels, ends)
     while not np.array_equal(further := up[up], up):
         up = further
-    tops, basin = np.unique(up, return_inverse=True)
+    tops, basin = _numbered(up, count)
     if not len(tops):
         empty = np.empty(0, dtype=np.int64)
         return Basins(
@@ -81,7 +82,7 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
         order[tops], (height[tops], total[tops]), (first, second, height[saddle], total[saddle]), keep, noise
     )
     # summits that stay, the brightest first
-    kept = np.unique(owner)
+    kept, _ = _numbered(owner, len(tops))
     kept = kept[np.argsort(-order[tops[kept]], kind="stable")]
     rank = np.full(len(tops), -1)
     rank[kept] = np.arange(len(kept))
@@ -90,6 +91,16 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     labels[rows, columns] = mine[basin] + 1
     pairs, low = _highest_of_pairs(mine[first], mine[second], saddle, order, len(kept))
     return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[low], columns[low]], axis=1))
+
+
+def _numbered(values: Index, count: int) -> tuple[Index, Index]:
+    """Return the different ones of whole numbers from 0 to below `count`, rising, and which of them each one is.
+
+    `np.unique` sorts for it, and loads `numpy.ma`.
+    """
+    present = np.zeros(count, dtype=bool)
+    present[values] = True
+    return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
 
 
 def _highest_neighbour(order: Index, pixels: Index, ends: list[Index]) -> Index:

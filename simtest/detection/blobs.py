@@ -11,7 +11,8 @@ from enum import StrEnum
 import cv2
 import numpy as np
 
-from simtest.calibration.calibration import brightest_channel
+from simtest.calibration.calibration import brightest_channel, mean_channel
+from simtest.calibration.noise_estimate import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.light_split import BLOCKS, NEIGHBOURHOOD, SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
@@ -371,9 +372,10 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
         far = cv2.dilate(bright.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) == 0
         far = far if np.count_nonzero(far) >= MIN_AREA_PX else around
     clutter = _ranked(specular[far], CLUTTER_SHARE) / spot.value
-    tissue = np.median(values[around], axis=0)
-    own = np.median(linear[spot.crop][spot.mask], axis=0)
-    brighter = _ranked(values[around].mean(axis=1), PALE_SHARE)
+    surroundings = values[around]
+    tissue = _medians(surroundings)
+    own = _medians(linear[spot.crop][spot.mask])
+    brighter = _ranked(mean_channel(surroundings[None])[0], PALE_SHARE)
     surround = brighter / max(float(own.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
     shown = (specular >= 0.3 * spot.value) & (brightest_channel(values) < UNCLIPPED)
@@ -382,6 +384,11 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     gain = values[shown].mean(axis=0) - tissue
     weakest, strongest = float(gain[tissue.argmin()]), float(gain[tissue.argmax()])
     return (min(weakest / strongest, 1.0) if strongest > 0 else 1.0), clutter, surround
+
+
+def _medians(values: Image) -> Image:
+    """Return the median of each channel of some pixels, shape (n, 3), as `np.median` does; faster."""
+    return np.array([median(channel) for channel in values.T.copy()])
 
 
 def _ranked(values: Image, share: float) -> float:

@@ -16,6 +16,7 @@ from simtest.detection.spots import Spot, find_spots
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask, smooth
+from simtest.geometry.pixel_sets import rows_and_columns
 
 SMOOTHING_PX = 0.35
 """Smoothing before highlights are told apart; a wider one melts small ones."""
@@ -172,16 +173,20 @@ def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:
     number = np.zeros(mask.shape, dtype=np.int32)
     for i, spot in enumerate(spots):
         number[spot.crop][spot.mask] = i
+    # Ways between pixels stay inside the box around all of them.
+    x, y, width, height = cv2.boundingRect((mask | more).view(np.uint8))
+    box = np.s_[y : y + height, x : x + width]
     away, nearest = cv2.distanceTransformWithLabels(
-        (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        (~mask[box]).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
-    rows, columns = np.nonzero(more & ~mask)
     owner = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    owner[nearest[mask]] = number[mask]
-    mine = owner[nearest[rows, columns]]
+    owner[nearest[mask[box]]] = number[mask]
+    down, right = rows_and_columns((more & ~mask)[box])
+    rows, columns = down + y, right + x
+    mine = owner[nearest[down, right]]
     reach = np.array([FOOT_REACH * np.sqrt(spot.area_px / np.pi) + 1 for spot in spots])
     peak = np.array([spot.value for spot in spots])
-    near = (away[rows, columns] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
+    near = (away[down, right] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
     feet = np.zeros(mask.shape, dtype=bool)
     feet[rows[near], columns[near]] = True
     return feet

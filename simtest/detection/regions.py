@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration.noise_estimate import median
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
 from simtest.geometry import pixel_sets
 from simtest.runtime.arrays import Array, Image, Mask
@@ -159,7 +160,7 @@ def contrast(image: Image, component: Component, peak: float, seen: Mask | None 
         inside |= ~seen[top : top + height, left : left + width]
     around = image[top : top + height, left : left + width][~inside]
     least = image.min() if seen is None else image.min(where=seen, initial=np.inf)
-    return peak - float(np.median(around) if around.size else least)
+    return peak - float(median(around) if around.size else least)
 
 
 def _expanded_box(component: Component, shape: tuple[int, ...]) -> tuple[int, int, int, int]:

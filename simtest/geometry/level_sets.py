@@ -6,6 +6,7 @@ without it they are found several times faster than by tracing.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -116,6 +117,10 @@ class LevelSet:
 
         A pixel whose value is the level is passed each time that the border comes to it.
         """
+        return self._polygon
+
+    @cached_property
+    def _polygon(self) -> Array:
         # Traced on the region itself: on the values, contours that meet at such a pixel would separate there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)
@@ -195,7 +200,7 @@ def level_set_around(
     box = np.s_[y - 1 : y + height + 1, x - 1 : x + width + 1]
     # reject what touches unseen pixels, then fill the holes
     around = (marks[box] == _REGION).view(np.uint8)
-    if seen is not None and (cv2.dilate(around, _NEIGHBOURS) > 0)[~seen[box]].any():
+    if seen is not None and not (known := seen[box]).all() and (cv2.dilate(around, _NEIGHBOURS) > 0)[~known].any():
         return None
     cv2.floodFill(around, None, (0, 0), _OUTSIDE, flags=8)
     return LevelSet(values, around != _OUTSIDE, level, (x - 1, y - 1))

@@ -218,13 +218,16 @@ def _describe(
     # A lens sees no direction beyond its fold.
     if sightline is not None and not np.isfinite(sightline).all():
         sightline = None
+    answered = {name: result for name, result in estimates.items() if isinstance(result, Estimate)}
+    # Estimators share isophotes: each is drawn once.
+    shared = {id(isophote): isophote for result in answered.values() for isophote in result.isophotes}
+    curves = {of: drawable(isophote.ellipse_px(camera)) for of, isophote in shared.items()}
     drawings = {
         name: Drawing(
             [(t, np.round(points, 3).tolist()) for t, points in result.contours(patch)],
-            [drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes] + _cloud_outline(result, camera),
+            [curves[id(isophote)] for isophote in result.isophotes] + _cloud_outline(result, camera),
         )
-        for name, result in estimates.items()
-        if isinstance(result, Estimate)
+        for name, result in answered.items()
     }
     kind, score = (None, None) if highlight is None else (str(highlight.kind), highlight.score)
     best, because = best_of(estimates, target)

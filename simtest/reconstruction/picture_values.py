@@ -14,6 +14,9 @@ from simtest.runtime.resources import shown
 LARGEST = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}
 """The value that light of full scale has, by the type of the values."""
 
+SAFE_SUM = 1e38
+"""A sum of values up to this is finite in float32, whatever the rounding."""
+
 
 def scale_picture(picture: npt.NDArray[np.generic], name: str) -> Image | None:
     """Return a picture of 8 or 16 bits as encoded values in [0, 1], shape (H, W) or (H, W, 3); None for other types.
@@ -73,15 +76,24 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
         with np.errstate(all="ignore"):
             image = given.astype(np.float32)
     check_size(image, camera)
-    # The channels' mean may be beyond what float32 holds.
+    check_finite(image)
+    if is_picture:
+        check_encoded(image)
+    return image, is_picture
+
+
+def check_finite(image: Image) -> None:
+    """Raise `InputError` where a frame, or the mean of its channels, holds values that are not finite."""
     with np.errstate(all="ignore"):
+        # NaN and infinity show at both or either end of the range, which costs less than the means.
+        low, high = float(image.min()), float(image.max())
+        if max(-low, high) * (1 if image.ndim == 2 else image.shape[2]) < SAFE_SUM:
+            return
+        # The channels' mean may be beyond what float32 holds.
         finite = np.isfinite(image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32))
     if not finite.all():
         bad = int(np.count_nonzero(~finite))
         raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
-    if is_picture:
-        check_encoded(image)
-    return image, is_picture
 
 
 def check_size(image: Image, camera: Camera) -> None:

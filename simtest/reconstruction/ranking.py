@@ -1,5 +1,6 @@
 """Which of a highlight's estimates is the best one, and why: the one with the smallest stated error."""
 
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -57,8 +58,8 @@ def stated_errors(best: Sequence[Estimate]) -> StatedErrors | None:
         for name, value in deviations(each.budget or {}).items():
             parts.setdefault(name, []).append(float(np.degrees(value)))
     # A part that some estimates do not have is 0 there.
-    medians = {name: float(np.median(values + [0.0] * (len(stated) - len(values)))) for name, values in parts.items()}
-    median = float(np.median([deviation_deg(each) for each in stated]))
+    medians = {name: statistics.median(values + [0.0] * (len(stated) - len(values))) for name, values in parts.items()}
+    median = statistics.median([deviation for each in stated if (deviation := deviation_deg(each)) is not None])
     ordered = dict(sorted(medians.items(), key=lambda item: -item[1]))
     return StatedErrors(len(stated), len(best) - len(stated), median, ordered)
 

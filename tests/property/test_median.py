@@ -1,11 +1,13 @@
-"""The median of a frame's noise is NumPy's, without what NumPy loads for it."""
+"""Medians and quantiles are NumPy's, without what NumPy loads for them."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.noise_estimate import SAMPLE, median
+from simtest.estimators.budget import quantile
 
 VALUES = arrays(np.float32, st.integers(1, 40), elements=st.floats(0, 2.0**100, width=32) | st.just(np.nan))
 
@@ -15,3 +17,26 @@ def test_it_is_numpys_to_the_last_bit(values):
     kept = values.copy()
     assert np.array_equal(median(values), np.median(values), equal_nan=True)
     assert np.array_equal(values, kept, equal_nan=True)
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+@pytest.mark.parametrize("kind", ["noise", "rising", "in periods of the sample", "few values", "doubles"])
+def test_that_of_many_values_is_numpys_too(kind, odd):
+    count = 40 * SAMPLE + odd
+    noise = np.random.default_rng(3).normal(size=count).astype(np.float32)
+    values = {
+        "noise": noise,
+        "rising": np.sort(noise),
+        # The sample, every 40th value, then lies far above the rest.
+        "in periods of the sample": np.where(np.arange(count) % 40 == 0, 9, noise).astype(np.float32),
+        "few values": np.rint(noise),
+        "doubles": noise.astype(np.float64) / 3,
+    }[kind]
+    found = median(values)
+    assert found == np.median(values)
+    assert found.dtype == values.dtype
+
+
+@given(arrays(float, st.integers(1, 70), elements=st.floats(0, 1e30)), st.floats(0.01, 0.99))
+def test_a_quantile_is_numpys_to_the_last_bit(values, share):
+    assert quantile(values, share) == np.quantile(values, share)

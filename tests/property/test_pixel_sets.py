@@ -49,3 +49,9 @@ def test_quantiles_that_estimators_use(share, freedom):
 def test_quantiles_need_a_share_and_freedom(share, freedom):
     with pytest.raises(ValueError, match="must be inside"):
         chi_squared.quantile(share, freedom)
+
+
+@given(masks)
+def test_rows_and_columns_are_those_of_numpy(mask):
+    for ours, theirs in zip(pixel_sets.rows_and_columns(mask), np.nonzero(mask), strict=True):
+        assert np.array_equal(ours, theirs)

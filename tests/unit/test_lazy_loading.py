@@ -117,3 +117,13 @@ def test_a_page_needs_neither_scipy_nor_pillow_s_other_formats(tmp_path):
     modules = loaded(code)
     assert "PIL.AvifImagePlugin" in modules
     assert not modules & {"scipy", "scipy.special", "PIL.PdfImagePlugin", "PIL.WebPImagePlugin"}
+
+
+def test_a_picture_is_reconstructed_without_scipy_and_masked_arrays():
+    code = (
+        "import numpy as np\nimport simtest\ny, x = np.mgrid[:96, :128]\n"
+        "spot = 0.4 * np.exp(-((x - 60) ** 2 + (y - 50) ** 2) / 40)\n"
+        "picture = np.rint(255 * (spot[..., None] + np.array([0.5, 0.3, 0.25]))).astype(np.uint8)\n"
+        "assert simtest.reconstruct(picture, 60.0)"
+    )
+    assert not loaded(code) & {"scipy", "numpy.ma", "jinja2", "rich"}
