@@ -47,14 +47,22 @@ STEPS = {
 SEARCHED_AGAIN = {"lights", "camera", "back"}
 
 
-@pytest.mark.parametrize("surface", [COLON, ROUGH], ids=["colon", "rough"])
-def test_highlights_and_labels_are_those_of_a_fresh_session(surface, monkeypatch):
+@pytest.mark.parametrize(
+    ("surface", "steps"),
+    [
+        pytest.param(COLON, ("reflectance", "lights"), id="colon"),
+        pytest.param(COLON, tuple(STEPS), id="colon, all", marks=pytest.mark.slow),
+        pytest.param(ROUGH, tuple(STEPS), id="rough"),
+    ],
+)
+def test_highlights_and_labels_are_those_of_a_fresh_session(surface, steps, monkeypatch):
     searched = []
     search = found_highlights.search
     monkeypatch.setattr(found_highlights, "search", lambda s, base: searched.append(base) or search(s, base))
     kept = Session(scene(surface))
     kept.highlights(kept.frame().radiance)
-    for name, step in STEPS.items():
+    for name in steps:
+        step = STEPS[name]
         kept.update(step(surface))
         searched.clear()
         radiance = kept.frame().radiance
@@ -142,7 +150,7 @@ def test_samples_are_the_same_bytes_without_reuse(family, least, monkeypatch):
         assert fresh.make(index).encode() == sample.encode()
 
 
-@pytest.mark.parametrize("family", ["colon", "rough"])
+@pytest.mark.parametrize("family", ["colon", pytest.param("rough", marks=pytest.mark.slow)])
 def test_a_frame_that_is_not_rendered_shows_too_few_highlights(family):
     plan = Plan(recipe(family))
     session = Session(plan.draw(0).scene)
