@@ -41,12 +41,20 @@ TEXTURE_FACTOR = 6.0
 highlights."""
 
 TEXTURE_LIGHT = 0.02
-"""Tissue darker than this share of full scale does not count for the spread."""
+"""Pixels darker than this share of full scale do not count for the spread."""
 
 MIN_TEXTURE_PX = 100
 
 RISE = 0.7
 """At the peak the light is brighter than the tissue around by this share of the least ratio: pale tissue is not."""
+
+STANDS_OUT = 0.8
+"""No tissue beside a highlight is brighter than this share of its peak, as of a saddle (theory.md 7.1b). Where chroma is
+coarser than luma, as in JPEG, tissue at an edge is paler than farther in, but no brighter."""
+
+BESIDE_PX, NARROW_PX = 6, 64
+"""Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
+spot is no edge, and so wide that shading matters."""
 
 _WIDE = np.ones((5, 5), dtype=np.uint8)
 
@@ -112,11 +120,16 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
     flat, white = _all_clipped(linear, clipped)
     spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
-    spots = _brighter_than_around(spots, smoothed + tissue, candidates, ratio, seen)
+    bare = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
+    if seen is not None:
+        bare &= seen
+    spots = _brighter_than_around(spots, smoothed + tissue, bare, ratio)
     bright = _pixels(spots, candidates.shape)
     foreign = find_foreign(bright)
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
+    # Only now: text is known by whole lines.
+    spots = [spot for spot in spots if _stands_out(spot, smoothed + tissue, bare)]
     made = classify(spots, smooth(light.specular, SHAPE_PX, seen), light, linear, bright, flat, white, seen)
     kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
     # pixels that show a highlight
@@ -136,7 +149,8 @@ def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
 
 def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
     """Return the robust spread of specular light over the tissue's, where the tissue's colour varies by itself."""
-    sound = ~clipped & (tissue > TEXTURE_LIGHT)
+    # By all light: the tissue's part is filled in from around where a pixel has no colour, as a dark background has.
+    sound = ~clipped & (specular + tissue > TEXTURE_LIGHT)
     if seen is not None:
         sound &= seen
     values = specular[::2, ::2][sound[::2, ::2]] / tissue[::2, ::2][sound[::2, ::2]]
@@ -146,16 +160,11 @@ def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -
     return MAD_TO_SIGMA * float(median(np.abs(values - middle)))
 
 
-def _brighter_than_around(
-    spots: list[Spot], total: Image, candidates: Mask, ratio: float, seen: Mask | None
-) -> list[Spot]:
-    """Leave out spots that are paler than the tissue around, but no brighter."""
+def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: float) -> list[Spot]:
+    """Leave out spots that are paler than the bare tissue around, but no brighter."""
     if not spots:
         return spots
-    known = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
-    if seen is not None:
-        known &= seen
-    around = fill(total, known)
+    around = fill(total, bare)
     rows, columns = (np.array([spot.peaks[0][i] for spot in spots]) for i in (1, 0))
     rise = total[rows, columns] - around[rows, columns]
     return [
@@ -163,6 +172,17 @@ def _brighter_than_around(
         for spot, more, below in zip(spots, rise, around[rows, columns], strict=True)
         if more >= RISE * ratio * below
     ]
+
+
+def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
+    """Return whether no bare tissue beside a spot comes near to its light; a wide one needs not be asked."""
+    if spot.area_px > NARROW_PX:
+        return True
+    (x, y), (height, width) = spot.corner, spot.mask.shape
+    left, top = max(x - BESIDE_PX, 0), max(y - BESIDE_PX, 0)
+    beside = np.s_[top : y + height + BESIDE_PX, left : x + width + BESIDE_PX]
+    column, row = spot.peaks[0]
+    return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
 
 
 def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:

@@ -62,7 +62,7 @@ def test_tissue_without_highlights_shows_none(tissue):
 @pytest.mark.parametrize(
     ("specular", "expected"),
     [
-        (lobe(160, 120, 16.0, 2.5, 0.4), Kind.ELONGATED),
+        (lobe(160, 120, 30.0, 2.0, 0.4), Kind.ELONGATED),
         (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.CLUSTER),
         (lobe(3, 120, 5.0), Kind.BORDER),
         (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.CLUSTER),
@@ -73,6 +73,51 @@ def test_other_kinds_are_told_apart(specular, expected):
     assert found
     assert found[0][0] is expected
     assert not any(kind is Kind.ISOLATED for kind, _ in found)
+
+
+def test_a_long_highlight_that_is_one_ellipse_may_carry_a_normal():
+    """Where abs(1 + d k) is 0.3 along one axis and 1.5 along the other, the axis ratio is 0.2 (theory.md, section 3)."""
+    (found,) = detect_in_picture(picture(3 * lobe(160, 120, 15.0, 3.0, 0.4))).detection.highlights
+    assert found.is_isolated
+    assert found.axis_ratio == pytest.approx(0.2, abs=0.05)
+
+
+def blurred_chroma(linear, width):
+    """Encode a frame whose chroma is coarser than its luma, as JPEG stores it; 8 bits."""
+    encoded = srgb_encode(np.clip(linear, 0, 1)).astype(np.float32)
+    luma, first, second = cv2.split(cv2.cvtColor(encoded, cv2.COLOR_RGB2YCrCb))
+    parts = [luma, *(cv2.GaussianBlur(chroma, (0, 0), width) for chroma in (first, second))]
+    return (np.rint(255 * np.clip(cv2.cvtColor(cv2.merge(parts), cv2.COLOR_YCrCb2RGB), 0, 1)) / 255).astype(np.float32)
+
+
+def organ():
+    """A round, shaded organ with a crease before a dark background, without a highlight."""
+    x, y = places()
+    inside = np.clip(1 - ((x - 160) / 110) ** 2 - ((y - 120) / 90) ** 2, 0, None) ** 0.5
+    light = (inside * (1 - 0.9 * np.exp(-0.5 * ((x - 190 - 0.2 * y) / 2.0) ** 2)))[..., None] * TISSUE
+    return light + np.random.default_rng(5).normal(0, 0.0005, light.shape)
+
+
+def test_pale_edges_of_an_organ_are_no_highlights():
+    """JPEG's coarse chroma leaves the tissue at an edge paler than inside, but no brighter."""
+    found = detect_in_picture(blurred_chroma(organ(), 2.0)).detection
+    assert found.highlights == []
+    highlight = 3 * lobe(120, 110, 5.0)[..., None]
+    (one,) = detect_in_picture(blurred_chroma(organ() + highlight, 2.0)).detection.isolated
+    assert np.hypot(*(np.array(one.region.peak) + 0.5 - [120, 110])) < 3
+
+
+def test_a_dark_background_hides_no_highlight():
+    """It has no colour, and its tissue is filled in from around: that is no spread of the tissue's own colour."""
+    x, y = places()
+    inside = ((x - 160) / 60) ** 2 + ((y - 120) / 50) ** 2 < 1
+    rng = np.random.default_rng(7)
+    linear = np.where(inside[..., None], 0.7 * TISSUE, 0.0) + 3 * (inside * lobe(150, 115, 4.0))[..., None]
+    # grey blocks and coloured ones, as JPEG leaves them in the dark
+    blocks = np.kron(rng.uniform(0, 0.004, (HEIGHT // 8, WIDTH // 8, 3)), np.ones((8, 8, 1)))
+    blocks[np.kron(rng.random((HEIGHT // 8, WIDTH // 8)) < 0.5, np.ones((8, 8))) > 0] = 0.002
+    found = detect_in_picture(blurred_chroma(linear + blocks, 1.0)).detection
+    assert len(found.isolated) == 1
 
 
 def test_light_that_met_tissue_before_is_no_isolated_highlight():
