@@ -3,8 +3,10 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, srgb_encode
+from simtest.detection import colour
 from simtest.detection.blobs import Kind
 from simtest.detection.light_split import fill, split_light
+from simtest.detection.spots import Spot
 from simtest.detection.view_mask import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
@@ -82,42 +84,28 @@ def test_a_long_highlight_that_is_one_ellipse_may_carry_a_normal():
     assert found.axis_ratio == pytest.approx(0.2, abs=0.05)
 
 
-def blurred_chroma(linear, width):
-    """Encode a frame whose chroma is coarser than its luma, as JPEG stores it; 8 bits."""
-    encoded = srgb_encode(np.clip(linear, 0, 1)).astype(np.float32)
-    luma, first, second = cv2.split(cv2.cvtColor(encoded, cv2.COLOR_RGB2YCrCb))
-    parts = [luma, *(cv2.GaussianBlur(chroma, (0, 0), width) for chroma in (first, second))]
-    return (np.rint(255 * np.clip(cv2.cvtColor(cv2.merge(parts), cv2.COLOR_YCrCb2RGB), 0, 1)) / 255).astype(np.float32)
+@pytest.mark.parametrize(("from_edge", "size", "expected"), [(4, 2, False), (20, 2, True), (4, 9, True)])
+def test_a_pale_edge_is_no_highlight(from_edge, size, expected):
+    """JPEG's coarse chroma leaves dark tissue pale beside a bright organ, but no brighter than that."""
+    x, _ = places()
+    total = np.where(x < 160, 0.35, 0.09).astype(np.float32)
+    crop = np.s_[120 : 120 + size, 160 + from_edge : 160 + from_edge + size]
+    total[crop] = 0.2
+    spot = Spot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
+    bare = np.ones(total.shape, dtype=bool)
+    bare[crop] = False
+    assert colour._stands_out(spot, total, bare) is expected
 
 
-def organ():
-    """A round, shaded organ with a crease before a dark background, without a highlight."""
-    x, y = places()
-    inside = np.clip(1 - ((x - 160) / 110) ** 2 - ((y - 120) / 90) ** 2, 0, None) ** 0.5
-    light = (inside * (1 - 0.9 * np.exp(-0.5 * ((x - 190 - 0.2 * y) / 2.0) ** 2)))[..., None] * TISSUE
-    return light + np.random.default_rng(5).normal(0, 0.0005, light.shape)
-
-
-def test_pale_edges_of_an_organ_are_no_highlights():
-    """JPEG's coarse chroma leaves the tissue at an edge paler than inside, but no brighter."""
-    found = detect_in_picture(blurred_chroma(organ(), 2.0)).detection
-    assert found.highlights == []
-    highlight = 3 * lobe(120, 110, 5.0)[..., None]
-    (one,) = detect_in_picture(blurred_chroma(organ() + highlight, 2.0)).detection.isolated
-    assert np.hypot(*(np.array(one.region.peak) + 0.5 - [120, 110])) < 3
-
-
-def test_a_dark_background_hides_no_highlight():
-    """It has no colour, and its tissue is filled in from around: that is no spread of the tissue's own colour."""
-    x, y = places()
-    inside = ((x - 160) / 60) ** 2 + ((y - 120) / 50) ** 2 < 1
-    rng = np.random.default_rng(7)
-    linear = np.where(inside[..., None], 0.7 * TISSUE, 0.0) + 3 * (inside * lobe(150, 115, 4.0))[..., None]
-    # grey blocks and coloured ones, as JPEG leaves them in the dark
-    blocks = np.kron(rng.uniform(0, 0.004, (HEIGHT // 8, WIDTH // 8, 3)), np.ones((8, 8, 1)))
-    blocks[np.kron(rng.random((HEIGHT // 8, WIDTH // 8)) < 0.5, np.ones((8, 8))) > 0] = 0.002
-    found = detect_in_picture(blurred_chroma(linear + blocks, 1.0)).detection
-    assert len(found.isolated) == 1
+def test_a_dark_background_is_no_texture():
+    """It has no colour, so its tissue is filled in from around: no spread of the tissue's own colour."""
+    third = np.arange(WIDTH) * 3 // WIDTH
+    tissue = np.array([0.05, 0.05, 0.03], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
+    # an organ, and a background of two kinds that is darker than what was filled in
+    specular = np.array([0.0, -0.049, -0.012], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
+    specular += np.random.default_rng(7).normal(0, 0.0005, tissue.shape).astype(np.float32)
+    clipped = np.zeros(tissue.shape, dtype=bool)
+    assert colour._texture(specular, tissue, clipped, None) < 0.02
 
 
 def test_light_that_met_tissue_before_is_no_isolated_highlight():
