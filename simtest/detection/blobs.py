@@ -138,6 +138,9 @@ class Highlight:
         Column and row of each highlight in it, the brightest first; one but for clusters.
     clipped : float
         Share of its pixels that are clipped.
+    dim : bool
+        Whether it is resolved and darker than clipped highlights of the frame: the normal may only come near the
+        bisector there (theory.md 7.1b).
     """
 
     region: Region
@@ -152,6 +155,7 @@ class Highlight:
     outline: Array
     peaks: Index = field(default_factory=lambda: np.empty((0, 2), dtype=np.intp))
     clipped: float = 0.0
+    dim: bool = False
 
     @property
     def is_isolated(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import SINGLE, Highlight, Kind, classify
+from simtest.detection.blobs import MIN_SHAPE_PX, SINGLE, Highlight, Kind, classify
 from simtest.detection.detector import Detection
 from simtest.detection.foreign import find_foreign
 from simtest.detection.light_split import SplitLight, fill, split_light
@@ -55,6 +55,10 @@ coarser than luma, as in JPEG, tissue at an edge is paler than farther in, but n
 BESIDE_PX, NARROW_PX = 6, 64
 """Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
 spot is no edge, and so wide that shading matters."""
+
+DIM, CLEARLY_CLIPPED = 0.8, 0.1
+"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So where
+more than the second share of one highlight is clipped, a resolved one below the first share of its light is dim."""
 
 _WIDE = np.ones((5, 5), dtype=np.uint8)
 
@@ -136,7 +140,7 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     mask = _pixels([spot for spot, _ in kept], candidates.shape)
     more = (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue) & candidates & ~foreign
     mask |= _feet([spot for spot, _ in kept], mask, light.specular, more)
-    return ColourDetection(light, mask, [highlight for _, highlight in kept])
+    return ColourDetection(light, mask, _with_dim_marked([highlight for _, highlight in kept], light))
 
 
 def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
@@ -183,6 +187,18 @@ def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
     beside = np.s_[top : y + height + BESIDE_PX, left : x + width + BESIDE_PX]
     column, row = spot.peaks[0]
     return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
+
+
+def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Highlight]:
+    """Return highlights of which those are marked that are dim beside clipped ones."""
+    pixels = [highlight.region.peak[::-1] for highlight in highlights]
+    total = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
+    shining = [own for own, each in zip(total, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
+    least = DIM * max(shining, default=0.0)
+    return [
+        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and own < least else each
+        for own, each in zip(total, highlights, strict=True)
+    ]
 
 
 def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:

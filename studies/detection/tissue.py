@@ -106,9 +106,7 @@ def score_frame(frame: TissueFrame, highlights: Sequence[Highlight], counts: dic
 
 def _in_cluster(peak: Floats, highlights: Sequence[Highlight]) -> bool:
     """Return whether a cluster's outline encloses a peak, px."""
-    return any(
-        highlight.kind is Kind.CLUSTER and bool(encloses(highlight.outline, peak)) for highlight in highlights
-    )
+    return any(highlight.kind is Kind.CLUSTER and bool(encloses(highlight.outline, peak)) for highlight in highlights)
 
 
 def main(split: str = "figures", count: str = "5", folder: str | None = None) -> int:
