@@ -49,16 +49,17 @@ RISE = 0.7
 """At the peak the light is brighter than the tissue around by this share of the least ratio: pale tissue is not."""
 
 STANDS_OUT = 0.8
-"""No tissue beside a highlight is brighter than this share of its peak, as of a saddle (theory.md 7.1b). Where chroma is
-coarser than luma, as in JPEG, tissue at an edge is paler than farther in, but no brighter."""
+"""No tissue beside a highlight is brighter than this share of its peak, as of a saddle (theory.md 7.1b). Where chroma
+is coarser than luma, as in JPEG, tissue at an edge is paler than farther in, but no brighter."""
 
 BESIDE_PX, NARROW_PX = 6, 64
 """Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
 spot is no edge, and so wide that shading matters."""
 
 DIM, CLEARLY_CLIPPED = 0.8, 0.1
-"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So where
-more than the second share of one highlight is clipped, a resolved one below the first share of its light is dim."""
+"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So
+where more than the second share of one highlight is clipped, a resolved one below the first share of its light is
+dim."""
 
 _WIDE = np.ones((5, 5), dtype=np.uint8)
 
