@@ -9,8 +9,7 @@ does in pictures. Truth is that of the mesh's interpolated normals (docs/meshes.
 
 import sys
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,58 +19,81 @@ from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
+from simtest.geometry.isophotes import encloses
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, run_pipeline
+from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
 from simtest.rendering import Session
+from simtest.runtime.arrays import Array
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import load_scene
-from simtest.validation.matching import match
+from simtest.validation.matching import match, peak_px
 from simtest.validation.metrics import mahalanobis2
 
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "data" / "meshes"
 ESTIMATORS = ("cone_axis", "curved", "brightest_point", "photometric")
 COLOUR = "llvm_ad_rgb"
-KEPT = ("isolated", "clipped", "small")
-"""Kinds of detections that may carry one normal."""
+NEAR_PX = 1.5
+"""A detection shows the visible highlight whose peak its isophote encloses, or lies so near to its own peak."""
+
+Answer = tuple[float, float, float]
+"""Error in deg, squared Mahalanobis distance, and semi-axis in deg, of an answer."""
 
 
-@dataclass(frozen=True)
-class FrameScore:
-    """What a frame shows and what was made of it.
+@dataclass
+class Score:
+    """What frames show and what was made of it.
 
     Parameters
     ----------
-    isolated, found : int
-        True isolated highlights, and those that a detection matches.
-    detections, false : int
-        Detections that may carry one normal, and those that match no lit highlight point.
-    answers : dict
-        By estimator: error in deg, squared Mahalanobis distance and semi-axis in deg of each answer at an isolated one.
+    frames, isolated : int
+        Frames, and true isolated highlights (theory.md section 6).
+    found, refused : int
+        Those that a detection matches which may carry one normal; of the others those inside the outline of a highlight
+        of another kind, which no estimator answers for: mostly clusters.
+    detections, near, false : int
+        Detections that may carry one normal; those that show a visible highlight without any lit highlight point, where
+        the normal only comes near the bisector (theory.md 7.1b); and those that show no visible highlight.
+    answers, near_answers : dict
+        By estimator, the answers at isolated highlights, against the normal there; and at near misses, against the
+        normal of the surface point that the estimate looks at.
+    near_flagged, flagged : int
+        Near misses, and found isolated highlights, that are flagged as dim.
     """
 
-    isolated: int
-    found: int
-    detections: int
-    false: int
-    answers: dict[str, list[tuple[float, float, float]]]
+    frames: int = 0
+    isolated: int = 0
+    found: int = 0
+    refused: int = 0
+    detections: int = 0
+    near: int = 0
+    false: int = 0
+    near_flagged: int = 0
+    flagged: int = 0
+    answers: dict[str, list[Answer]] = field(default_factory=lambda: {name: [] for name in ESTIMATORS})
+    near_answers: dict[str, list[Answer]] = field(default_factory=lambda: {name: [] for name in ESTIMATORS})
 
 
 def main(arguments: list[str]) -> int:
-    """Print the table."""
+    """Print the two tables."""
     count, first = (int(arguments[i]) if len(arguments) > i else default for i, default in ((0, 20), (1, 300)))
-    rows = [["mesh", "frames", "highlights", "found, %", "false, % of detections", *ESTIMATORS]]
+    rows = [[
+        "mesh", "frames", "highlights", "found", "refused", "false, of detections", "near misses", *ESTIMATORS,
+    ]]  # fmt: skip
+    misses = [["mesh", "near misses", "flagged dim (of found)", *ESTIMATORS]]
     for path in sorted(MESHES.glob("*.ply")):
-        rows.append(_row(path, list(_frames(path, range(first, first + count)))))
-        print(rows[-1], file=sys.stderr)
+        score = _scored(path, range(first, first + count))
+        rows.append(_row(path, score))
+        dim = f"{_share(score.near_flagged, score.near)} ({_share(score.flagged, score.found)})"
+        misses.append([path.stem, str(score.near), dim, *(_looked(score.near_answers[name]) for name in ESTIMATORS)])
+        print(rows[-1], misses[-1], file=sys.stderr)
     print_markdown(rows)
+    print()
+    print_markdown(misses)
     return 0
 
 
-def _frames(
-    path: Path, viewpoints: range
-) -> Iterator[tuple[int, int, int, dict[str, list[tuple[float, float, float]]]]]:
-    """Yield of each frame: true isolated highlights, those found, false detections, and the answers."""
-    session = None
+def _scored(path: Path, viewpoints: range) -> Score:
+    session, score = None, Score()
     for viewpoint in viewpoints:
         values = {
             "surface.path": str(path), "surface.viewpoint": viewpoint, "sensor": {"preset": "colonoscope_hd"},
@@ -86,43 +108,87 @@ def _frames(
         except SimtestError as error:
             print(f"{path.name}, viewpoint {viewpoint}: {error}", file=sys.stderr)
             continue
-        yield _judged(view, viewpoint)
+        _judge(score, session, view, viewpoint)
+    return score
 
 
-def _judged(view: RenderedView, seed: int) -> FrameScore:
+def _judge(score: Score, session: Session, view: RenderedView, seed: int) -> None:
+    """Add a frame's counts and answers."""
     made = run_pipeline(
         view.frame(seed), view.calibration, ColourDetector(True), list(ESTIMATORS), None, SMOOTHING_BY_COLOUR_PX
     )
-    judged = zip(made.specularities, made.detection.highlights, strict=True)
-    found = [specularity for specularity, highlight in judged if str(highlight.kind) in KEPT]
+    detection = made.detection
+    judged = list(zip(made.specularities, detection.highlights, strict=True))
+    kept = [pair for pair in judged if pair[1].is_isolated]
+    found = [specularity for specularity, _ in kept]
     lit = [h for h in view.highlights if h.lit]
     matched = match(found, [h.bp_px for h in lit])
     isolated = {i for i, h in enumerate(lit) if h.isolated}
-    answers: dict[str, list[tuple[float, float, float]]] = {name: [] for name in ESTIMATORS}
+    held = isolated & set(matched.values())
+    # highlights that are told, but not answered for
+    others = [highlight for _, highlight in judged if not highlight.is_isolated] + list(detection.others)
+    refused = sum(any(encloses(other.outline, lit[j].bp_px) for other in others) for j in isolated - held)
+    # detections without a highlight point: near misses, or nothing that can be seen
+    bare = [i for i in range(len(found)) if i not in matched]
+    near = [i for i in bare if _shows_any(found[i], [visible.peak_px for visible in view.visible_highlights])]
+    score.frames, score.isolated = score.frames + 1, score.isolated + len(isolated)
+    score.found, score.refused = score.found + len(held), score.refused + refused
+    score.detections, score.near = score.detections + len(found), score.near + len(near)
+    score.false += len(bare) - len(near)
+    score.near_flagged += sum(kept[i][1].dim for i in near)
+    score.flagged += sum(kept[i][1].dim for i, j in matched.items() if j in isolated)
     for i, j in matched.items():
+        for name, result in found[i].estimates.items() if j in isolated else ():
+            _add(score.answers[name], result, lit[j].normal)
+    for i in near:
         for name, result in found[i].estimates.items():
-            if isinstance(result, Failure) or j not in isolated or not isinstance(result, Estimate):
+            if isinstance(result, Failure) or not np.isfinite(result.look_px).all():
                 continue
-            distance = mahalanobis2(result, lit[j].normal)
-            if distance is not None and result.covariance is not None:
-                semi = float(np.degrees(np.sqrt(np.trace(result.covariance) / 2)))
-                answers[name].append((float(angle_deg(result.normal, lit[j].normal)), distance, semi))
-    held = len(isolated & set(matched.values()))
-    return FrameScore(len(isolated), held, len(found), len(found) - len(matched), answers)
+            point = session.cast(result.look_px[None])[0]
+            if point.valid[0]:
+                _add(score.near_answers[name], result, point.normal[0])
 
 
-def _row(path: Path, frames: list[FrameScore]) -> list[str]:
-    true, found, detections, false = (
-        sum(getattr(frame, name) for frame in frames) for name in ("isolated", "found", "detections", "false")
-    )
-    row = [path.stem, str(len(frames)), str(true), _share(found, true), _share(false, detections)]
+def _shows_any(specularity: Specularity, peaks_px: list[Array]) -> bool:
+    """Return whether a detection shows one of the visible highlights with these peaks, px."""
+    apart = np.array([*peaks_px]).reshape(-1, 2) - peak_px(specularity)
+    return bool(match([specularity], peaks_px)) or bool((np.hypot(*apart.T) <= NEAR_PX).any())
+
+
+def _add(answers: list[Answer], result: Estimate | Failure, normal: Array) -> None:
+    """Add an answer's error against a normal, unless it states no region."""
+    if isinstance(result, Failure) or result.covariance is None:
+        return
+    distance = mahalanobis2(result, normal)
+    if distance is not None:
+        semi = float(np.degrees(np.sqrt(np.trace(result.covariance) / 2)))
+        answers.append((float(angle_deg(result.normal, normal)), distance, semi))
+
+
+def _row(path: Path, score: Score) -> list[str]:
+    row = [path.stem, str(score.frames), str(score.isolated), _share(score.found, score.isolated),
+           _share(score.refused, score.isolated), _share(score.false, score.detections),
+           _share(score.near, score.detections)]  # fmt: skip
     for name in ESTIMATORS:
-        own = np.array([answer for frame in frames for answer in frame.answers[name]]).reshape(-1, 3)
-        held = int(np.count_nonzero(own[:, 1] <= chi_squared.quantile(0.95, 2)))
+        own, held = _inside(score.answers[name])
         rms = float(np.sqrt(np.mean(own[:, 0] ** 2) / 2)) if len(own) else np.nan
         size = float(np.median(own[:, 2])) / rms if len(own) else np.nan
-        row.append(f"{_share(held, len(own))}, median error {np.median(own[:, 0]):.3f}°, semi-axis {size:.2f} RMS")
+        row.append(f"{held}, median error {np.median(own[:, 0]):.3f}°, semi-axis {size:.2f} RMS")
     return row
+
+
+def _looked(answers: list[Answer]) -> str:
+    own, held = _inside(answers)
+    if not len(own):
+        return "none"
+    median, most, semi = np.median(own[:, 0]), np.percentile(own[:, 0], 90), np.median(own[:, 2])
+    return f"{held}, median {median:.2f}°, 90 % below {most:.2f}°, semi-axis {semi:.2f}°"
+
+
+def _inside(answers: list[Answer]) -> tuple[Array, str]:
+    """Return answers as an array, shape (N, 3), and the share whose 95 % region holds the normal."""
+    own = np.array(answers).reshape(-1, 3)
+    return own, _share(int(np.count_nonzero(own[:, 1] <= chi_squared.quantile(0.95, 2))), len(own))
 
 
 def _share(part: int, whole: int) -> str:

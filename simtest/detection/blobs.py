@@ -35,6 +35,9 @@ MIN_SHAPE_PX = 12
 NESTED_ISOVALUES = (0.5, 0.65, 0.8)
 """Isophotes whose ellipses are compared."""
 
+ROUND = 0.3
+"""A shape is a highlight's whatever shines around from this axis ratio on: pale strips of tissue are longer."""
+
 RESIDUAL = 0.09
 """Largest RMS distance of an isolated highlight's isophote from its ellipse, as a share of its radius."""
 
@@ -44,8 +47,9 @@ RESIDUAL_CLIPPED = 0.16
 WANDER = 0.25
 """Largest distance between the centres of the nested ellipses, as a share of the radius at half height."""
 
-LEAST_AXIS_RATIO = 0.3
-"""A longer highlight is a streak: abs(1 + d k) differs so much between its axes that one of them is near 0."""
+LEAST_AXIS_RATIO = 0.12
+"""A longer highlight is a streak, as on an instrument; on tissue so long a one bends, or lies where abs(1 + d k) is
+near 0."""
 
 MIN_CLIPPED_PX = 12
 """With so many pixels that are nearly clipped above half height the shape is that of a clipped highlight."""
@@ -135,6 +139,9 @@ class Highlight:
         Column and row of each highlight in it, the brightest first; one but for clusters.
     clipped : float
         Share of its pixels that are clipped.
+    dim : bool
+        Whether it is resolved and darker than clipped highlights of the frame: the normal may only come near the
+        bisector there (theory.md 7.1b).
     """
 
     region: Region
@@ -149,6 +156,7 @@ class Highlight:
     outline: Array
     peaks: Index = field(default_factory=lambda: np.empty((0, 2), dtype=np.intp))
     clipped: float = 0.0
+    dim: bool = False
 
     @property
     def is_isolated(self) -> bool:
@@ -248,7 +256,8 @@ def _classified(one: _Traced, fits: list[_Fitted], linear: Image, mask: Mask, li
     axis_ratio, residual, wander = _shape(fits)
     tint, clutter, surround = _around(spot, box, linear, mask, light)
     kind = _kind(one, axis_ratio, residual, wander, tint, clutter)
-    if kind not in (*SINGLE, Kind.UNCLEAR):
+    long = area >= MIN_SHAPE_PX and axis_ratio is not None and axis_ratio < ROUND
+    if long or kind not in (*SINGLE, Kind.UNCLEAR):
         wide = area >= WIDE_PX
         across = 2 * np.sqrt(area / np.pi) / max(light.specular.shape)
         glaring = one.white_px >= GLARING * area and (

@@ -8,7 +8,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import SINGLE, Highlight, Kind, classify
+from simtest.detection.blobs import MIN_SHAPE_PX, SINGLE, Highlight, Kind, classify
 from simtest.detection.detector import Detection
 from simtest.detection.foreign import find_foreign
 from simtest.detection.light_split import SplitLight, fill, split_light
@@ -42,12 +42,25 @@ TEXTURE_FACTOR = 6.0
 highlights."""
 
 TEXTURE_LIGHT = 0.02
-"""Tissue darker than this share of full scale does not count for the spread."""
+"""Pixels darker than this share of full scale do not count for the spread."""
 
 MIN_TEXTURE_PX = 100
 
 RISE = 0.7
 """At the peak the light is brighter than the tissue around by this share of the least ratio: pale tissue is not."""
+
+STANDS_OUT = 0.8
+"""No tissue beside a highlight is brighter than this share of its peak, as of a saddle (theory.md 7.1b). Where chroma
+is coarser than luma, as in JPEG, tissue at an edge is paler than farther in, but no brighter."""
+
+BESIDE_PX, NARROW_PX = 6, 64
+"""Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
+spot is no edge, and so wide that shading matters."""
+
+DIM, CLEARLY_CLIPPED = 0.8, 0.1
+"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So
+where more than the second share of one highlight is clipped, a resolved one below the first share of its light is
+dim."""
 
 _WIDE = np.ones((5, 5), dtype=np.uint8)
 
@@ -113,18 +126,23 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
     flat, white = _all_clipped(linear, clipped)
     spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
-    spots = _brighter_than_around(spots, smoothed + tissue, candidates, ratio, seen)
+    bare = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
+    if seen is not None:
+        bare &= seen
+    spots = _brighter_than_around(spots, smoothed + tissue, bare, ratio)
     bright = _pixels(spots, candidates.shape)
     foreign = find_foreign(bright)
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
+    # Only now: text is known by whole lines.
+    spots = [spot for spot in spots if _stands_out(spot, smoothed + tissue, bare)]
     made = classify(spots, smooth(light.specular, SHAPE_PX, seen), light, linear, bright, flat, white, seen)
     kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
     # pixels that show a highlight
     mask = _pixels([spot for spot, _ in kept], candidates.shape)
     more = (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue) & candidates & ~foreign
     mask |= _feet([spot for spot, _ in kept], mask, light.specular, more)
-    return ColourDetection(light, mask, [highlight for _, highlight in kept])
+    return ColourDetection(light, mask, _with_dim_marked([highlight for _, highlight in kept], light))
 
 
 def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
@@ -137,7 +155,8 @@ def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
 
 def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
     """Return the robust spread of specular light over the tissue's, where the tissue's colour varies by itself."""
-    sound = ~clipped & (tissue > TEXTURE_LIGHT)
+    # By all light: the tissue's part is filled in from around where a pixel has no colour, as a dark background has.
+    sound = ~clipped & (specular + tissue > TEXTURE_LIGHT)
     if seen is not None:
         sound &= seen
     values = specular[::2, ::2][sound[::2, ::2]] / tissue[::2, ::2][sound[::2, ::2]]
@@ -147,22 +166,40 @@ def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -
     return MAD_TO_SIGMA * float(median(np.abs(values - middle)))
 
 
-def _brighter_than_around(
-    spots: list[Spot], total: Image, candidates: Mask, ratio: float, seen: Mask | None
-) -> list[Spot]:
-    """Leave out spots that are paler than the tissue around, but no brighter."""
+def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: float) -> list[Spot]:
+    """Leave out spots that are paler than the bare tissue around, but no brighter."""
     if not spots:
         return spots
-    known = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
-    if seen is not None:
-        known &= seen
-    around = fill(total, known)
+    around = fill(total, bare)
     rows, columns = (np.array([spot.peaks[0][i] for spot in spots]) for i in (1, 0))
     rise = total[rows, columns] - around[rows, columns]
     return [
         spot
         for spot, more, below in zip(spots, rise, around[rows, columns], strict=True)
         if more >= RISE * ratio * below
+    ]
+
+
+def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
+    """Return whether no bare tissue beside a spot comes near to its light; a wide one needs not be asked."""
+    if spot.area_px > NARROW_PX:
+        return True
+    (x, y), (height, width) = spot.corner, spot.mask.shape
+    left, top = max(x - BESIDE_PX, 0), max(y - BESIDE_PX, 0)
+    beside = np.s_[top : y + height + BESIDE_PX, left : x + width + BESIDE_PX]
+    column, row = spot.peaks[0]
+    return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
+
+
+def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Highlight]:
+    """Return highlights of which those are marked that are dim beside clipped ones."""
+    pixels = [highlight.region.peak[::-1] for highlight in highlights]
+    total = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
+    shining = [own for own, each in zip(total, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
+    least = DIM * max(shining, default=0.0)
+    return [
+        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and own < least else each
+        for own, each in zip(total, highlights, strict=True)
     ]
 
 

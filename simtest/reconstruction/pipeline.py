@@ -320,10 +320,13 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     result = Reconstruction([], detection)
     rounded_px = SMALL_RADIUS * frame.smoothing_px
     small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
+    dim = [h.dim for h in detection.highlights] or [False] * len(patches)
     for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
         own = {name: each.of_patches[i] for name, each in made.items()}
         estimates = {
-            name: _flagged(result, patch, limited, small[i]) for name, result in own.items() if result is not None
+            name: _flagged(result, patch, limited, small[i], dim[i])
+            for name, result in own.items()
+            if result is not None
         }
         result.specularities.append(Specularity(region, patch, estimates))
     undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
@@ -368,7 +371,7 @@ def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
 
 
 def _flagged(
-    result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None, small: bool
+    result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None, small: bool, dim: bool
 ) -> Estimate | Failure:
     """Add the flags that depend on the frame, not on the estimator."""
     if isinstance(result, Failure) or isinstance(patch, Failure):
@@ -381,6 +384,7 @@ def _flagged(
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
     # An unresolved highlight states no shape that smoothing could have changed.
     flags = ("small",) if small and UNRESOLVED not in result.flags else ()
+    flags = (*flags, "dim") if dim else flags
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))

@@ -3,8 +3,10 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, srgb_encode
+from simtest.detection import colour as colour_detection
 from simtest.detection.blobs import Kind
 from simtest.detection.light_split import fill, split_light
+from simtest.detection.spots import Spot
 from simtest.detection.view_mask import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
@@ -62,7 +64,7 @@ def test_tissue_without_highlights_shows_none(tissue):
 @pytest.mark.parametrize(
     ("specular", "expected"),
     [
-        (lobe(160, 120, 16.0, 2.5, 0.4), Kind.ELONGATED),
+        (lobe(160, 120, 30.0, 2.0, 0.4), Kind.ELONGATED),
         (lobe(153.5, 120, 4.0, peak=0.4) + lobe(166.5, 120, 4.0, peak=0.4), Kind.CLUSTER),
         (lobe(3, 120, 5.0), Kind.BORDER),
         (np.maximum(lobe(150, 120, 3.0, 12.0), lobe(160, 131, 12.0, 3.0)), Kind.CLUSTER),
@@ -73,6 +75,37 @@ def test_other_kinds_are_told_apart(specular, expected):
     assert found
     assert found[0][0] is expected
     assert not any(kind is Kind.ISOLATED for kind, _ in found)
+
+
+def test_a_long_highlight_that_is_one_ellipse_may_carry_a_normal():
+    """As where abs(1 + d k) is 0.3 along one axis and 1.5 along the other (theory.md, section 3)."""
+    (found,) = detect_in_picture(picture(3 * lobe(160, 120, 15.0, 3.0, 0.4))).detection.highlights
+    assert found.is_isolated
+    assert found.axis_ratio == pytest.approx(0.2, abs=0.05)
+
+
+@pytest.mark.parametrize(("from_edge", "size", "expected"), [(4, 2, False), (20, 2, True), (4, 9, True)])
+def test_a_pale_edge_is_no_highlight(from_edge, size, expected):
+    """JPEG's coarse chroma leaves dark tissue pale beside a bright organ, but no brighter than that."""
+    x, _ = places()
+    total = np.where(x < 160, 0.35, 0.09).astype(np.float32)
+    crop = np.s_[120 : 120 + size, 160 + from_edge : 160 + from_edge + size]
+    total[crop] = 0.2
+    spot = Spot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
+    bare = np.ones(total.shape, dtype=bool)
+    bare[crop] = False
+    assert colour_detection._stands_out(spot, total, bare) is expected
+
+
+def test_a_dark_background_is_no_texture():
+    """It has no colour, so its tissue is filled in from around: no spread of the tissue's own colour."""
+    third = np.arange(WIDTH) * 3 // WIDTH
+    tissue = np.array([0.05, 0.05, 0.03], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
+    # an organ, and a background of two kinds that is darker than what was filled in
+    specular = np.array([0.0, -0.049, -0.012], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
+    specular += np.random.default_rng(7).normal(0, 0.0005, tissue.shape).astype(np.float32)
+    clipped = np.zeros(tissue.shape, dtype=bool)
+    assert colour_detection._texture(specular, tissue, clipped, None) < 0.02
 
 
 def test_light_that_met_tissue_before_is_no_isolated_highlight():
@@ -138,6 +171,18 @@ def test_highlights_that_smoothing_has_rounded_are_flagged():
     flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
     assert "small" in flags[100]
     assert not {"small", "unresolved"} & set(flags[220])
+
+
+def test_a_highlight_that_is_dim_beside_clipped_ones_is_flagged():
+    """One lobe is as bright at every zero of the misfit; at a near miss it is not (theory.md 7.1b)."""
+    camera = Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
+    bright, dim = lobe(90, 70, 5.0, peak=4.0), lobe(230, 160, 5.0, peak=0.35)
+    for specular, expected in ((bright + dim, [False, True]), (dim, [False]), (bright + 10 * dim, [False, False])):
+        made = reconstruct_colour(picture(specular), camera)
+        spots = sorted(made.specularities, key=lambda spot: spot.patch.peak_px[0])
+        assert [
+            all("dim" in e.flags for e in s.estimates.values() if isinstance(e, Estimate)) for s in spots
+        ] == expected
 
 
 # The view's border ------------------------------------------------------------------------------------------------
