@@ -40,7 +40,7 @@ LARGELY_SEEN = 0.98
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
 
-BENDS = 0.3
+BENDS = 0.35
 """How far tissue's changes of curvature inside a cloud move its centre, standard deviation along one direction as a
 share of the cloud's extent (``python -m studies.clouds.shading``)."""
 

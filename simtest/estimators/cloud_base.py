@@ -17,11 +17,14 @@ from simtest.estimators.prior_parts import light_offset_part
 from simtest.geometry import Array, chi_squared
 from simtest.geometry.vectors import basis_across
 
-QUADRIC_SD = math.radians(2.5)
-"""Of the misfit from a quadric along one direction, beside the jackknife's, rad: albedo and changes of curvature."""
+ALBEDO_SLOPE = 0.12
+"""Standard deviation of grad ln L by the albedo along one direction, per rad."""
 
-CUBIC_FACTOR, CUBIC_SD = 3.0, math.radians(1.5)
-"""The misfit from a cubic is off by so many times the jackknife's standard deviation, and by this more, rad."""
+JACKKNIFE_CUBIC = 3.0
+"""The jackknife's standard deviation of a cubic's gradient is too small by this factor."""
+
+MOST_MISFIT = math.radians(2.5)
+"""A misfit with a larger standard deviation, rad, verifies nothing."""
 
 LEAST_GAIN = 0.7
 """Along a direction of a smaller gain 1 + d k the diffuse light does not tell where the highlight point is."""
@@ -47,7 +50,7 @@ class BaseEvidence:
     misfit : float
         Turn of the base at the cloud's centre from where it would face the lights, rad.
     told : bool
-        Whether the misfit is known to about `QUADRIC_SD`.
+        Whether the misfit is known to about `MOST_MISFIT`.
     information : ndarray, shape (2, 2)
         Inverse covariance of `shift`, rad^-2; zero where nothing is told.
     shift : ndarray, shape (2,)
@@ -91,46 +94,47 @@ def evidence_of(cloud: Cloud, light: DiffuseLight, sampling: Array, priors: Prio
         return BaseEvidence(light.shows)
     turn = basis_across(cloud.centre) @ basis_across(cloud.sightline).T
     quadric, cubic = (_turned(fit, turn) for fit in fits)
-    # The lights' mean turns the light by m = L / d, and the normal at the cloud by m / 2.
+    # The lights' mean turns the light by m = L / d, and the normal at the cloud by m / 2: the misfit is -m / 2.
     expected = -cloud.turns.mean(axis=0)
-    off = quadric.misfit - expected
-    untold = _untold(cloud, quadric, priors)
-    covariance = quadric.covariance + QUADRIC_SD**2 * np.eye(2) + quadric.gains @ sampling @ quadric.gains.T + untold
-    statistic = float(off @ np.linalg.solve(covariance, off))
-    told = bool(np.linalg.eigvalsh(quadric.covariance + untold)[-1] < QUADRIC_SD**2)
+    off = quadric.gradient + quadric.steepness @ expected
+    fitted = quadric.covariance + _untold(cloud, quadric, priors)
+    centre = quadric.steepness @ quadric.gains @ sampling @ quadric.gains @ quadric.steepness
+    statistic = float(off @ np.linalg.solve(fitted + ALBEDO_SLOPE**2 * np.eye(2) + centre, off))
+    back = np.linalg.inv(quadric.steepness)
+    told = bool(np.linalg.eigvalsh(back @ fitted @ back)[-1] < MOST_MISFIT**2)
     information, shift = np.zeros((2, 2)), np.zeros(2)
     if priors.lights_mm:
         information, shift = _highlight_point(cubic, expected, _untold(cloud, cubic, priors))
-    return BaseEvidence(light.shows, statistic, float(np.linalg.norm(off)), told, information, shift)
+    return BaseEvidence(light.shows, statistic, float(np.linalg.norm(back @ off)), told, information, shift)
 
 
 def _turned(fit: Shading, turn: Array) -> Shading:
     """Return a fit in another basis."""
-    return Shading(turn @ fit.misfit, turn @ fit.covariance @ turn.T, turn @ fit.gains @ turn.T)
+    return Shading(turn @ fit.gradient, turn @ fit.covariance @ turn.T, turn @ fit.gains @ turn.T)
 
 
 def _untold(cloud: Cloud, fit: Shading, priors: Priors) -> Array:
-    """Return the covariance of a misfit by a light and a falloff that nobody told, shape (2, 2), rad^2."""
+    """Return the covariance of grad ln L by a light and a falloff that nobody told, shape (2, 2), per rad^2."""
     half, covariance = basis_across(cloud.centre), np.zeros((2, 2))
     if not priors.lights_mm:
-        turn = half @ basis_across(-cloud.centre).T
+        turn = fit.steepness @ half @ basis_across(-cloud.centre).T
         covariance = turn @ light_offset_part(-cloud.centre, priors) @ turn.T
     if (power := priors.falloff_power) is not None:
-        # Light that falls as cos^k of the angle from the axis has the slope k grad ln cos.
+        # Light that falls as cos^k of the angle from the axis.
         slope = half[:, 2] / max(float(cloud.centre[2]), 1e-3)
-        moved = np.linalg.solve(2 * np.eye(2) + fit.gains, slope)
-        covariance = covariance + (power.mean**2 + power.sd**2) * np.outer(moved, moved)
+        covariance = covariance + (power.mean**2 + power.sd**2) * np.outer(slope, slope)
     return covariance
 
 
 def _highlight_point(fit: Shading, expected: Array, untold: Array) -> tuple[Array, Array]:
     """Return the inverse covariance of where the misfit is as expected, rad^-2, and that place from the centre."""
     gains, directions = np.linalg.eigh(fit.gains)
+    covariance = JACKKNIFE_CUBIC**2 * fit.covariance + ALBEDO_SLOPE**2 * np.eye(2) + untold
     information, shift = np.zeros((2, 2)), np.zeros(2)
     for gain, direction in zip(gains, directions.T, strict=True):
         if gain < LEAST_GAIN:
             continue
-        variance = CUBIC_FACTOR**2 * direction @ fit.covariance @ direction + CUBIC_SD**2 + direction @ untold @ direction
-        information += gain**2 / variance * np.outer(direction, direction)
-        shift += direction @ (expected - fit.misfit) / gain * direction
+        slope = gain * (2 + gain)
+        information += slope**2 / (direction @ covariance @ direction) * np.outer(direction, direction)
+        shift += (direction @ fit.gradient / slope + direction @ expected / gain) * direction
     return information, shift

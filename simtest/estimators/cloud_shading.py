@@ -62,17 +62,22 @@ class Shading:
 
     Parameters
     ----------
-    misfit : ndarray, shape (2,)
-        Turn of the base's normal from the direction to the light, rad.
+    gradient : ndarray, shape (2,)
+        grad ln L = -(2 + J) w, w the turn of the base's normal from the direction to the light, per rad.
     covariance : ndarray, shape (2, 2)
-        Of `misfit`, by the jackknife over sectors, rad^2.
+        Of `gradient`, by the jackknife over sectors.
     gains : ndarray, shape (2, 2)
         I + dS of the base. A gain g below -1 makes the same light as -2 - g, which is given for it.
     """
 
-    misfit: Array
+    gradient: Array
     covariance: Array
     gains: Array
+
+    @property
+    def steepness(self) -> Array:
+        """2 + J, shape (2, 2)."""
+        return np.asarray(2 * np.eye(2) + self.gains)
 
 
 @dataclass(frozen=True)
@@ -166,11 +171,10 @@ def _fitted(points: Array, radius2: Array, values: Array, hues: Array, cubic: bo
         gaps = values - A @ solution
         spread = 1.48 * float(np.median(np.abs(gaps))) + 1e-9
         weights = near / (1 + (gaps / (OUTLYING * spread)) ** 2)
-    misfit, gains = _base(solution, scale)
     sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     without = [_solved(A[sector != i], weights[sector != i], values[sector != i]) for i in range(SECTORS)]
-    moves = np.array([_base(other, scale)[0] - misfit for other in without])
-    return Shading(misfit, moves.T @ moves * (SECTORS - 1) / SECTORS, gains)
+    moves = (np.array(without) - solution)[:, 1:3] / scale
+    return Shading(solution[1:3] / scale, moves.T @ moves * (SECTORS - 1) / SECTORS, _gains(solution[3:6] / scale**2))
 
 
 def _solved(A: Array, weights: Array, values: Array) -> Array:
@@ -178,11 +182,10 @@ def _solved(A: Array, weights: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(weighted @ A, weighted @ values, rcond=None)[0])
 
 
-def _base(solution: Array, scale: float) -> tuple[Array, Array]:
-    """Return the misfit, shape (2,), and I + dS from a polynomial of the light's log in points over `scale`."""
-    gradient, (xx, xy, yy) = solution[1:3] / scale, solution[3:6] / scale**2
+def _gains(hessian: Array) -> Array:
+    """Return I + dS from the second derivatives of the light's log: xx, xy, yy."""
+    xx, xy, yy = hessian
     values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
     # Of the two roots of J^2 + 2 J + H = 0 the one that is not below -1.
     J = np.sqrt(np.clip(1 - values, 0.0, (1 + MOST_GAIN) ** 2)) - 1
-    misfit = -vectors @ ((vectors.T @ gradient) / (2 + J))
-    return misfit, vectors @ np.diag(J) @ vectors.T
+    return np.asarray(vectors @ np.diag(J) @ vectors.T)
