@@ -1,13 +1,13 @@
-"""What the diffuse light around a cloud tells: how far the base is turned away from the camera at the cloud's centre.
+"""What the diffuse light around a cloud tells: how far the base is turned away from the camera at its centre.
 
-Light and camera at one place: a base of even albedo at the distance r sends back L = cos(w) / r^2, where the misfit w is
-the turn of its normal from the reversed sightline. Across a sightline w = grad ln r, so that
+Light and camera at one place: a base of even albedo at the distance r sends back L = cos(w) / r^2, where the misfit w
+is the turn of its normal from the reversed sightline. Across a sightline w = grad ln r, so that
 
     grad ln L = -(2 + J) w,    J = grad w = I + dS,    Hessian of ln L = -(2 J + J^2) where w = 0.
 
-A polynomial of ln L around a cloud gives J, and w at its centre. At a highlight point of the base w = 0. Folds that come
-near to facing the camera make clouds too; there w is not 0. To first order a light beside the camera, at L across the
-sightline, turns all by L / d: w - L / d takes the place of w.
+A polynomial of ln L around a cloud gives J, and w at its centre. At a highlight point of the base w = 0. Folds that
+come near to facing the camera make clouds too; there w is not 0. To first order a light beside the camera, at L across
+the sightline, turns all by L / d: w - L / d takes the place of w.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ STEPS, OUTLYING = 6, 2.0
 FRONT = 0.3
 """Least cosine between a sightline that is fitted and the cloud's."""
 
-MOST_GAIN = 5.0
+MOST_GAIN = 20.0
 """A larger gain 1 + d k of the base is not told from this one."""
 
 SECTORS = 8
@@ -96,7 +96,11 @@ class DiffuseLight:
     def _logs(self) -> tuple[Array, Mask, Mask]:
         """Return logs of the channels, shape (h, w, C), where they are lit between the spots, and not clipped there."""
         frame, cut = self.frame, (slice(None, None, STRIDE), slice(None, None, STRIDE))
-        light, encoded = (a if a.ndim == 3 else a[..., None] for a in (frame.channels, frame.encoded))
+        encoded = frame.encoded if frame.encoded.ndim == 3 else frame.encoded[..., None]
+        # A grey frame whose response nobody told is taken as linear.
+        light = (
+            frame.channels if frame.encoded.ndim == 3 else frame.calibration.correct(frame.encoded).linear[..., None]
+        )
         gain = frame.corrected.gain
         values = light[cut] if gain is None else light[cut] * gain[cut][..., None]
         # The noise is that of the channels' mean.
