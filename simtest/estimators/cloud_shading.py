@@ -146,7 +146,8 @@ class DiffuseLight:
         reach = covariance + LEAST_EXTENT**2 * np.eye(2)
         radius2 = np.nan_to_num(np.einsum("ni,ij,nj->n", points, np.linalg.inv(reach), points), nan=np.inf)
         inside = np.flatnonzero(radius2 < REACH**2)
-        logs, sound = (part.reshape(-1, part.shape[2])[inside] for part in (self._logs[0], self._logs[2]))
+        logs, _, sound = self._logs
+        logs, sound = logs.reshape(-1, logs.shape[2])[inside], sound.reshape(-1, sound.shape[2])[inside]
         enough = np.flatnonzero(sound.sum(axis=0) >= max(LEAST_PIXELS, LEAST_SHARE * len(inside)))
         if not len(enough):
             return None
