@@ -59,7 +59,8 @@ class CloudCentre:
     """The centre of a cloud of spots carries the base's normal, where a single highlight carries the fine one.
 
     Spots are found in the frame (`cloud_spots`) and grouped into clouds (`cloud_mixture`). With the light at the camera
-    a cloud lies around the sightline at which the base faces the camera. Lights that are told have each their part of
+    a cloud lies around the sightline at which the base faces the camera; the diffuse light says whether there is one,
+    and moves the centre to it (`cloud_base`). Lights that are told have each their part of
     the cloud, half their angle at the surface off that sightline; lights that are not told apart are one mixture.
 
     Parameters
@@ -74,9 +75,11 @@ class CloudCentre:
         """Estimate the base's normal of each cloud, that of most spots first (see `FrameEstimator`).
 
         Each estimate has ``target`` base and a `cloud`. Flags: ``anisotropic_or_curved`` where the cloud is longer than
-        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view. The
-        axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate``
-        where no cloud has spots enough in view.
+        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view;
+        ``wide`` where it is longer than `MOST_EXTENT`; ``base_doubted`` where the diffuse light says that the base is
+        likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell.
+        The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
+        cloud has spots enough in view, or the base has no single highlight point at any one's centre (`cloud_base`).
         """
         spots = find_spots(frame)
         if len(spots.peaks) < self.least_spots:
@@ -84,12 +87,17 @@ class CloudCentre:
         turns, window = _turns(priors), window_of(camera, frame.seen)
         mixture = fit_mixture(camera.unproject(spots.points_px), window, turns)
         owner = np.where(mixture.belongs.sum(axis=1) > 0.5, mixture.belongs.argmax(axis=1), -1)
-        light, estimates, refused = DiffuseLight(frame), [], []
+        light = DiffuseLight(frame)
+        estimates: list[Estimate] = []
+        refused: list[Failure] = []
         for i, cloud in enumerate(mixture.clouds):
             own = spots.points_px[owner == i]
             if len(own) >= self.least_spots and cloud.seen >= LEAST_IN_VIEW and _is_in_view(cloud, camera, frame):
                 made = _estimate(cloud, own, window, camera, priors, light)
-                (refused if isinstance(made, Failure) else estimates).append(made)
+                if isinstance(made, Failure):
+                    refused.append(made)
+                else:
+                    estimates.append(made)
         if not estimates:
             return refused[0] if refused else self._none_whole(mixture, owner)
         return sorted(estimates, key=lambda estimate: -len(_shape(estimate).points_px))
