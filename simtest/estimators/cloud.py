@@ -60,8 +60,8 @@ class CloudCentre:
 
     Spots are found in the frame (`cloud_spots`) and grouped into clouds (`cloud_mixture`). With the light at the camera
     a cloud lies around the sightline at which the base faces the camera; the diffuse light says whether there is one,
-    and moves the centre to it (`cloud_base`). Lights that are told have each their part of
-    the cloud, half their angle at the surface off that sightline; lights that are not told apart are one mixture.
+    and moves the centre to it (`cloud_base`). Lights that are told have each their part of the cloud, half their angle
+    at the surface off that sightline; lights that are not told apart are one mixture.
 
     Parameters
     ----------

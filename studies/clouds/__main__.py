@@ -1,7 +1,8 @@
 """Print the table of clouds: python -m studies.clouds [--frames FOLDER] [--tuning] [--only GROUP] [--most N].
 
 With `--tuning` the frames that the estimator's constants were set on, else others: of other seeds and viewpoints.
-Frames are rendered once, into the folder. `--tissue` takes colons and livers from another seed on, `--most` only so many frames of each group.
+Frames are rendered once, into the folder. `--tissue` takes colons and livers from another seed on, `--most` takes only
+so many frames of each group.
 """
 
 import argparse
