@@ -42,7 +42,8 @@ UNEVEN = 0.2
 
 BENDS = 0.35
 """How far tissue's changes of curvature inside a cloud move its centre, standard deviation along one direction as a
-share of the cloud's extent (``python -m studies.clouds.shading``)."""
+share of the cloud's extent. ``python -m studies.clouds.shading`` finds 0.15 to 0.2 of clouds that lie about their
+highlight point; what is more is for those that do not."""
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""
