@@ -1,13 +1,14 @@
 """`cloud`: the base's normal from the cloud of highlights that relief makes of one (theory.md 7.1 and 7.5)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import CONFIDENCE, Budget, equivalent_covariance
+from simtest.estimators.cloud_base import MOST_EXTENT, BaseEvidence, evidence_of
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
     Cloud,
@@ -19,6 +20,7 @@ from simtest.estimators.cloud_mixture import (
     sampling_covariance,
     window_of,
 )
+from simtest.estimators.cloud_shading import DiffuseLight
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.cloud_spots import find_spots
 from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
@@ -38,10 +40,10 @@ LARGELY_SEEN = 0.98
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
 
-BENDS, BENDS_LONG = 0.35, 0.4
-"""How far the centre may be off since the base's gains change inside the cloud, standard deviation as a share of the
-cloud's extent: in any direction, and along a cloud that is longer than wide by what it is longer. Livers and colons
-need as much; a plane, where it is told to be one, none."""
+BENDS = 0.35
+"""How far tissue's changes of curvature inside a cloud move its centre, standard deviation along one direction as a
+share of the cloud's extent. ``python -m studies.clouds.shading`` finds 0.15 to 0.2 of clouds that lie about their
+highlight point; what is more is for those that do not."""
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""
@@ -58,8 +60,9 @@ class CloudCentre:
     """The centre of a cloud of spots carries the base's normal, where a single highlight carries the fine one.
 
     Spots are found in the frame (`cloud_spots`) and grouped into clouds (`cloud_mixture`). With the light at the camera
-    a cloud lies around the sightline at which the base faces the camera. Lights that are told have each their part of
-    the cloud, half their angle at the surface off that sightline; lights that are not told apart are one mixture.
+    a cloud lies around the sightline at which the base faces the camera; the diffuse light says whether there is one,
+    and moves the centre to it (`cloud_base`). Lights that are told have each their part of the cloud, half their angle
+    at the surface off that sightline; lights that are not told apart are one mixture.
 
     Parameters
     ----------
@@ -73,9 +76,11 @@ class CloudCentre:
         """Estimate the base's normal of each cloud, that of most spots first (see `FrameEstimator`).
 
         Each estimate has ``target`` base and a `cloud`. Flags: ``anisotropic_or_curved`` where the cloud is longer than
-        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view. The
-        axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate``
-        where no cloud has spots enough in view.
+        wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view;
+        ``wide`` where it is longer than `MOST_EXTENT`; ``base_doubted`` where the diffuse light says that the base is
+        likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell.
+        The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
+        cloud has spots enough in view, or the base has no single highlight point at any one's centre (`cloud_base`).
         """
         spots = find_spots(frame)
         if len(spots.peaks) < self.least_spots:
@@ -83,13 +88,19 @@ class CloudCentre:
         turns, window = _turns(priors), window_of(camera, frame.seen)
         mixture = fit_mixture(camera.unproject(spots.points_px), window, turns)
         owner = np.where(mixture.belongs.sum(axis=1) > 0.5, mixture.belongs.argmax(axis=1), -1)
-        estimates = []
+        light = DiffuseLight(frame)
+        estimates: list[Estimate] = []
+        refused: list[Failure] = []
         for i, cloud in enumerate(mixture.clouds):
             own = spots.points_px[owner == i]
             if len(own) >= self.least_spots and cloud.seen >= LEAST_IN_VIEW and _is_in_view(cloud, camera, frame):
-                estimates.append(_estimate(cloud, own, window, camera, priors))
+                made = _estimate(cloud, own, window, camera, priors, light)
+                if isinstance(made, Failure):
+                    refused.append(made)
+                else:
+                    estimates.append(made)
         if not estimates:
-            return self._none_whole(mixture, owner)
+            return refused[0] if refused else self._none_whole(mixture, owner)
         return sorted(estimates, key=lambda estimate: -len(_shape(estimate).points_px))
 
     def _too_few(self, count: int) -> Failure:
@@ -137,9 +148,17 @@ def _is_in_view(cloud: Cloud, camera: Camera, frame: Frame) -> bool:
     return frame.seen is None or bool(frame.seen[row, column])
 
 
-def _estimate(cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors) -> Estimate:
-    """Return the estimate of one cloud."""
+def _estimate(
+    cloud: Cloud, points_px: Array, window: Window, camera: Camera, priors: Priors, light: DiffuseLight
+) -> Estimate | Failure:
+    """Return the estimate of one cloud, or why its centre says nothing of the base's normal."""
     independent = max(len(points_px) / CLUMPING, LEAST_INDEPENDENT)
+    sampling = sampling_covariance(cloud, window, independent)
+    evidence = BaseEvidence(False) if priors.plane else evidence_of(cloud, light, sampling, priors)
+    if (doubt := _refusal(cloud, evidence, len(points_px))) is not None:
+        return doubt
+    bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px), evidence)
+    cloud, parts = _with_light(cloud, sampling * small_sample(independent), bends, evidence, _turns(priors))
     normal = -cloud.centre
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
@@ -151,8 +170,8 @@ def _estimate(cloud: Cloud, points_px: Array, window: Window, camera: Camera, pr
         candidates=normal[None],
         look_px=camera.project(cloud.sightline),
         axis_ratio=shape.axis_ratio,
-        budget=_budget(cloud, window, independent, priors),
-        flags=_flags(cloud, shape),
+        budget=_budget(cloud, parts, priors),
+        flags=_flags(cloud, shape, evidence, priors),
         curvature=EstimatedCurvature(vectors, shape.axis_ratio),
         target="base",
         cloud=shape,
@@ -160,16 +179,72 @@ def _estimate(cloud: Cloud, points_px: Array, window: Window, camera: Camera, pr
     return add_camera_and_falloff(estimate, camera, priors)
 
 
-def _budget(cloud: Cloud, window: Window, independent: float, priors: Priors) -> Budget:
-    """Return the budget of a cloud's normal: the relief's chance, the base's bends, and the lights."""
+def _refusal(cloud: Cloud, evidence: BaseEvidence, spots: int) -> Failure | None:
+    """Return why a cloud gets no answer where the base has no highlight point at its centre, or more than one."""
+    if evidence.refutes:
+        off = math.degrees(evidence.misfit)
+        why = f"the diffuse light says that the base is turned by {off:.0f} deg from facing the light at its centre"
+    elif evidence.shows and _extent(cloud) > MOST_EXTENT:
+        most, extent = (math.degrees(value) for value in (MOST_EXTENT, _extent(cloud)))
+        why = f"its extent is {extent:.0f} deg, over {most:.0f}: the base has several highlight points there or none"
+    else:
+        return None
+    return Failure(Reason.NO_ESTIMATE, f"a cloud of {spots} spots states no normal: {why}")
+
+
+def _extent(cloud: Cloud) -> float:
+    """Return the longer semi-axis of a cloud, rad."""
+    return float(np.sqrt(np.linalg.eigvalsh(cloud.covariance)[-1]))
+
+
+def _bends(cloud: Cloud, sightlines: Array, evidence: BaseEvidence) -> Array:
+    """Return the covariance of a cloud's centre by changes of the base's gains inside it, shape (2, 2), rad^2.
+
+    Where the density of spots is p(w), w the base's misfit and quadratic in x, the centroid is off by half of
+    E[x |x|^2], x in extents of the cloud about the centroid. What N gaussian spots show of it by chance has a variance
+    of 2 / N along each direction and is taken off. Tissue bends by `BENDS` at least, shown or not.
+    """
+    points, _ = cloud.coordinates(sightlines)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(cloud.turns) > 1 or len(points) < LEAST_SPOTS:
+        return np.asarray(BENDS**2 * cloud.covariance)
+    gap = points - points.mean(axis=0)
+    x = np.linalg.solve(np.linalg.cholesky(gap.T @ gap / len(gap)), gap.T)
+    off = (x * (x**2).sum(axis=0)).mean(axis=1) / 2
+    excess = float(off @ off) / 2 - 2 * CLUMPING / len(points)
+    return np.asarray(max(excess, BENDS**2 if evidence.shows else 0.0) * cloud.covariance)
+
+
+def _with_light(
+    cloud: Cloud, sampling: Array, bends: Array, evidence: BaseEvidence, turns: Turns
+) -> tuple[Cloud, dict[str, Array]]:
+    """Return a cloud whose centre the diffuse light has moved, weighted by both covariances, and the parts of its own.
+
+    The parts ``relief`` and ``shape`` are in the basis across the cloud's new centre.
+    """
+    parts = {"relief": sampling, "shape": bends}
+    if not evidence.information.any():
+        return cloud, parts
+    alone = np.linalg.inv(sampling + bends)
+    together = np.linalg.inv(alone + evidence.information)
+    rest, basis = together @ alone, basis_across(cloud.centre)
+    centre = cloud.centre + together @ evidence.information @ evidence.shift @ basis
+    centre /= np.linalg.norm(centre)
+    turn = basis_across(centre) @ basis.T
+    parts = {
+        "relief": rest @ sampling @ rest.T,
+        "shape": rest @ bends @ rest.T + together @ evidence.information @ together,
+    }
+    moved = replace(cloud, centre=centre, covariance=turn @ cloud.covariance @ turn.T, turns=turns(centre))
+    return moved, {name: turn @ part @ turn.T for name, part in parts.items()}
+
+
+def _budget(cloud: Cloud, parts: dict[str, Array], priors: Priors) -> Budget:
+    """Return the budget of a cloud's normal: the parts of its centre, shape (2, 2), and the lights."""
     normal, half = -cloud.centre, basis_across(cloud.centre)
     # The bases across a direction and its reverse are not the same.
     turn = basis_across(normal) @ half.T
-    sampling = sampling_covariance(cloud, window, independent) * small_sample(independent)
-    bends = np.zeros((2, 2)) if priors.plane else BENDS**2 * cloud.covariance
-    if not priors.plane and _is_long(cloud.covariance, independent):
-        bends = bends + BENDS_LONG**2 * _longer(cloud.covariance)
-    budget = {"relief": turn @ sampling @ turn.T, "shape": turn @ bends @ turn.T}
+    budget = {name: turn @ part @ turn.T for name, part in parts.items()}
     if not priors.lights_mm:
         budget["light_offset"] = light_offset_part(normal, priors)
     elif not _is_at_camera(priors):
@@ -189,11 +264,6 @@ def _is_long(covariance: Array, independent: float) -> bool:
     return bool(math.log(large / small) / 2 * math.sqrt(independent) > ROUND_SIGMA)
 
 
-def _longer(covariance: Array) -> Array:
-    """Return what a covariance has along its longer axis beyond a round one."""
-    return np.asarray(covariance - np.linalg.eigvalsh(covariance)[0] * np.eye(2))
-
-
 def small_sample(independent: float) -> float:
     """Return what a sampling covariance is multiplied by, so that its 95 % region holds 95 % of the errors.
 
@@ -204,10 +274,17 @@ def small_sample(independent: float) -> float:
     return 2 * (independent - 1) / rest * F / chi_squared.quantile(CONFIDENCE, 2)
 
 
-def _flags(cloud: Cloud, shape: CloudShape) -> tuple[str, ...]:
+def _flags(cloud: Cloud, shape: CloudShape, evidence: BaseEvidence, priors: Priors) -> tuple[str, ...]:
     flags = []
     if _is_long(cloud.covariance, shape.independent):
         flags.append("anisotropic_or_curved")
     if cloud.seen < LARGELY_SEEN:
         flags.append("cut")
+    if not priors.plane:
+        if _extent(cloud) > MOST_EXTENT:
+            flags.append("wide")
+        if evidence.doubts:
+            flags.append("base_doubted")
+        elif not evidence.told:
+            flags.append("base_unverified")
     return tuple(flags)

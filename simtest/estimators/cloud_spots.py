@@ -10,7 +10,7 @@ import numpy as np
 
 from simtest.calibration import Frame
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
-from simtest.geometry import Array, Image, smooth
+from simtest.geometry import Array, Image, Mask, smooth
 from simtest.geometry.gaussian_smoothing import share_of_noise
 
 SMOOTHING_PX = 0.7
@@ -31,6 +31,9 @@ no glint and lies far out more often."""
 
 LEAST_CONTRAST = 0.5
 """A spot's peak over the light around it: texture and shading of the tissue stay below."""
+
+PART_CONTRAST = 0.3
+"""Light this much over that around is no diffuse light."""
 
 BRIGHT_QUANTILE = 0.8
 """The bright spots are those around this quantile of all peaks above the noise."""
@@ -83,6 +86,13 @@ def find_spots(frame: Frame) -> Spots:
         return spots
     kept = spots.peaks >= FAINTEST * np.quantile(spots.peaks, BRIGHT_QUANTILE)
     return Spots(spots.points_px[kept], spots.areas_px[kept], spots.peaks[kept])
+
+
+def bright_parts(frame: Frame) -> Mask:
+    """Return where the light stands above that of the tissue around, shape (H, W): spots, faint ones too."""
+    light, noise = _light(frame)
+    around, _ = _background(light)
+    return np.asarray(light - around > np.maximum(PART_CONTRAST * around, NOISE_FACTOR * noise))
 
 
 def _light(frame: Frame) -> tuple[Image, float]:

@@ -23,6 +23,9 @@ MANY = 15
 CLOSE = 0.15
 """A slope this near, as a share of the true one, counts as right."""
 
+WARNINGS = {"base_doubted", "base_unverified", "cut", "wide"}
+"""Flags with which a false answer is no sure one."""
+
 REGION = chi_squared.quantile(0.95, 2)
 
 
@@ -105,9 +108,9 @@ def _answer(frame: BaseFrame, estimate: Estimate) -> Answer:
 def header() -> str:
     """Return the heading of the table."""
     return (
-        f"{'group':26s} frames  answers  false  spots   error, deg          in s/sqrt(spots)  hold the truth    "
+        f"{'group':26s} frames  answers  false, sure  spots   error, deg          in s/sqrt(spots)  hold the truth    "
         "semi-axis   slope, gains told         prior's interval\n"
-        f"{'':26s}                          median  mean     RMS         mean             of the regions    "
+        f"{'':26s}                                median  mean     RMS         mean             of the regions    "
         "over RMS    median  within 15 %       holds it"
     )
 
@@ -116,7 +119,8 @@ def line(name: str, judged: Sequence[list[Answer] | Failure], least: int = MANY)
     """Return a line of the table: of answers with so many spots at least."""
     given = [answer for made in judged if not isinstance(made, Failure) for answer in made if answer.spots >= least]
     true = [answer for answer in given if answer.error_deg is not None]
-    start = f"{name:26s} {len(judged):5d} {len(given):8d} {len(given) - len(true):6d}"
+    sure = sum(answer.error_deg is None and not WARNINGS & set(answer.flags) for answer in given)
+    start = f"{name:26s} {len(judged):5d} {len(given):8d} {len(given) - len(true):6d} {sure:5d}"
     if not true:
         return start
     error = np.array([answer.error_deg for answer in true])

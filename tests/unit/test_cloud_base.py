@@ -1,0 +1,180 @@
+"""The diffuse light around a cloud: where the base faces the light, and which clouds have no highlight point."""
+
+import math
+
+import numpy as np
+import pytest
+
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, exactly
+from simtest.errors import Failure
+from simtest.estimators.cloud import cloud
+from simtest.estimators.cloud_shading import DiffuseLight
+from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg, basis_across
+
+CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
+COVARIANCE = np.eye(2) * math.radians(4.0) ** 2
+Y, X = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+SIGHTLINES = CAMERA.unproject(np.stack([X.ravel(), Y.ravel()], axis=1))
+
+
+def direction(x_deg, y_deg=0.0):
+    """A unit sightline."""
+    found = np.array([math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)), 1.0])
+    return found / np.linalg.norm(found)
+
+
+def light_of_sphere(facing, distance=20.0, radius=20.0):
+    """Diffuse light of a sphere whose nearest point lies along `facing`, in the picture; 0 beside it."""
+    centre = facing * (distance + radius)
+    along = SIGHTLINES @ centre
+    root = along**2 - centre @ centre + radius**2
+    r = along - np.sqrt(np.maximum(root, 0.0))
+    normals = (r[:, None] * SIGHTLINES - centre) / radius
+    light = -np.einsum("ni,ni->n", normals, SIGHTLINES) * (distance / r) ** 2
+    return np.where(root > 0, light, 0.0).reshape(Y.shape)
+
+
+def light_of_plane(normal, distance, light_mm):
+    """Diffuse light of a plane that is lit from beside the camera."""
+    r = -distance / (SIGHTLINES @ normal)
+    to_light = np.asarray(light_mm) - r[:, None] * SIGHTLINES
+    length = np.linalg.norm(to_light, axis=1)
+    return ((to_light @ normal) / length**3 * distance**2).reshape(Y.shape)
+
+
+def points_around(sightline, seed=1, count=24, extent_px=14.0, apart=8.0):
+    """Gaussian points about a sightline's pixel that do not touch."""
+    rng, middle = np.random.default_rng(seed), CAMERA.project(sightline)
+    points: list[np.ndarray] = []
+    while len(points) < count:
+        point = rng.normal(middle, extent_px)
+        if all(np.hypot(*(point - other)) > apart for other in points):
+            points.append(point)
+    return np.array(points)
+
+
+def frame_of(light, points_px=(), priors=LIGHT_AT_CAMERA, noise=0.002):
+    """A frame of diffuse light, at most 0.4, with a spot at each point."""
+    picture = 0.4 * light / light.max() + noise * np.random.default_rng(0).standard_normal(light.shape)
+    for u, v in points_px:
+        picture += np.exp(-((X - u) ** 2 + (Y - v) ** 2) / (2 * 1.5**2))
+    return Frame(picture.astype(np.float32), Calibration(CAMERA, priors=priors), 1.0)
+
+
+def estimates(frame, priors=LIGHT_AT_CAMERA):
+    return cloud.estimate_frame(frame, CAMERA, priors)
+
+
+@pytest.mark.parametrize("radius", [10.0, 20.0, 60.0])
+def test_light_of_a_sphere_tells_its_gains_and_where_it_faces_the_camera(radius):
+    """1 + d k is 1 + d / R in all directions; two degrees beside the highlight point the misfit is so much."""
+    gain = 1 + 20.0 / radius
+    facing, beside = direction(5.0, 3.0), direction(7.0, 3.0)
+    light = DiffuseLight(frame_of(light_of_sphere(facing, radius=radius), noise=0.0005))
+    quadric, cubic = light.around(facing, COVARIANCE)
+    assert np.linalg.eigvalsh(cubic.gains) == pytest.approx([gain, gain], rel=0.15)
+    for fit in light.around(beside, COVARIANCE):
+        misfit = -np.linalg.solve(fit.steepness, fit.gradient)
+        expected = gain * basis_across(beside) @ (beside - facing)
+        assert misfit == pytest.approx(expected, abs=0.25 * np.linalg.norm(expected))
+    assert np.linalg.norm(np.linalg.solve(quadric.steepness, quadric.gradient)) < math.radians(0.3)
+
+
+def test_vessels_do_not_turn_the_base():
+    """Their colour tells them from shading, also where they lie on one side alone."""
+    facing = direction(0.0)
+    light = 0.5 * light_of_sphere(facing)
+    blood = np.where(X > 160, np.exp(-((X - 175) ** 2) / 200), 0.0)
+    picture = np.stack([light * np.exp(-absorbed * blood) for absorbed in (0.15, 0.9, 0.8)], axis=2)
+    picture += 0.0005 * np.random.default_rng(1).standard_normal(picture.shape)
+    calibration = Calibration(CAMERA, response=Response(), priors=LIGHT_AT_CAMERA)
+    coloured = Frame(picture.astype(np.float32), calibration, 1.0)
+    grey = Frame(picture[..., 0].astype(np.float32), calibration, 1.0)
+    with_hue, without = (
+        np.linalg.norm(DiffuseLight(frame).around(facing, COVARIANCE)[0].gradient) for frame in (coloured, grey)
+    )
+    assert without > 0.2
+    assert with_hue < 0.1 * without
+
+
+def test_a_dark_frame_verifies_nothing():
+    points = points_around(direction(0.0))
+    dark = Frame((frame_of(np.ones(Y.shape), points).encoded - 0.4).astype(np.float32),
+                 Calibration(CAMERA, priors=LIGHT_AT_CAMERA), 1.0)  # fmt: skip
+    assert not DiffuseLight(dark).shows
+    (found,) = estimates(dark)
+    assert "base_unverified" in found.flags
+    (verified,) = estimates(frame_of(light_of_sphere(direction(0.0)), points))
+    assert not {"base_unverified", "base_doubted"} & set(verified.flags)
+
+
+def test_a_cloud_where_the_base_is_turned_away_gets_no_answer():
+    """Spots about a direction 9 deg off the one at which the base faces the camera: 18 deg of misfit."""
+    points = points_around(direction(9.0))
+    made = estimates(frame_of(light_of_sphere(direction(0.0)), points))
+    assert isinstance(made, Failure)
+    assert "diffuse light says that the base is turned by" in made.detail
+
+
+def test_the_light_moves_a_centre_that_few_spots_tell():
+    """Spots 2 deg beside the highlight point: the estimate lies between, and its region is smaller than theirs."""
+    facing = direction(0.0)
+    points = points_around(direction(2.0), count=12)
+    (found,) = estimates(frame_of(light_of_sphere(facing), points))
+    plane = Priors(lights_mm=((0.0, 0.0, 0.0),), falloff_power=None, plane=True)
+    (spots_alone,) = estimates(frame_of(light_of_sphere(facing), points, plane), plane)
+    assert angle_deg(found.normal, -facing) < 0.7 * angle_deg(spots_alone.normal, -facing)
+    assert np.trace(found.budget["relief"]) < np.trace(spots_alone.budget["relief"])
+    assert found.covariance == pytest.approx(found.covariance.T, rel=1e-9)
+
+
+def test_a_light_beside_the_camera_is_taken_into_account():
+    """A plane lit from 4 mm aside at 25 mm: its cloud lies about the bisector's point, and its light agrees."""
+    normal, light_mm = -direction(4.0, 3.0), (4.0, 0.0, 0.0)
+    priors = Priors(lights_mm=(light_mm,), distance_mm=exactly(25.0), falloff_power=None)
+    positions = -25.0 / (SIGHTLINES @ normal)[:, None] * SIGHTLINES
+    to_light = np.array(light_mm) - positions
+    half = to_light / np.linalg.norm(to_light, axis=1)[:, None] - SIGHTLINES
+    half /= np.linalg.norm(half, axis=1)[:, None]
+    point = SIGHTLINES[np.argmax(half @ normal)]
+    points = points_around(point, count=40)
+    # As drawn the spots' mean is off by chance.
+    points += CAMERA.project(point) - points.mean(axis=0)
+    (found,) = estimates(frame_of(light_of_plane(normal, 25.0, light_mm), points, priors), priors)
+    assert angle_deg(found.normal, normal) < 0.7
+    assert "base_doubted" not in found.flags
+
+
+def test_where_the_light_is_untold_it_refutes_nothing():
+    points = points_around(direction(5.0))
+    light = light_of_sphere(direction(0.0))
+    assert isinstance(estimates(frame_of(light, points)), Failure)
+    (found,) = estimates(frame_of(light, points, Priors()), Priors())
+    assert angle_deg(found.normal, -direction(5.0)) < 1.5
+
+
+def test_a_wide_cloud_on_tissue_gets_no_answer_and_on_a_dark_base_a_flag():
+    points = points_around(direction(0.0), count=60, extent_px=35.0)
+    made = estimates(frame_of(light_of_sphere(direction(0.0), radius=200.0), points))
+    assert isinstance(made, Failure)
+    assert "its extent is" in made.detail
+    dark = Frame((frame_of(np.ones(Y.shape), points).encoded - 0.4).astype(np.float32),
+                 Calibration(CAMERA, priors=LIGHT_AT_CAMERA), 1.0)  # fmt: skip
+    (found, *_) = estimates(dark)
+    assert "wide" in found.flags
+
+
+def test_bends_are_what_the_spots_show_beyond_chance():
+    """Spots that thin out slowly to one side: the centroid is off, and the part `shape` says so."""
+    dark = Calibration(CAMERA, priors=LIGHT_AT_CAMERA)
+    shapes = []
+    for skewed in (False, True):
+        points = points_around(direction(0.0), count=40)
+        if skewed:
+            points[:, 0] += 0.05 * np.maximum(points[:, 0] - 155.0, 0.0) ** 2
+        picture = frame_of(np.ones(Y.shape), points).encoded - 0.4
+        (found, *_) = estimates(Frame(picture.astype(np.float32), dark, 1.0))
+        shapes.append(float(np.trace(found.budget["shape"])))
+    assert shapes[0] < 0.2 * shapes[1]
+    assert math.degrees(math.sqrt(shapes[1])) > 0.8
