@@ -1,6 +1,7 @@
 """The best estimate and why; what is assumed where nobody told, and the keys that narrow it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from simtest.calibration import CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
-from simtest.reconstruction.assumptions import FOCAL_SD, assumptions, calibration_of_view
+from simtest.reconstruction.assumptions import FOCAL_SD, NEAR_MISSES, assumptions, calibration_of_view
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.ranking import best_of, stated_errors
 from simtest.runtime.files import write_json
@@ -80,11 +81,11 @@ def test_a_field_of_view_alone_leaves_all_of_it_open():
     fine = assumptions(calibration, None, "fine")
     assert [each.what for each in fine] == [
         "light", "distance of the tissue", "focal length", "principal point", "distortion", "response",
-        "falloff towards the border",
+        "falloff towards the border", "highlights",
     ]  # fmt: skip
     assert "uniform from 0 to 6 mm" in str(fine[0])
     assert all(each.how_to_narrow for each in fine)
-    assert assumptions(calibration, None, "base")[-1].distribution == "uniform from 0 to 8 deg an axis"
+    assert assumptions(calibration, None, "base")[-2].distribution == "uniform from 0 to 8 deg an axis"
     assert "response" not in {each.what for each in assumptions(calibration, "linear", "fine")}
 
 
@@ -94,7 +95,10 @@ def test_a_full_calibration_leaves_nothing_open(tmp_path):
         CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
         "distance_mm = 40.0\n"
     )
-    assert assumptions(load_calibration(path), None, "fine") == []
+    # But for highlights that hold no highlight point; a plane has none of these.
+    told = load_calibration(path)
+    assert assumptions(told, None, "fine") == [NEAR_MISSES]
+    assert assumptions(replace(told, priors=replace(told.priors, plane=True)), None, "fine") == []
 
 
 def test_the_keys_that_narrow(tmp_path):
