@@ -131,9 +131,12 @@ class IsophoteFamily:
 
     @cached_property
     def drift(self) -> Array:
-        """Offset of the axis at the peak from the mean axis, in the basis, rad, shape (2,); 0 for one isophote."""
-        axes = np.array([pose.axis for pose in self.poses]) @ self.basis.T
-        return self._weights @ axes if self.can_extrapolate else np.zeros(2)
+        """Offset of the axis at the peak from the mean axis, in the basis, rad, shape (2,); 0 for one isophote.
+
+        The sightlines through the isophotes' centres in the picture are followed: to area 0 they lead where the axes
+        do, and beyond it, since the picture was smoothed, they alone lead to the peak before smoothing.
+        """
+        return self._weights @ self._crossings.picture_centres if self.can_extrapolate else np.zeros(2)
 
     @property
     def peak_axis(self) -> Array:
