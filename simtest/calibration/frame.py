@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.calibration.calibration import Calibration, CorrectedFrame, brightest_channel
-from simtest.calibration.noise_estimate import estimate_noise
+from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, estimate_noise
 from simtest.calibration.response import Response
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
@@ -93,11 +93,24 @@ class Frame:
         noise = np.maximum(white, known)
         return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
 
+    @cached_property
+    def noise_as_smoothed(self) -> float | Image:
+        """Standard deviation of white noise before smoothing that leaves as much noise as the smoothed frame has.
+
+        That of `noise`, unless coding or demosaicing has correlated it (`estimate_coarse_noise`).
+        """
+        noise = self.noise
+        level = float(np.median(noise)) if isinstance(noise, np.ndarray) else noise
+        found = estimate_coarse_noise(self.smoothed, self.smoothing_px, self.seen, self.corrected.saturated)
+        if found <= COLOURED * level:
+            return noise
+        return noise * (found / level) if level > 0 else found
+
     def patch(self, box: Box, peak: tuple[int, int] | None = None) -> Patch | Failure:
         """Cut a region of interest out (see `Patch.cut`); the same box and peak give the same patch again."""
         if (box, peak) not in self._patches:
             self._patches[box, peak] = Patch.cut(
                 self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen,
-                raw=self.corrected.intensity, noise=self.noise, smoothing_px=self.smoothing_px,
+                raw=self.corrected.intensity, noise=self.noise_as_smoothed, smoothing_px=self.smoothing_px,
             )  # fmt: skip
         return self._patches[box, peak]
