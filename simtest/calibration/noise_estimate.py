@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Image, Mask
-from simtest.geometry.gaussian_smoothing import LEAST_SMOOTHING_PX, share_of_noise
+from simtest.geometry.gaussian_smoothing import share_of_noise
 
 _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 """Difference of two Laplacians: blind to any quadratic image (Immerkaer 1996); its norm is 6."""
@@ -76,13 +76,13 @@ def estimate_coarse_noise(
     smoothed : ndarray of float32, shape (H, W)
         The frame, smoothed by a Gaussian of `sigma_px`.
     sigma_px : float
-        px; below 0.5, and of frames too small for the differences, the noise is not known: 0.
+        px; below 1, where pixels are no fine grid, and of frames too small for the differences, 0: not known.
     seen, clipped : ndarray of bool, shape (H, W), optional
         As in `estimate_noise`.
     """
-    step = max(round(sigma_px), 1)
+    step = round(sigma_px)
     reach = 2 * SPACING * step
-    if sigma_px < LEAST_SMOOTHING_PX or min(smoothed.shape) <= 2 * reach:
+    if sigma_px < 1 or min(smoothed.shape) <= 2 * reach:
         return 0.0
     # The smoothed frame is smooth over a step: every pixel of a coarser grid suffices.
     coarse = np.ascontiguousarray(smoothed[::step, ::step])
