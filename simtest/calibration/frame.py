@@ -11,6 +11,9 @@ from simtest.calibration.response import Response
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
 
+FINEST_SHARE = 0.8
+"""Of a told noise that nothing has correlated, the finest scale shows so much or more."""
+
 Box = tuple[int, int, int, int]
 
 
@@ -82,11 +85,7 @@ class Frame:
     @cached_property
     def noise(self) -> float | Image:
         """Standard deviation of the corrected intensity's noise before smoothing; in each pixel, where it differs."""
-        corrected, model = self.corrected, self.calibration.noise
-        # A sensor that clips at full scale clips at 0 as well.
-        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
-        # estimate where the noise is white, before the falloff's correction amplifies it
-        white = estimate_noise(corrected.linear, self.seen, clipped)
+        corrected, model, white = self.corrected, self.calibration.noise, self._white
         if model.is_silent and corrected.gain is None:
             return white
         known = model.at(smooth(corrected.linear, self.smoothing_px, self.seen), corrected.channels)
@@ -94,13 +93,24 @@ class Frame:
         return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
 
     @cached_property
+    def _white(self) -> float:
+        """Noise at the finest scale, where it is white, before the falloff's correction amplifies it."""
+        corrected = self.corrected
+        # A sensor that clips at full scale clips at 0 as well.
+        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
+        return estimate_noise(corrected.linear, self.seen, clipped)
+
+    @cached_property
     def noise_as_smoothed(self) -> float | Image:
         """Standard deviation of white noise before smoothing that leaves as much noise as the smoothed frame has.
 
-        That of `noise`, unless coding or demosaicing has correlated it (`estimate_coarse_noise`).
+        That of `noise`, unless coding or demosaicing has correlated it. These take noise from the finest scale; where a
+        told noise is all there, what a coarser scale has more is a texture, which other parts of a budget are for.
         """
         noise = self.noise
         level = float(np.median(noise)) if isinstance(noise, np.ndarray) else noise
+        if not self.calibration.noise.is_silent and self._white > FINEST_SHARE * level:
+            return noise
         found = estimate_coarse_noise(self.smoothed, self.smoothing_px, self.seen, self.corrected.saturated)
         if found <= COLOURED * level:
             return noise

@@ -33,10 +33,11 @@ DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
 pairs lie beyond. On a surface of constant curvature the drift is noise alone; on a colon hardly a highlight is like
 that, and where noise hides the drift it hides an error several times the mean axis's noise."""
 
-MEAN_SHARE, DRIFT_SHARE, DRIFT_PX2 = 1.0, 0.15, 0.005
-"""Variances over the squared drift: of the mean axis along it, where it may be more than noise (the peak lies 0.8 to
-1.8 times the drift away), and of both axes along any direction; and a constant added to both where the drift is more
-than noise, px^2: terms of higher order and, in renders of meshes, triangles."""
+MEAN_SHARE, MEAN_SIZE, DRIFT_SHARE, DRIFT_PX2 = 1.0, 5e-5, 0.15, 0.005
+"""Variances of the mean axis over the squared drift, along it, and over the lobe's variance, where the drift may be
+more than noise: the peak lies 0.8 to 1.8 times the drift away, and a texture pulls at all isophotes. Of both axes over
+the squared drift, in all directions, and a constant where the drift is more than noise, px^2: terms of higher order
+and, in renders of meshes, triangles."""
 
 MEAN_PX2, PEAK_PX2 = 4e-5, 8e-5
 """Variances of the mean axis and of the axis at the peak by the grid of pixels, px^2: crossings are interpolated, and a
@@ -283,7 +284,8 @@ class IsophoteFamily:
         parts["resolution"] = parts["resolution"] + MEAN_PX2 * self.px2
         parts["shape"] = self.bend_error() + self.drift_error
         if self.drift_is_suspect:
-            parts["shape"] = parts["shape"] + MEAN_SHARE * np.outer(self.drift, self.drift)
+            by_size = MEAN_SIZE * np.sqrt(max(float(np.linalg.det(self.mean_moments)), 0.0)) * np.eye(2)
+            parts["shape"] = parts["shape"] + MEAN_SHARE * np.outer(self.drift, self.drift) + by_size
         return _present(parts)
 
     @property

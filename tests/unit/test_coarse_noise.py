@@ -73,3 +73,11 @@ def test_a_coder_that_wipes_the_finest_scale_out_leaves_coarser_noise():
     frame = framed(1 + blocks)
     assert frame.noise == 0
     assert frame.noise_as_smoothed > 0.5 * SIGMA
+
+
+def test_a_texture_is_no_noise_where_the_finest_scale_shows_the_told_noise():
+    told = NoiseModel(SIGMA)
+    texture = 3 * cv2.GaussianBlur(white(7), (0, 0), 3.0) * 3
+    frame = framed(1 + white(8) + texture, told)
+    assert estimate_coarse_noise(frame.smoothed, 2.0) > COLOURED * SIGMA
+    np.testing.assert_array_equal(frame.noise_as_smoothed, frame.noise)

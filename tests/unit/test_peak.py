@@ -6,7 +6,7 @@ from scipy import stats
 
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, PEAK_PX2, SUSPECT_CHI2
+from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, MEAN_SIZE, PEAK_PX2, SUSPECT_CHI2
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.distortion import KannalaBrandt
 from simtest.geometry.vectors import angle_deg
@@ -110,7 +110,8 @@ def test_what_a_drift_adds_and_where_it_adds_nothing():
     assert np.sqrt(left_open) > np.radians(0.08 * PIXEL_DEG)
     noise = np.hstack([np.eye(2)] * 2) @ family.axes_covariance @ np.vstack([np.eye(2)] * 2)
     np.testing.assert_allclose(family.peak_budget["noise"], noise, rtol=1e-9)
-    np.testing.assert_allclose(family.peak_budget["shape"], left_open * np.eye(2), rtol=1e-2, atol=1e-10)
+    by_size = MEAN_SIZE * np.sqrt(np.linalg.det(family.mean_moments))
+    np.testing.assert_allclose(family.peak_budget["shape"], (left_open - by_size) * np.eye(2), rtol=1e-2, atol=1e-10)
 
 
 def test_noise_alone_drifts_as_often_as_is_said():
