@@ -103,8 +103,8 @@ class Photometric:
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
-        shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error() + family.drift_error
-        budget = {"noise": covariance, "shape": shape}
+        shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error()
+        budget = {"noise": covariance, "shape": shape + family.drift_error}
         if family.clipping.any():
             budget["resolution"] = family.clipping
         estimate = Estimate(
