@@ -6,10 +6,13 @@ from functools import cached_property
 import numpy as np
 
 from simtest.calibration.calibration import Calibration, CorrectedFrame, brightest_channel
-from simtest.calibration.noise_estimate import estimate_noise
+from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, estimate_noise
 from simtest.calibration.response import Response
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
+
+FINEST_SHARE = 0.8
+"""Of a told noise that nothing has correlated, the finest scale shows so much or more."""
 
 Box = tuple[int, int, int, int]
 
@@ -82,22 +85,42 @@ class Frame:
     @cached_property
     def noise(self) -> float | Image:
         """Standard deviation of the corrected intensity's noise before smoothing; in each pixel, where it differs."""
-        corrected, model = self.corrected, self.calibration.noise
-        # A sensor that clips at full scale clips at 0 as well.
-        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
-        # estimate where the noise is white, before the falloff's correction amplifies it
-        white = estimate_noise(corrected.linear, self.seen, clipped)
+        corrected, model, white = self.corrected, self.calibration.noise, self._white
         if model.is_silent and corrected.gain is None:
             return white
         known = model.at(smooth(corrected.linear, self.smoothing_px, self.seen), corrected.channels)
         noise = np.maximum(white, known)
         return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
 
+    @cached_property
+    def _white(self) -> float:
+        """Noise at the finest scale, where it is white, before the falloff's correction amplifies it."""
+        corrected = self.corrected
+        # A sensor that clips at full scale clips at 0 as well.
+        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
+        return estimate_noise(corrected.linear, self.seen, clipped)
+
+    @cached_property
+    def noise_as_smoothed(self) -> float | Image:
+        """Standard deviation of white noise before smoothing that leaves as much noise as the smoothed frame has.
+
+        That of `noise`, unless coding or demosaicing has correlated it. These take noise from the finest scale; where a
+        told noise is all there, what a coarser scale has more is a texture, which other parts of a budget are for.
+        """
+        noise = self.noise
+        level = float(np.median(noise)) if isinstance(noise, np.ndarray) else noise
+        if not self.calibration.noise.is_silent and self._white > FINEST_SHARE * level:
+            return noise
+        found = estimate_coarse_noise(self.smoothed, self.smoothing_px, self.seen, self.corrected.saturated)
+        if found <= COLOURED * level:
+            return noise
+        return noise * (found / level) if level > 0 else found
+
     def patch(self, box: Box, peak: tuple[int, int] | None = None) -> Patch | Failure:
         """Cut a region of interest out (see `Patch.cut`); the same box and peak give the same patch again."""
         if (box, peak) not in self._patches:
             self._patches[box, peak] = Patch.cut(
                 self.smoothed, box, peak, saturated=self.corrected.saturated, seen=self.seen,
-                raw=self.corrected.intensity, noise=self.noise, smoothing_px=self.smoothing_px,
+                raw=self.corrected.intensity, noise=self.noise_as_smoothed, smoothing_px=self.smoothing_px,
             )  # fmt: skip
         return self._patches[box, peak]

@@ -73,7 +73,7 @@ def _budget(family: IsophoteFamily) -> Budget | None:
     return {
         "noise": _noise(family),
         "resolution": PIXEL_PX2 * family.px2 + RIPPLES * family.ripple_error + family.clipping,
-        "shape": GAP_SHARE * np.outer(gap, gap) + family.bend_error(),
+        "shape": GAP_SHARE * np.outer(gap, gap) + family.bend_error() + family.drift_error,
     }
 
 

@@ -19,6 +19,10 @@ from simtest.runtime.arrays import AnyArray
 STEP_PX = 0.1
 """Step of the central differences of a distorting lens's sightlines."""
 
+_OUTLINE = 2 * np.pi * np.arange(24) / 24
+_CIRCLE = np.array([np.cos(_OUTLINE), np.sin(_OUTLINE)])
+"""Directions in which an isophote is imaged: the centroid is exact for an ellipse, whatever their number."""
+
 
 @dataclass(frozen=True)
 class FamilyCrossings:
@@ -79,6 +83,32 @@ class FamilyCrossings:
         mean = np.add.reduceat(squares, [part.start for part in self._parts]) / self._counts
         a, b, c = self.conics.T[:3]
         return np.asarray(np.sqrt(mean) * np.maximum(a * c - b * b / 4, 0.0) ** 0.25)
+
+    @cached_property
+    def picture_centres(self) -> Array:
+        """Where the isophotes' centres in the picture lie, tangents in the basis, shape (K, 2).
+
+        A picture is smoothed in pixels, so that smoothing moves these centres, not the cones' axes. They differ by the
+        perspective, and by the lens, in proportion to the isophote's area: a cone through a circle about its axis is
+        imaged as an ellipse about another point.
+        """
+        # points of each ellipse x^T A x + b^T x = 1: its centre and L^-T e, A / size = L L^T
+        a, b, c, d, e = self.conics.T
+        A = np.array([[a, b / 2], [b / 2, c]]).transpose(2, 0, 1)
+        linear = np.array([d, e]).T[:, :, None]
+        centres = -np.linalg.solve(A, linear) / 2
+        size = 1 - (linear * centres).sum(axis=1) / 2
+        lower = np.linalg.cholesky(A / size[:, :, None])
+        tangents = (centres + np.linalg.inv(lower).transpose(0, 2, 1) @ _CIRCLE).transpose(0, 2, 1)
+        rays = np.concatenate([tangents, np.ones((*tangents.shape[:2], 1))], axis=2) @ self.frame
+        # centroid of each curve in the picture
+        outline = self.camera.project(rays.reshape(-1, 3)).reshape(tangents.shape)
+        middle = outline.mean(axis=1)
+        x, y = (outline - middle[:, None]).transpose(2, 0, 1)
+        x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+        doubled = x * y1 - x1 * y
+        moments = np.array([((x + x1) * doubled).sum(axis=1), ((y + y1) * doubled).sum(axis=1)])
+        return np.asarray(self.tangents((moments / (3 * doubled.sum(axis=1))).T + middle).T)
 
     @cached_property
     def ripples(self) -> AnyArray:

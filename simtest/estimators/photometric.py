@@ -104,7 +104,7 @@ class Photometric:
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
         shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error()
-        budget = {"noise": covariance, "shape": shape}
+        budget = {"noise": covariance, "shape": shape + family.drift_error}
         if family.clipping.any():
             budget["resolution"] = family.clipping
         estimate = Estimate(

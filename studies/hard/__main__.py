@@ -1,10 +1,12 @@
 """Measure what stated uncertainties are worth on the corpus `hard`.
 
-    python -m studies.hard --out FOLDER [--split test] [--scenes 48] [--first 0] [--row NAME]... [--estimator NAME]...
+    python -m studies.hard --out FOLDER [--split test] [--scenes 48] [--first 0] [--row NAME]...
+        [--judged-from 0] [--estimator NAME]...
 
 The highlights of each scene's frames are kept in FOLDER, one file a scene: a run that was ended goes on where it
 stopped, and another one judges estimators without rendering. The table is printed at the end, of all scenes that are
-there. Scenes of the split `train` are for fitting: no figure is quoted on them.
+there. With `--row` those rows alone are rendered and judged; a later run adds other rows to the files. Scenes of the
+split `train` are for fitting: no figure is quoted on them.
 """
 
 import argparse
@@ -21,7 +23,7 @@ from simtest.errors import SimtestError
 from simtest.estimators import Estimator, load_estimators
 from simtest.estimators.dispatch import run
 from simtest.runtime.files import make_folder
-from studies.hard.cases import Case, calibration_of, load, save
+from studies.hard.cases import Case, calibration_of, load, rows_in, save
 from studies.hard.measure import Frames, Record, record
 from studies.hard.rows import GROUPS, ROWS, Row
 from studies.hard.scenes import SPLITS, kind_of
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [row for row in ROWS if not given.rows or row.name in given.rows]
     make_folder(given.out)
     for number in range(given.first, given.first + given.scenes):
-        _render(SPLITS[given.split] + number, given.out / f"{given.split}_{number:05d}.npz")
+        _render(SPLITS[given.split] + number, given.out / f"{given.split}_{number:05d}.npz", rows)
     loaded = load_estimators(list(given.estimators or ESTIMATORS))
     # Those of whole frames are measured by studies of their own.
     estimators = {name: each for name, each in loaded.items() if isinstance(each, Estimator)}
@@ -65,19 +67,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _render(number: int, file: Path) -> None:
-    """Keep the highlights of a scene; a row that it cannot show is left out, and said."""
-    if file.exists():
+def _render(number: int, file: Path, rows: Sequence[Row]) -> None:
+    """Keep the highlights of rows of a scene that its file lacks; rows that it cannot show are left out and told."""
+    done = rows_in(file)
+    missing = [row for row in rows if row.name not in done]
+    if not missing:
         return
-    started, frames, cases = time.process_time(), Frames(number), []
-    for row in ROWS:
+    started, frames, cases = time.process_time(), Frames(number), list(load(file)) if done else []
+    for row in missing:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 cases += list(frames.cases(row))
         except SimtestError as error:
             print(f"scene {number}, {row.name}: {error}", file=sys.stderr)
-    save(file, cases)
+    save(file, cases, done | {row.name for row in missing})
     print(f"scene {number}: {len(cases)} highlights, {time.process_time() - started:.0f} s", file=sys.stderr)
 
 

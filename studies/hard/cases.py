@@ -2,10 +2,11 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,8 +81,8 @@ def calibration_of(number: int, row: Row, span_mm: tuple[float, float]) -> Calib
     return replace(calibration, camera=replace(camera, fx=camera.fx * off, fy=camera.fy * off), priors=told)
 
 
-def save(path: Path, cases: list[Case]) -> None:
-    """Write the cases of a scene: arrays, and one text with the rest."""
+def save(path: Path, cases: Sequence[Case], rows: Iterable[str]) -> None:
+    """Write the cases of a scene, and which rows were rendered: arrays, and one text with the rest."""
     arrays: dict[str, np.ndarray] = {}
     kept = []
     for i, case in enumerate(cases):
@@ -93,7 +94,7 @@ def save(path: Path, cases: list[Case]) -> None:
         told = {name: getattr(case, name) for name in ("row", "holds", "radius_px", "span_mm")}
         normals = [None if n is None else n.tolist() for n in (case.normal, case.normal_base)]
         kept.append({"patch": numbers, "case": told, "normals": normals})
-    arrays["text"] = np.array(json.dumps(kept, default=float))
+    arrays["text"] = np.array(json.dumps({"rows": sorted(rows), "cases": kept}, default=float))
 
     def write(part: Path) -> None:
         with part.open("wb") as file:
@@ -102,12 +103,18 @@ def save(path: Path, cases: list[Case]) -> None:
     write_atomically(path, write)
 
 
+def rows_in(path: Path) -> set[str]:
+    """Return the rows whose frames were rendered for a scene's file; none where there is no file."""
+    if not path.exists():
+        return set()
+    with np.load(path, allow_pickle=False) as kept:
+        return set(_text(path, kept)["rows"])
+
+
 def load(path: Path) -> Iterator[Case]:
     """Read the cases of a scene; raise `InputError` where the file does not hold any."""
     with np.load(path, allow_pickle=False) as kept:
-        if "text" not in kept:
-            raise InputError(f"{path}: no file of the corpus hard")
-        for i, each in enumerate(json.loads(str(kept["text"]))):
+        for i, each in enumerate(_text(path, kept)["cases"]):
             arrays = {name: kept.get(f"{i}_{name}") for name in ARRAYS}
             if arrays["noise"] is not None and arrays["noise"].ndim == 0:
                 arrays["noise"] = float(arrays["noise"])  # type: ignore[assignment]
@@ -120,3 +127,11 @@ def load(path: Path) -> Iterator[Case]:
             told["radius_px"] = math.nan if told["radius_px"] is None else told["radius_px"]
             normals = [None if n is None else np.array(n) for n in each["normals"]]
             yield Case(patch=Patch(**arrays, **numbers), normal=normals[0], normal_base=normals[1], **told)
+
+
+def _text(path: Path, kept: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return what a scene's file holds beside its arrays."""
+    made = json.loads(str(kept["text"])) if "text" in kept else None
+    if not isinstance(made, dict):
+        raise InputError(f"{path}: no file of the corpus hard, or one without the names of its rows")
+    return made

@@ -9,7 +9,7 @@ import pytest
 from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Patch
-from studies.hard.cases import Case, calibration_of, load, save, scene_of
+from studies.hard.cases import Case, calibration_of, load, rows_in, save, scene_of
 from studies.hard.measure import record
 from studies.hard.rows import GROUPS, ROWS
 from studies.hard.scenes import KINDS, SPLITS, base_scene
@@ -42,7 +42,9 @@ def test_every_row_of_every_kind_is_a_scene(number):
 
 def test_cases_are_read_as_they_were_written(tmp_path):
     cases = [a_case(), a_case(normal=None, normal_base=None, holds=0, radius_px=float("nan"), row="vessels")]
-    save(tmp_path / "kept.npz", cases)
+    save(tmp_path / "kept.npz", cases, ["vessels", "JPEG 80", "mosaic"])
+    assert rows_in(tmp_path / "kept.npz") == {"vessels", "JPEG 80", "mosaic"}
+    assert rows_in(tmp_path / "other.npz") == set()
     for read, written in zip(load(tmp_path / "kept.npz"), cases, strict=True):
         for name in ("row", "holds", "span_mm"):
             assert getattr(read, name) == getattr(written, name)

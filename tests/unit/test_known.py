@@ -334,7 +334,8 @@ def test_an_untold_distance_is_the_working_range():
     ends = [tangent_coordinates(vague.normal, each.normal) for each in told]
     assert ends[0] @ ends[1] < 0
     assert dominant(vague.budget) == "distance"
-    assert set(told[0].budget) == {"noise", "distance"}
+    # The noise may look like a drift, which is shape.
+    assert set(told[0].budget) - {"shape"} == {"noise", "resolution", "distance"}
     assert np.trace(told[0].budget["distance"]) == 0
     # The share of the working range whose normals lie in the region.
     distances = np.linspace(5.0, 80.0, 151)

@@ -6,8 +6,9 @@ from scipy import stats
 
 from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_SHARE, SUSPECT_CHI2
+from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, MEAN_SIZE, PEAK_PX2, SUSPECT_CHI2
 from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.distortion import KannalaBrandt
 from simtest.geometry.vectors import angle_deg
 
 CAMERA = Camera(200, 160, 300.0, 300.0, 100.0, 80.0)
@@ -63,6 +64,23 @@ def test_on_a_base_the_axis_runs_with_the_area():
     assert mean > 4 * by_level
 
 
+@pytest.mark.parametrize(("distortion", "gain"), [(None, 10), (KannalaBrandt(0.02), 2)])
+def test_a_round_lobe_aside_of_the_optical_axis_has_its_peak_where_it_is(distortion, gain):
+    """Smoothing is round in pixels, which a lens images as an ellipse off its centre, a fisheye less."""
+    camera = Camera(200, 160, 300.0, 300.0, -40.0, 20.0, distortion=distortion)
+    x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(160) + 0.5)
+    rays, true = camera.unproject(np.array([x.ravel(), y.ravel()]).T), camera.unproject(PLACE)
+    frame = np.exp(-(np.arccos(np.clip(rays @ true, -1, 1)) ** 2) / (2 * (7 / 300) ** 2)).reshape(x.shape)
+    patch = Patch.cut(smooth(frame.astype(np.float32), 2.0).astype(float), (40, 20, 130, 120), smoothing_px=2.0)
+    family = fit_isophote_family(patch, camera, ISOVALUES)
+    pixel_deg = float(np.degrees(np.linalg.norm(camera.step_of_pixels(PLACE), axis=1).mean()))
+    by_axes = family._weights @ np.array([pose.axis for pose in family.poses])
+    followed = float(angle_deg(family.peak_axis, true)) / pixel_deg
+    assert followed < 0.004
+    # Negative control: the cones' axes, followed as far, leave it.
+    assert float(angle_deg(by_axes / np.linalg.norm(by_axes), true)) / pixel_deg > gain * followed
+
+
 def test_weights_sum_to_one_and_leave_a_common_axis():
     family = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
     weights = weights_of_axes(family._crossings.conics, family._crossings.isovalues, family.px2, 2.0)
@@ -75,8 +93,11 @@ def test_weights_sum_to_one_and_leave_a_common_axis():
 def test_what_a_drift_adds_and_where_it_adds_nothing():
     plain = fit_isophote_family(lopsided((0.0, 0.0, 0.0), sigma=0.02, seed=3), CAMERA, ISOVALUES)
     assert not plain.drift_is_real
-    assert list(plain.axis_budget) == ["noise"]
+    assert list(plain.axis_budget) == ["noise", "resolution"]
     np.testing.assert_array_equal(plain.axis_budget["noise"], plain.axes_covariance[:2, :2])
+    # A round lobe in white noise is left with what the grid of pixels makes.
+    np.testing.assert_allclose(plain.axis_budget["resolution"], MEAN_PX2 * plain.px2)
+    np.testing.assert_allclose(plain.peak_budget["resolution"], PEAK_PX2 * plain.px2)
     family = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
     assert family.drift_is_real
     np.testing.assert_array_equal(family.axis_budget["noise"], family.axes_covariance[:2, :2])
@@ -89,7 +110,8 @@ def test_what_a_drift_adds_and_where_it_adds_nothing():
     assert np.sqrt(left_open) > np.radians(0.08 * PIXEL_DEG)
     noise = np.hstack([np.eye(2)] * 2) @ family.axes_covariance @ np.vstack([np.eye(2)] * 2)
     np.testing.assert_allclose(family.peak_budget["noise"], noise, rtol=1e-9)
-    np.testing.assert_allclose(family.peak_budget["shape"], left_open * np.eye(2), rtol=1e-2, atol=1e-10)
+    by_size = MEAN_SIZE * np.sqrt(np.linalg.det(family.mean_moments))
+    np.testing.assert_allclose(family.peak_budget["shape"], (left_open - by_size) * np.eye(2), rtol=1e-2, atol=1e-10)
 
 
 def test_noise_alone_drifts_as_often_as_is_said():
