@@ -42,7 +42,7 @@ def test_the_same_night_gives_the_same_bytes(tmp_path, run):
 def test_json_holds_the_verdict(tmp_path, run):
     verdict = regression(run, notes=["Versions differ."])
     data = json.loads(written(tmp_path, run, verdict)["verdict.json"])
-    assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (1, "regression", 1, False)
+    assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (2, "regression", 1, False)
     assert data["counts"] == {**dict.fromkeys(OUTCOMES, 0), "worse": 2, "same": 2, "better": 2, "equivalent": 2}
     assert data["notes"] == ["Versions differ."]
     assert data["run"] == RUN
@@ -83,7 +83,7 @@ def test_junit_counts_what_it_lists(run):
     for count in ("tests", "failures", "errors"):
         assert int(root.get(count)) == sum(int(suite.get(count)) for suite in root)
     (failure, *_) = suites["quick.first"].iter("failure")
-    assert failure.get("message") == "mean_deg: 1.1 deg, baseline 1 deg, margin 0.02 deg, p 0.0001 (Holm)"
+    assert failure.get("message") == "worse: mean_deg: 1.1 deg, baseline 1 deg, margin 0.02 deg, p 0.0001 (Holm)"
     (failed,) = suites["quick.canaries"].iter("failure")
     assert failed.get("message") == "axis_ratio = 0.2: must be 0.9 to 1.1"
 
