@@ -1,11 +1,14 @@
 """Results that were edited without touching the code: what the gate says of each.
 
-`python -m studies.gate edits` prints the table. A night is edited; the gate compares it with the same night as it was
-(same seeds), and a night that was drawn from the bank with one of other seeds.
+`python -m studies.gate edits` prints the table. A night is edited, and the gate compares it with the same night as it
+was (same seeds): the last one of the profile quick, from the folder that GATE_NIGHT names (default:
+reports/nightly/quick), and one that is drawn from the bank, which is compared with a night of other seeds too.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -13,7 +16,9 @@ import polars as pl
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
+from simtest.nightly.storage import LATEST_ROWS, load_run
 from simtest.validation.results_table import SCHEMA
+from studies.gate.nights import Source
 
 OK = (pl.col("status") == "ok") & pl.col("true_id").is_not_null()
 OF_ANSWERS = (
@@ -53,13 +58,6 @@ def _settings(rows: pl.DataFrame, count: int, rng: np.random.Generator) -> pl.Ex
     for experiment, setting in chosen.iter_rows():
         condition |= (pl.col("experiment") == experiment) & (pl.col("setting") == setting)
     return condition
-
-
-def _one_cell(rows: pl.DataFrame, rng: np.random.Generator) -> pl.Expr:
-    names = rows.filter(OK & (pl.col("error_deg") > 0.02))["estimator"].unique().sort()
-    return _settings(rows.filter(pl.col("error_deg") > 0.02), 1, rng) & (
-        pl.col("estimator") == names[int(rng.integers(len(names)))]
-    )
 
 
 def failing(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
@@ -200,23 +198,68 @@ MEDIANS = "mean replaced by median"
 
 @dataclass(frozen=True)
 class Edited:
-    """What the gate said of an edit: `same` against the night itself, `fresh` against one of other seeds."""
+    """What the gate said of an edit.
+
+    Parameters
+    ----------
+    name : str
+        Of the edit.
+    changes : bool
+        Whether it changed anything of this night.
+    same, fresh : Verdict
+        Against the night itself, and against one of other seeds.
+    """
 
     name: str
+    changes: bool
     same: Verdict
-    fresh: Verdict
+    fresh: Verdict | None
 
 
-def edited(tonight: pl.DataFrame, other: pl.DataFrame, seed: int = 0) -> list[Edited]:
-    """Edit a night in all ways; `other` is a night of other seeds. The first of the list is no edit."""
+def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> list[Edited]:
+    """Edit a night in all ways; the first of the list is no edit.
+
+    `other` is a night of other seeds, if there is one.
+    """
     runs = {"none": run_of(tonight)}
     for name, edit in EDITS.items():
         runs[name] = run_of(edit(tonight, np.random.default_rng(seed)))
     runs[MEDIANS] = medians(runs["none"])
-    unedited, fresh = runs["none"], run_of(other)
-    return [Edited(name, compare(run, unedited), compare(run, fresh)) for name, run in runs.items()]
+    unedited, fresh = runs["none"], None if other is None else run_of(other)
+    return [
+        Edited(
+            name, not (run.rows.equals(tonight) and run.figures.equals(unedited.figures)), compare(run, unedited),
+            None if fresh is None else compare(run, fresh),
+        )
+        for name, run in runs.items()
+    ]  # fmt: skip
+
+
+def of_the_bank(bank: pl.DataFrame, count: int, seed: int = 0) -> list[Edited]:
+    """Edit a night of so many realisations a setting that is drawn from the bank."""
+    source = Source.of(bank)
+    ranks = source.ranks(np.random.default_rng(seed))
+    return edited(source.chosen(ranks < count), source.chosen((ranks >= count) & (ranks < 2 * count)), seed)
+
+
+def night_folder() -> Path:
+    """Return the folder of the night that is edited."""
+    return Path(os.environ.get("GATE_NIGHT") or Path("reports") / "nightly" / "quick")
+
+
+def of_last_night(folder: Path) -> list[Edited]:
+    """Edit the night whose results a folder of reports holds, such as reports/nightly/quick; raise `InputError`."""
+    return edited(load_run(folder, LATEST_ROWS).rows, None)
+
+
+def said(one: Edited, verdict: Verdict | None) -> str:
+    """Return a verdict in a word, with the number of findings."""
+    if verdict is None or not (one.changes or one.name == "none"):
+        return "-"
+    found = verdict.regressions.height + verdict.unexplained.height
+    return f"{verdict.state} ({found})" if found else verdict.state
 
 
 def told(verdict: Verdict) -> str:
     """Return the first cause that a verdict names."""
-    return verdict.causes[0] if verdict.causes else ""
+    return verdict.causes[0] if verdict.causes else "-"

@@ -21,7 +21,10 @@ from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_cells, judge_many, raised
 
-FRESH_NIGHTS, PAIRED_NIGHTS, DETECTION_NIGHTS, CANARY_SEEDS = 1000, 200, 100, 100
+FRESH_NIGHTS = int(os.environ.get("GATE_NIGHTS") or 1000)
+"""Nights of fresh seeds of each kind; GATE_NIGHTS changes it."""
+
+PAIRED_NIGHTS, DETECTION_NIGHTS, CANARY_SEEDS = 200, 100, 100
 N = 10
 """Realisations of each setting in a night."""
 

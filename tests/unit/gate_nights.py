@@ -20,7 +20,8 @@ def rows(count=20, level=1.0, seed=0, estimators=("cone_axis",), settings=("a",)
                 row = dict.fromkeys(SCHEMA)
                 row |= {
                     "experiment": "e", "label": "l", "surface": "plane", "setting": setting, "estimator": estimator,
-                    "realisation": realisation, "specularity": 0, "true_id": 0, "seed": 10**6 * sum(map(ord, setting)) + 1000 * seed + realisation,
+                    "realisation": realisation, "specularity": 0, "true_id": 0,
+                    "seed": 10**6 * sum(map(ord, setting)) + 1000 * seed + realisation,
                     "status": "ok", "error_deg": level * (1 + spread * float(rng.uniform(-1, 1))),
                     "mahalanobis2": float(rng.chisquare(2)), "axis_ratio": 0.5 + 0.01 * float(rng.normal()),
                     "axis_ratio_law": 0.5, "error_oracle_deg": 0.0,

@@ -176,7 +176,7 @@ def test_tables_are_whole(run):
 def test_the_counts_by_experiment(run):
     text = summary(judged(run, no_baseline()))
     assert "| first | 16 | 15 | 1 | 0 |" in text
-    assert "| second | 15 | 15 | 0 | 1 |" in text
+    assert "| second | 16 | 16 | 0 | 1 |" in text
 
 
 def test_a_huge_verdict_fits_a_comment(run):
@@ -227,3 +227,18 @@ def test_the_badge_tells_equal_bytes(run):
     fine = Verdict("fine", True, pl.DataFrame(schema=COMPARISONS), (), BASELINE)
     assert "fine, bit-equal" in badge(judged(run, fine))
     assert "bit-equal" not in badge(judged(run, dataclasses.replace(fine, bit_equal=False)))
+
+
+def test_causes_stand_first_and_changes_fail_their_cell(run):
+    changed = regression(run, outcomes=("changed", "same"))
+    verdict = dataclasses.replace(
+        changed, state="changed", causes=("cone_axis in first, plane: the law is 6 deg, was 1 deg.",)
+    )
+    text = summary(judged(run, verdict))
+    assert text.splitlines()[0] == f"## Nightly quick: changed: {verdict.unexplained.height} figures to explain"
+    assert text.splitlines()[2] == "- cone_axis in first, plane: the law is 6 deg, was 1 deg."
+    assert "### Changed, to be explained" in text
+    failures = list(ET.fromstring(junit(judged(run, verdict))).iter("failure"))
+    of_cells = [failure.get("message") for failure in failures][: verdict.unexplained.height]
+    assert all(message.startswith("changed: ") for message in of_cells)
+    assert "changed: " in badge(judged(run, verdict))

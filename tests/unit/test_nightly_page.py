@@ -14,6 +14,7 @@ import pytest
 from test_report import EVIL, make_item, make_rows
 
 from benchmarks.nights import history_of, run_of, verdict_of
+from simtest.nightly.gate.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.page.ladder_figures import FLOOR_DEG, ladder
 from simtest.nightly.page.run_tables import comparisons
@@ -23,6 +24,7 @@ from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun,
 from simtest.pages.chart_web import BUNDLE, packed
 from simtest.pages.style import colours
 from simtest.validation.results_table import SCHEMA
+from tests.unit.nightly_samples import make_run
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
 
@@ -175,14 +177,39 @@ def test_no_text_of_the_night_becomes_markup(tmp_path, night):
 
 @pytest.mark.parametrize(
     ("state", "told"),
-    [("fine", "Fine: nothing is worse"), ("no baseline", "No baseline:"), ("regression", "figures are worse than")],
+    [
+        ("fine", "Fine: nothing is worse"),
+        ("no baseline", "No baseline:"),
+        ("regression", "figures are worse than"),
+        ("changed", "Changed: nothing is worse, but "),
+    ],
 )
 def test_each_state_is_told(tmp_path, night, state, told):
     verdict = verdict_of(night, state=state)
     _, page = written(tmp_path, night, verdict)
     assert told in page.text
-    bit_equal = {"fine": "yes: all rows", "no baseline": "not known", "regression": "no: some rows"}[state]
+    bit_equal = {
+        "fine": "yes: all rows",
+        "no baseline": "not known",
+        "regression": "no: some rows",
+        "changed": "no: some rows",
+    }[state]
     assert bit_equal in page.text
+
+
+def test_the_causes_come_before_all_else(tmp_path, night):
+    cause = "cone_axis in overview, plane: the mean error is 3 deg, was 1 deg (worse)."
+    _, page = written(tmp_path, night, replace(verdict_of(night), causes=(cause, "<b>second</b>")))
+    assert page.text.index("Regression:") < page.text.index(cause) < page.text.index("Bit-equal")
+    assert "<b>second</b>" in page.text
+
+
+def test_a_first_night_has_one_line_and_no_table_of_what_is_new(tmp_path):
+    first = make_run()
+    text, page = written(tmp_path, first, compare(first, None))
+    assert "There is no baseline." in page.text
+    assert "no baseline has been accepted" in page.text
+    assert 'class="outcome new"' not in text
 
 
 def test_a_canary_alone_can_make_a_regression(tmp_path, night):

@@ -61,7 +61,7 @@ COLUMNS: dict[str, Judged | NotJudged] = {
     "error_look_law_deg": NotJudged("Follows from the miss, which `look_deg` judges, and the truth's curvature."),
     "error_fine_deg": _NORMAL,
     "error_base_deg": Judged("base_deg", _ERROR),
-    "error_base_law_deg": NotJudged("A constant of the relief's slope, which is part of the experiment's definition."),
+    "error_base_law_deg": NotJudged("A constant of the relief's slope, part of the experiment's definition."),
     "rank_correct": NotJudged("The place of the better candidate: `oracle_deg` beside `mean_deg` judges the choice."),
     "n_candidates": NotJudged("How many there are is the estimator's affair; the better one's error is judged."),
     "choice_margin": NotJudged("Of no stated scale; what a wrong choice costs is judged by `mean_deg`."),
@@ -114,8 +114,8 @@ COLUMNS: dict[str, Judged | NotJudged] = {
          "cloud_kd_min", "cloud_kd_max", "cloud_cov_11", "cloud_cov_12", "cloud_cov_22"), _CLOUD,
     ),
 }  # fmt: skip
-"""Columns of results.parquet that always exist; swept parameters are part of the setting. All are hashed, and any change
-of one is told as "not bit-equal"."""
+"""Columns of results.parquet that always exist; swept parameters are part of the setting. All numbers are hashed, and
+any change of one is told as "not bit-equal"."""
 
 _ROWS = "that of the rows, computed anew, to 1e-9"
 _COUNT = Judged("published", _ROWS)
