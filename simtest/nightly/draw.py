@@ -32,7 +32,8 @@ def _with_worst_cases(judged: JudgedRun, profile: Profile, folder: Path, variant
     try:
         findings = pl.concat([judged.with_outcome(name) for name in ("worse", "changed", "better")])
         chosen = worst_cases(judged.run.rows, findings)
-        return dataclasses.replace(judged, gallery=tuple(save_worst(chosen, experiments_of(profile), folder, variant)))
+        files = save_worst(chosen, experiments_of(profile), folder, variant)
+        return dataclasses.replace(judged, gallery=tuple(files), cases=tuple(chosen))
     except Exception as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         notes = (*judged.verdict.notes, f"The worst cases could not be made again ({why}).")

@@ -1,13 +1,17 @@
 """The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import polars as pl
 from pydantic import BaseModel, ConfigDict
+
+if TYPE_CHECKING:
+    # It makes frames; whoever only judges runs needs no renderer.
+    from simtest.validation.worst import WorstCase
 
 
 class Cell(NamedTuple):
@@ -203,6 +207,8 @@ class JudgedRun:
     verdict: Verdict
     history: pl.DataFrame  # columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them
     gallery: tuple[Path, ...] = ()  # items of the worst cases, the worst first (see `simtest.validation.worst`)
+    cases: "tuple[WorstCase, ...]" = ()  # what the items show, in the same order
+    before: pl.DataFrame = field(default_factory=pl.DataFrame)  # the baseline's rows
 
     @property
     def comparisons(self) -> pl.DataFrame:

@@ -18,7 +18,8 @@ def judge(run: NightlyRun, baseline: NightlyRun | None, reports: Reports) -> Jud
     told = [clock_note(history, run.record.start), log_note(reports, run.record.profile)]
     verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *filter(None, told), *skipped))
     own = trend_columns(history_rows(run, verdict), quantities=TRENDS)
-    return JudgedRun(run, verdict, pl.concat([history, own]))
+    before = pl.DataFrame() if baseline is None else baseline.rows
+    return JudgedRun(run, verdict, pl.concat([history, own]), before=before)
 
 
 def verdict_on(run: NightlyRun, baseline: NightlyRun | None) -> Verdict:

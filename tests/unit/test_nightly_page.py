@@ -24,6 +24,7 @@ from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun,
 from simtest.pages.chart_web import BUNDLE, packed
 from simtest.pages.style import colours
 from simtest.validation.results_table import SCHEMA
+from simtest.validation.worst import WorstCase
 from tests.unit.nightly_samples import make_run
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
@@ -247,6 +248,25 @@ def test_a_gallery_file_that_is_none_is_told(tmp_path, night):
     broken.write_bytes(b"none")
     _, page = written(tmp_path / "page", night, verdict_of(night), gallery=(broken,))
     assert "worst-00.npz: not a gallery file" in page.text
+
+
+def test_a_worst_case_shows_what_was_before(tmp_path, night):
+    make_item(tmp_path / "worst-00.npz")
+    row = {
+        "experiment": "overview", "setting": "s", "realisation": 2, "estimator": "circle_pose", "true_id": 0,
+        "status": "ok", "error_deg": 0.25, "normal_x": 0.0, "normal_y": 0.0, "normal_z": -1.0,
+    }  # fmt: skip
+    before = pl.DataFrame([row, {**row, "realisation": 3, "error_deg": 7.0}])
+    case = WorstCase("overview", "s", 2, "circle_pose", "why")
+    judged = JudgedRun(
+        night, verdict_of(night), pl.DataFrame(), (tmp_path / "worst-00.npz",), cases=(case,), before=before
+    )
+    told = Page(write_nightly_page(tmp_path / "page", judged).read_text(encoding="utf-8")).text
+    assert "In the baseline: highlight 0: 0.25°" in told
+    assert "circle_pose (baseline)" in told
+    # A baseline of an older version has no normals.
+    older = write_nightly_page(tmp_path / "older", replace(judged, before=before.drop("normal_x")))
+    assert "In the baseline" not in Page(older.read_text(encoding="utf-8")).text
 
 
 def test_the_same_night_gives_the_same_page(tmp_path, night, history):

@@ -145,7 +145,8 @@ def _where(row: Mapping[str, object]) -> str:
     estimator, experiment = row["estimator"] or "all estimators", row["experiment"]
     setting = row["setting"] or row["label"]
     if setting == POOLED:
-        place = "all experiments together" if experiment == POOLED else f"{experiment}, all settings together"
+        # Cells that are bit-equal are not pooled.
+        place = "all cells that differ" if experiment == POOLED else f"{experiment}, all cells that differ"
     else:
         place = f"{experiment}, {setting}" if setting else str(experiment)
     more = int(str(row["settings"])) - 1
