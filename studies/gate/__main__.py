@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 
 from benchmarks.measuring import print_figures
+from simtest.nightly.gate.judged import COLUMNS, SUMMARY, Judged, NotJudged
 from studies.gate import figures, proof
 from studies.gate.bank import frames_of, load_bank
 from studies.gate.edits import night_folder, of_last_night, of_the_bank, said, told
@@ -71,9 +72,24 @@ def edits() -> str:
     return lines + "\n" + _table(head, rows)
 
 
+def judged() -> str:
+    """Return the tables of what is judged, and of what is not and why."""
+    made = []
+    for title, table in {"results.parquet": COLUMNS, "summary.json": SUMMARY}.items():
+        own = [(name, entry) for name, entry in table.items() if isinstance(entry, Judged)]
+        rest = [(name, entry) for name, entry in table.items() if isinstance(entry, NotJudged)]
+        made.append(f"{len(own)} of {len(table)} of {title} are judged, {len(rest)} are not.\n")
+        made.append(_table((title, "judged by", "limit"), [(f"`{name}`", e.quantity, e.limit) for name, e in own]))
+        by_reason: dict[str, list[str]] = {}
+        for name, entry in rest:
+            by_reason.setdefault(entry.reason, []).append(f"`{name}`")
+        made.append(_table((title, "not judged, for"), [(", ".join(n), reason) for reason, n in by_reason.items()]))
+    return "\n".join(made)
+
+
 SECTIONS: dict[str, Callable[[], str]] = {
     "alarms": alarms, "harmless": harmless, "rises": rises, "faults": faults, "noise": noise,
-    "edits": edits,
+    "edits": edits, "judged": judged,
 }  # fmt: skip
 
 

@@ -124,6 +124,8 @@ def _sentence(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyR
     pooled = row["unit"] == "x" and row["setting"] == POOLED
     told = f"is {now} of the baseline's" if pooled else f"is {now}, was {was}"
     words = WORDS.get(quantity) or quantity
+    if row["method"] == "ladder":
+        words = f"the mean error on the rung {quantity!r}"
     if row["method"] == SINGLE:
         told, words = _of_single(row, was, now, words)
     text = f"{where}: {words} {told} ({outcome})."
