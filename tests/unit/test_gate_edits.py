@@ -102,6 +102,10 @@ def test_each_rule_is_broken_by_what_it_is_about(rule, values, everywhere):
     assert rule in set(worse.regressions["quantity"])
 
 
+def test_round_highlights_all_have_the_ratio_1():
+    assert broken_rules(changed(TONIGHT, pl.col("axis_ratio").is_not_null(), axis_ratio=1.0)).is_empty()
+
+
 def test_a_rule_that_the_baseline_breaks_as_much_is_no_regression():
     table = changed(TONIGHT, FIRST, error_fine_deg=3.0)
     nudged = table.with_columns(pl.col("error_deg") * (1 + 1e-9))

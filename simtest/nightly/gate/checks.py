@@ -156,7 +156,8 @@ def _axis_ratio_law(table: pl.DataFrame) -> Mask:
 def _axis_ratios(table: pl.DataFrame) -> Mask:
     own = pl.when(ANSWERED).then("axis_ratio")
     # A scene without noise gives one ratio in all its realisations; so does a column that was filled with a constant.
-    alike = (own.n_unique() - own.is_null().any()).over(CELL) == 1
+    # Highlights that are round within their noise have the ratio 1, all of them.
+    alike = ((own.n_unique() - own.is_null().any()).over(CELL) == 1) & (own < 1)
     many = (own.drop_nulls().len().over(CELL) >= FEW) & (pl.col("noise_sigma") > 0)
     outside = (own < 0) | (own > 1 + SHARE)
     return _mask(table, own.is_not_null() & (outside | (alike & many)))

@@ -74,7 +74,8 @@ def _both(tonight: pl.DataFrame, baseline: pl.DataFrame | None, kind: str) -> pl
     before = tonight.clear() if baseline is None else baseline
     before = before.filter(pl.col("kind") == kind).select(*_KEY, numbers.name.suffix("_before"))
     after = tonight.filter(pl.col("kind") == kind).with_columns(numbers)
-    return after.join(before, on=_KEY, how="full", coalesce=True, maintain_order="left_right")
+    # A name that does not apply, such as the surface of a rung, is null.
+    return after.join(before, on=_KEY, how="full", coalesce=True, nulls_equal=True, maintain_order="left_right")
 
 
 def _compared() -> list[pl.Expr]:
