@@ -116,15 +116,6 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
     return NightlyRun(record, rows, pl.concat([table.select(*FIGURES) for table in figures]))
 
 
-def frames_of(experiments: Sequence[Experiment], cases: Sequence[Sequence[Case]]) -> dict[tuple[str, str], int]:
-    """Count the frames that experiments take, by experiment and setting; `cases` holds those of each experiment."""
-    counted: Counter[tuple[str, str]] = Counter()
-    for experiment, own in zip(experiments, cases, strict=True):
-        for case in own:
-            counted[experiment.name, case.setting] += case.realisations
-    return dict(counted)
-
-
 def _ladder() -> pl.DataFrame:
     figures = ladder_figures()
     return pl.concat([figures, ladder_canary(figures)])
@@ -155,3 +146,12 @@ class _Steps:
         """Show that all is measured."""
         self._done = self._total
         self.show("done")
+
+
+def frames_of(experiments: Sequence[Experiment], cases: Sequence[Sequence[Case]]) -> dict[tuple[str, str], int]:
+    """Count the frames that experiments take, by experiment and setting; `cases` holds those of each experiment."""
+    counted: Counter[tuple[str, str]] = Counter()
+    for experiment, own in zip(experiments, cases, strict=True):
+        for case in own:
+            counted[experiment.name, case.setting] += case.realisations
+    return dict(counted)
