@@ -31,7 +31,7 @@ def run(
     ] = None,
     address: Address = None,
 ) -> int:
-    """Run a profile; exit 0 fine, 1 a regression, 2 it could not be run.
+    """Run a profile; exit 0 fine, 1 a regression or a change to explain, 2 it could not be run.
 
     The night is kept in the history, compared with the accepted baseline, and its page written.
     """
@@ -75,10 +75,14 @@ def accept(
 ) -> None:
     """Make the last night's numbers the baseline."""
     from simtest.nightly.baseline import accept as accept_night
+    from simtest.nightly.baseline import log_note
     from simtest.nightly.layout import Reports
     from simtest.spec import load_profile
 
-    accepted = accept_night(Reports(reports), load_profile(profile).name, reason)
+    folder, name = Reports(reports), load_profile(profile).name
+    if note := log_note(folder, name):
+        print(note)
+    accepted = accept_night(folder, name, reason)
     print(f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}")
 
 
@@ -93,7 +97,7 @@ def _print(outcome: "Outcome") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from simtest.nightly.phrases import cell_name, headline, plain
+    from simtest.nightly.phrases import headline
     from simtest.nightly.records import OUTCOMES
 
     judged, verdict = outcome.judged, outcome.judged.verdict
@@ -104,12 +108,7 @@ def _print(outcome: "Outcome") -> None:
         table.add_row(*("" if value is None else str(value) for value in values))
     console = Console(width=TABLE_WIDTH)
     console.print(table)
-    for row in judged.with_outcome("worse").iter_rows(named=True):
-        print(
-            f"worse: {row['experiment']}, {cell_name(row)}, {row['quantity']}: {plain(row['tonight'], row['unit'])}, "
-            f"baseline {plain(row['baseline'], row['unit'])}"
-        )
-    for row in judged.run.failed_canaries.iter_rows(named=True):
-        print(f"canary failed: {row['experiment']}, {row['quantity']} = {plain(row['value'], row['unit'])}")
+    # The cause first, then what else a reader must know.
+    print(*verdict.causes, sep="\n", end="\n" * bool(verdict.causes))
     print(*verdict.notes, sep="\n", end="\n" * bool(verdict.notes))
     print(outcome.folder / "index.html")

@@ -1,11 +1,16 @@
 """The baseline: the numbers of a run that somebody accepted, and why."""
 
+import dataclasses
 import json
 import shutil
 from datetime import UTC, datetime
+from pathlib import Path
 
+import polars as pl
+
+from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
-from simtest.nightly.gate.quantities import RESULT_COLUMNS
+from simtest.nightly.gate.quantities import OLDEST_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.records import CELL, NightlyRun, RunRecord
 from simtest.nightly.storage import (
@@ -23,8 +28,19 @@ from simtest.validation.results_table import SCHEMA
 LOG = "log.jsonl"
 MAX_REASON = 1000
 
-COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS)
-"""Columns of the rows that a baseline keeps: what names a row, and what `simtest.nightly.gate.compare` reads."""
+COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS, ON_INSTRUMENT)
+"""Columns of the rows that a baseline keeps: what names a row, and what `simtest.nightly.gate.compare` reads.
+
+`ON_INSTRUMENT` is that of scenes with instruments alone.
+"""
+
+NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
+"""Columns without which a baseline is none; one of an older version may lack the others."""
+
+SINGLE_PRECISION = tuple(
+    name for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS and SCHEMA[name] == pl.Float64()
+)  # fmt: skip
+"""Columns that a baseline keeps in single precision, for it lies in git: they are compared with margins."""
 
 
 def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
@@ -46,8 +62,36 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
             f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "
             f"of the profile {profile}"
         )
-    check_columns(folder / BASELINE_ROWS, run.rows, {name: SCHEMA[name] for name in COLUMNS})
-    return run
+    rows = run.rows.with_columns(pl.col(name).cast(pl.Float64) for name in SINGLE_PRECISION if name in run.rows.columns)
+    known = {name: dtype for name, dtype in SCHEMA.items() if name in NEEDED or name in rows.columns}
+    check_columns(folder / BASELINE_ROWS, rows, known)
+    return dataclasses.replace(run, rows=rows)
+
+
+def log_note(reports: Reports, profile: str) -> str | None:
+    """Return a note where the log of acceptances holds a line that is no entry, such as one that was cut off."""
+    path = reports.baseline(profile) / LOG
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return f"{shown(path)}: cannot be read ({error.strerror})."
+    broken = [number for number, line in enumerate(lines, 1) if not _is_entry(line)]
+    if not broken:
+        return None
+    more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+    return (
+        f"{shown(path)}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
+        "the baseline itself is sound."
+    )
+
+
+def _is_entry(line: str) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
 
 
 def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
@@ -86,15 +130,26 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     with scratch(reports, new_run_id(now)) as folder, exclusive_replacement(target):
         new = folder / "baseline"
         new.mkdir()
-        save_run(new, NightlyRun(record, run.rows, run.figures), BASELINE_ROWS, COLUMNS)
+        small = run.rows.with_columns(
+            pl.col(name).cast(pl.Float32) for name in SINGLE_PRECISION if name in run.rows.columns
+        )
+        save_run(new, NightlyRun(record, small, run.figures), BASELINE_ROWS, COLUMNS)
         # The log of all acceptances goes along.
         if (target / LOG).is_file():
             shutil.copyfile(target / LOG, new / LOG)
+            _end_line(new / LOG)
         entry = {key: getattr(record, key) for key in ("accepted", "reason", "id", "started", "commit", "processor")}
         with (new / LOG).open("a", encoding="utf-8") as log:
             log.write(json.dumps({**entry, "replaces": _replaced(reports, profile)}) + "\n")
         replace_folder(new, target)
     return record
+
+
+def _end_line(log: Path) -> None:
+    """End a last line that was cut off, so that the next entry has one of its own."""
+    held = log.read_bytes()
+    if held and not held.endswith(b"\n"):
+        log.write_bytes(held + b"\n")
 
 
 def _replaced(reports: Reports, profile: str) -> str | None:

@@ -3,6 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+import polars as pl
+
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
@@ -28,8 +30,10 @@ def draw(judged: JudgedRun, profile: Profile, folder: Path, variant: str | None 
 def _with_worst_cases(judged: JudgedRun, profile: Profile, folder: Path, variant: str | None) -> JudgedRun:
     """Render the worst cases again; a failure is a note, for a run that is measured must not be lost over pictures."""
     try:
-        chosen = worst_cases(judged.run.rows, judged.with_outcome("worse"))
-        return dataclasses.replace(judged, gallery=tuple(save_worst(chosen, experiments_of(profile), folder, variant)))
+        findings = pl.concat([judged.with_outcome(name) for name in ("worse", "changed", "better")])
+        chosen = worst_cases(judged.run.rows, findings)
+        files = save_worst(chosen, experiments_of(profile), folder, variant)
+        return dataclasses.replace(judged, gallery=tuple(files), cases=tuple(chosen))
     except Exception as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         notes = (*judged.verdict.notes, f"The worst cases could not be made again ({why}).")

@@ -2,7 +2,8 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,8 +23,8 @@ from simtest.runtime import provenance
 from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.engine import Engine
 from simtest.runtime.measuring import PeakMemory
-from simtest.spec import Profile, experiments_of
-from simtest.validation.cases import expand
+from simtest.spec import Experiment, Profile, experiments_of
+from simtest.validation.cases import Case, expand
 from simtest.validation.runner import Progress, definition, run_experiments
 
 _LOOK_S = 0.5
@@ -86,7 +87,7 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
         )  # fmt: skip
         took_s = time.monotonic() - before
         rows = pl.concat([run.results for run in runs], how="diagonal_relaxed")
-        figures.insert(0, setting_figures(rows))
+        figures.insert(0, setting_figures(rows, frames_of(experiments, cases)))
         if profile.canaries:
             figures.append(or_failed_canary("noises_of", lambda: figure_table(noise.noises_of(rows, experiments))))
     if profile.costs:
@@ -145,3 +146,12 @@ class _Steps:
         """Show that all is measured."""
         self._done = self._total
         self.show("done")
+
+
+def frames_of(experiments: Sequence[Experiment], cases: Sequence[Sequence[Case]]) -> dict[tuple[str, str], int]:
+    """Count the frames that experiments take, by experiment and setting; `cases` holds those of each experiment."""
+    counted: Counter[tuple[str, str]] = Counter()
+    for experiment, own in zip(experiments, cases, strict=True):
+        for case in own:
+            counted[experiment.name, case.setting] += case.realisations
+    return dict(counted)

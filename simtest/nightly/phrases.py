@@ -8,18 +8,21 @@ import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+import polars as pl
+
 from simtest.nightly.records import JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.pages.style import degrees, labelled, number
 
 STATES = {
-    "fine": "Fine: nothing is worse than the baseline.",
+    "fine": "Fine: nothing is worse than the baseline, and nothing else needs a reason.",
     "no baseline": "No baseline: there is nothing to compare with.",
 }
-MARKS = {"fine": "✓", "regression": "✗", "no baseline": "○"}
+MARKS = {"fine": "✓", "changed": "≠", "regression": "✗", "no baseline": "○"}
 
 MEANINGS = {
-    "worse": "beyond the margin, at the corrected level: a regression",
-    "better": "beyond the margin the other way",
+    "worse": "beyond the margin, at the corrected level, missing, or contradicting the results: a regression",
+    "better": "beyond the margin the other way: to be explained, unless it is a cost",
+    "changed": "a level or a single result moved: to be explained",
     "gone": "in the baseline, but not tonight",
     "new": "tonight, but not in the baseline",
     "undecided": "neither a change nor equivalence is shown",
@@ -89,15 +92,24 @@ def bounds(low: float | None, high: float | None) -> str:
 
 def headline(verdict: Verdict) -> str:
     """Return the verdict in a few words."""
-    worse = verdict.regressions.height
+    worse, other = verdict.regressions.height, verdict.unexplained.height
     if verdict.state == "regression":
         return f"regression: {worse} figure{'s' * (worse != 1)} worse" if worse else "regression"
+    if verdict.state == "changed":
+        return f"changed: {other} figure{'s' * (other != 1)} to explain"
     return "fine, bit-equal" if verdict.state == "fine" and verdict.bit_equal else verdict.state
 
 
 def headline_sentence(judged: JudgedRun) -> str:
     """Return the verdict in a sentence, with the estimators or canaries to blame."""
     verdict = judged.verdict
+    if verdict.state == "changed":
+        found = verdict.unexplained
+        verb = "has" if found.height == 1 else "have"
+        return (
+            f"Changed: nothing is worse, but {found.height} of {verdict.comparisons.height} figures {verb} changed"
+            f"{_blamed(found)}. Explain it, then accept the run: {_ACCEPT}."
+        )
     if verdict.state != "regression":
         return STATES[verdict.state]
     worse, out = verdict.regressions, out_of_bounds(judged.run)
@@ -105,12 +117,18 @@ def headline_sentence(judged: JudgedRun) -> str:
         verb = "canary is" if len(out) == 1 else "canaries are"
         why = f"{len(out)} {verb} out of bounds: {labelled(out)}" if out else "the gate says so"
         return f"Regression: no figure is worse than the baseline, but {why}."
-    named = worse["estimator"].replace("", None).drop_nulls()
+    verb = "is" if worse.height == 1 else "are"
+    which = _blamed(worse)
+    than = "worse than the baseline" if verdict.baseline is not None else "wrong"
+    return f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} {than}{which}."
+
+
+def _blamed(found: pl.DataFrame) -> str:
+    """Return the estimators of findings with their numbers, after a colon; nothing where none is named."""
+    named = found["estimator"].replace("", None).drop_nulls()
     counted = named.value_counts().sort("count", "estimator", descending=[True, False])
     names = [f"{name} ({count})" for name, count in counted.iter_rows()]
-    which = f": {labelled(names)}" if names else ""
-    verb = "is" if worse.height == 1 else "are"
-    return f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} worse than the baseline{which}."
+    return f": {labelled(names)}" if names else ""
 
 
 def out_of_bounds(run: NightlyRun) -> list[str]:

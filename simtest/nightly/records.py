@@ -1,13 +1,17 @@
 """The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import polars as pl
 from pydantic import BaseModel, ConfigDict
+
+if TYPE_CHECKING:
+    # It makes frames; whoever only judges runs needs no renderer.
+    from simtest.validation.worst import WorstCase
 
 
 class Cell(NamedTuple):
@@ -49,18 +53,30 @@ COMPARISONS: dict[str, pl.DataType] = {
 }  # fmt: skip
 """Columns of the gate's comparisons, a row a cell and quantity.
 
-`method` is "equal" (the same bytes: no test is made), "paired", "unpaired" or "none"; `difference` is tonight less the
-baseline, `low`, `high` its 95 % interval, `margin` the harmless size of a difference; `p` one-sided for "worse by more
-than the margin", `p_holm` corrected over the family. `outcome` is one of `OUTCOMES`. Rows over many settings (`POOLED`)
-of a quantity with a relative margin have the unit "x": the baseline is 1, the difference the mean share of the
-settings'. Canaries (`experiment` the canary's name, `low`, `high` its bounds) and costs have the method "none".
+`method` is "equal" (the same bytes: no test is made), "paired", "unpaired", "single" (results one by one, `n` that
+moved), "check" (results against themselves, `n` rows), "rows" (figures against rows), "ladder" or "none".
+`difference` is tonight less the baseline, `low`, `high` its 95 % interval, `margin` the harmless size of a difference;
+`p` one-sided for "changed by more than the margin" to the surer side, `p_holm` corrected over the family. `outcome` is
+one of `OUTCOMES`. Rows over many settings (`POOLED`) of a quantity with a relative margin have the unit "x": the
+baseline is 1, the difference the mean share of the settings'. Canaries (`experiment` the canary's name, `low`, `high`
+its bounds) and costs have the method "none".
 """
 
-OUTCOMES = ("same", "equivalent", "undecided", "better", "worse", "new", "gone")
+OUTCOMES = ("same", "equivalent", "undecided", "better", "changed", "worse", "new", "gone")
 """same: equal bytes, and the same figures of them; equivalent: the interval, or every single pair, lies within the
-margin; worse: beyond the margin at the corrected level, a cell, highlights or a canary that tonight lacks, or another
-figure of the same results (a regression); better: its mirror image; undecided: neither shown; new: the baseline lacks
+margin; worse: beyond the margin at the corrected level, a cell, highlights or a canary that tonight lacks, another
+figure of the same results, or results that contradict each other (a regression); better: its mirror image; changed: a
+quantity of which neither side is better, or a single result, moved; undecided: neither shown; new: the baseline lacks
 it; gone: tonight has nothing to say of the quantity."""
+
+
+def to_explain() -> pl.Expr:
+    """Return which comparisons are no regression, and yet must be explained: errors that fell, and what changed.
+
+    A cost that fell needs no reason.
+    """
+    outcome = pl.col("outcome")
+    return (outcome == "changed") | ((outcome == "better") & (pl.col("method") != "none"))
 
 
 class Figure(NamedTuple):
@@ -152,16 +168,22 @@ class NightlyRun:
 class Verdict:
     """What the gate says of a run."""
 
-    state: str  # "fine", "regression" or "no baseline"
+    state: str  # "fine", "changed", "regression" or "no baseline"
     bit_equal: bool | None  # whether all rows of run and baseline are the same bytes; None without a baseline
     comparisons: pl.DataFrame  # columns `COMPARISONS`
-    notes: tuple[str, ...]  # versions that differ, pairs that are missing, contours that changed topology
+    notes: tuple[str, ...]  # versions that differ, pairs that are missing, results that changed in kind
     baseline: RunRecord | None
+    causes: tuple[str, ...] = ()  # what to look at first: estimator, experiment, setting, what it was and is
 
     @property
     def regressions(self) -> pl.DataFrame:
         """The comparisons that are worse."""
         return self.comparisons.filter(pl.col("outcome") == "worse")
+
+    @property
+    def unexplained(self) -> pl.DataFrame:
+        """The comparisons that are no regression, and must be explained all the same (`to_explain`)."""
+        return self.comparisons.filter(to_explain())
 
     @property
     def counts(self) -> dict[str, int]:
@@ -170,8 +192,11 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """1 for a regression, else 0: a run without a baseline is fine unless a canary failed."""
-        return 1 if self.state == "regression" else 0
+        """1 for a regression, or for a change that nobody has accepted, else 0.
+
+        A run without a baseline is fine unless a canary failed, or its results contradict each other.
+        """
+        return 1 if self.state in ("regression", "changed") else 0
 
 
 @dataclass(frozen=True)
@@ -182,6 +207,8 @@ class JudgedRun:
     verdict: Verdict
     history: pl.DataFrame  # columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them
     gallery: tuple[Path, ...] = ()  # items of the worst cases, the worst first (see `simtest.validation.worst`)
+    cases: "tuple[WorstCase, ...]" = ()  # what the items show, in the same order
+    before: pl.DataFrame = field(default_factory=pl.DataFrame)  # the baseline's rows
 
     @property
     def comparisons(self) -> pl.DataFrame:

@@ -4,6 +4,7 @@ import dataclasses
 
 import polars as pl
 
+from simtest.nightly.baseline import log_note
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.history import TREND_COLUMNS, TRENDS, clock_note, history_rows, read_history, trend_columns
 from simtest.nightly.layout import Reports
@@ -14,10 +15,11 @@ def judge(run: NightlyRun, baseline: NightlyRun | None, reports: Reports) -> Jud
     """Compare a run with its profile's baseline, if there is one, and read the history that it belongs to."""
     verdict = verdict_on(run, baseline)
     history, skipped = read_history(reports.history, run.record.profile, TREND_COLUMNS, TRENDS)
-    late = clock_note(history, run.record.start)
-    verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *([late] if late else []), *skipped))
+    told = [clock_note(history, run.record.start), log_note(reports, run.record.profile)]
+    verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *filter(None, told), *skipped))
     own = trend_columns(history_rows(run, verdict), quantities=TRENDS)
-    return JudgedRun(run, verdict, pl.concat([history, own]))
+    before = pl.DataFrame() if baseline is None else baseline.rows
+    return JudgedRun(run, verdict, pl.concat([history, own]), before=before)
 
 
 def verdict_on(run: NightlyRun, baseline: NightlyRun | None) -> Verdict:

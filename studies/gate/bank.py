@@ -4,11 +4,10 @@ from pathlib import Path
 
 import polars as pl
 
-from simtest.nightly.gate.quantities import RESULT_COLUMNS
-from simtest.nightly.records import CELL
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import write_atomically
 from simtest.spec import Experiment, load_experiment
+from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import run_experiment
 
 CONTENT = {"paper": 320, "curvature": 60, "light_offset": 60, "compare": 40, "anatomy": 2}
@@ -19,7 +18,8 @@ SLOW = "inverse_rendering"
 
 SEED = 20_000
 WORKERS = 2
-COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS)
+COLUMNS = tuple(SCHEMA)
+"""All columns of results: the gate holds them against each other."""
 
 
 def experiment(name: str, realisations: int) -> Experiment:

@@ -129,10 +129,10 @@ FAULTS: dict[str, tuple[Mutation, ...]] = {
             DirectLight._from, "values, -direction) / squared)", "values, -direction))"
         ),
     ),
-    "normals in the world frame": (Mutation(exact.solve, "normal=exact.normal @ rotation", "normal=exact.normal"),),
+    "normals in the world frame": (Mutation(exact.in_camera, "normal=exact.normal @ rotation", "normal=exact.normal"),),
     "light moved 1 mm": (
         Mutation(
-            Session._apply, "self.scene.rig.true_mm()", "(self.scene.rig.true_mm() + np.array([1.0, 0.0, 0.0]))"
+            Session._place_lights, "self.scene.rig.true_mm()", "(self.scene.rig.true_mm() + np.array([1.0, 0.0, 0.0]))"
         ),
     ),
     "ellipse fit unscaled": (
@@ -154,7 +154,7 @@ def doubly_blurred(image: Any, sigma_px: float) -> Any:
 
 _BLUR = "np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))"
 _BLUR_TWICE = "__import__('studies.gate.faults', fromlist=['_']).doubly_blurred(image, sigma_px)"
-_CAPTURE = "capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed))"
+_CAPTURE = "capture(self.light, self.full_scale, "
 
 HARMLESS: dict[str, tuple[Mutation, ...]] = {
     "sums of the ellipse fit in reverse order": (

@@ -139,8 +139,8 @@ class Found:
 
     Parameters
     ----------
-    regression : bool
-        Whether anything was worse.
+    alarm : bool
+        Whether anything was worse, or must be explained.
     estimators : tuple of str
         Of which.
     tests : int
@@ -149,7 +149,7 @@ class Found:
         Least corrected p-value; 1 without a test.
     """
 
-    regression: bool
+    alarm: bool
     estimators: tuple[str, ...]
     tests: int
     least: float
@@ -160,9 +160,10 @@ def judge(draw: Draw, seed: int) -> Found:
     tonight, baseline = draw(np.random.default_rng(seed))
     verdict = compare(tonight, baseline)
     tested = verdict.comparisons.filter(pl.col("p").is_not_null())
-    worse = verdict.regressions["estimator"].unique().sort().to_list()
+    findings = pl.concat([verdict.regressions, verdict.unexplained])
+    blamed = findings["estimator"].unique().sort().to_list()
     least = tested["p_holm"].to_numpy().min() if tested.height else 1.0
-    return Found(verdict.state == "regression", tuple(worse), tested.height, float(least))
+    return Found(verdict.exit_code != 0, tuple(blamed), tested.height, float(least))
 
 
 _draw: Draw

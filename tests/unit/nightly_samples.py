@@ -1,6 +1,7 @@
 """A small run, made without rendering, for the tests of the nightly."""
 
 from datetime import UTC, datetime
+from itertools import product
 
 import polars as pl
 
@@ -18,20 +19,22 @@ RUN = {
 }  # fmt: skip
 
 
+SETTINGS = ("plane, tilt_deg=0", "plane, tilt_deg=5")
+
+
 def make_rows(count=4, error_deg=1.0):
     made = [
         {
             "experiment": experiment, "label": "plane", "surface": "plane", "setting": setting, "realisation": number,
-            "specularity": 0, "true_id": 0, "seed": 100 + number, "estimator": estimator, "status": "ok",
+            "specularity": 0, "true_id": 0, "seed": 1000 * block + number, "estimator": estimator, "status": "ok",
             "error_deg": error_deg + 0.1 * number,
         }
-        for experiment in ("first", "second")
-        for setting in ("plane, tilt_deg=0", "plane, tilt_deg=5")
+        for block, (experiment, setting) in enumerate(product(("first", "second"), SETTINGS))
         for estimator in ("cone_axis", "circle_pose")
         for number in range(count)
     ]  # fmt: skip
     made[0] |= {"status": "missed", "error_deg": None, "specularity": None}
-    made[-1]["true_id"] = None
+    made.append(made[-1] | {"true_id": None, "specularity": 1})
     return pl.DataFrame(made, schema=SCHEMA)
 
 

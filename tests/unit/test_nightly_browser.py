@@ -1,13 +1,16 @@
 """The nightly page in a real browser: Chromium of the system, driven by playwright."""
 
+import re
 import shutil
 from datetime import UTC, datetime
 
+import polars as pl
 import pytest
 from test_nightly_page import rows_of
 from test_report import make_item
 
 from benchmarks.nights import history_of, run_of, verdict_of
+from simtest.nightly.gate.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
 
@@ -211,3 +214,13 @@ def test_dark_colours_reach_the_plots_and_paper_shows_what_was_folded(opened):
     assert page.evaluate(ink) == "#e7eaee"
     page.emulate_media(media="screen", color_scheme="light")
     page.wait_for_function(ink + " === '#1b1f24'")
+
+
+def test_the_axis_of_a_night_alone_shows_days(browser, tmp_path):
+    run = run_of(rows_of("overview"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
+    reader = Reader(browser, write_nightly_page(tmp_path, JudgedRun(run, compare(run, None), pl.DataFrame())).as_uri())
+    ticks = reader.open().locator("#trend-chart .xtick text").all_text_contents()
+    reader.close()
+    assert ticks
+    # Neither hours nor shares of a second.
+    assert all(re.fullmatch(r"\d{4}-\d{2}-\d{2}", tick) for tick in ticks), ticks

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -12,11 +13,14 @@ from polars.testing import assert_frame_equal
 
 from simtest.errors import InputError
 from simtest.nightly import layout
-from simtest.nightly.baseline import accept, load_baseline
+from simtest.nightly.baseline import accept, load_baseline, log_note
+from simtest.nightly.gate.quantities import OLDEST_COLUMNS
 from simtest.nightly.history import HISTORY, TREND_COLUMNS, append, clock_note, history_rows, read_history
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.phrases import short_commit
+from simtest.nightly.records import CELL
 from simtest.nightly.storage import BASELINE_ROWS, LATEST_ROWS, load_run, save_run
+from simtest.nightly.verdict import judge
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
 
@@ -230,6 +234,8 @@ def test_a_baseline_is_the_last_night_with_a_reason(reports):
     assert datetime.fromisoformat(record.accepted).tzinfo is not None
     assert_frame_equal(found.figures, run.figures)
     kept = run.rows.select(found.rows.columns)
+    # What is compared with margins lies there in single precision.
+    assert pl.read_parquet_schema(reports.baseline("quick") / BASELINE_ROWS)["peak_snr"] == pl.Float32()
     assert_frame_equal(found.rows, kept)
     assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
     assert not list(reports.work.glob("2*"))
@@ -243,6 +249,38 @@ def test_all_acceptances_are_kept(reports):
     assert [line["reason"] for line in lines] == ["first", "better ellipse fit"]
     assert [line["replaces"] for line in lines] == [None, "20260301T023000Z-7-0123abcd"]
     assert load_baseline(reports, "quick").rows["error_deg"].min() == 0.5
+
+
+def test_a_log_that_was_cut_off_is_told_and_what_is_left_is_kept(reports):
+    assert log_note(reports, "quick") is None
+    accept(reports, "quick", "first")
+    accept(reports, "quick", "second")
+    assert log_note(reports, "quick") is None
+    log = reports.baseline("quick") / "log.jsonl"
+    os.truncate(log, log.stat().st_size - 20)
+    note = log_note(reports, "quick")
+    assert "log.jsonl: damaged (line 2 of 2 is no entry; cut off?); the rest is kept" in note
+    assert "\n" not in note
+    # The next entry has a line of its own.
+    accept(reports, "quick", "third")
+    lines = log.read_text().splitlines()
+    assert len(lines) == 3
+    assert [json.loads(lines[i])["reason"] for i in (0, 2)] == ["first", "third"]
+    assert "line 2 of 3" in log_note(reports, "quick")
+    assert "log.jsonl: damaged" in judge(make_run(), load_baseline(reports, "quick"), reports).verdict.notes[-1]
+
+
+def test_a_baseline_of_an_older_version_is_compared_in_what_it_holds(reports):
+    accept(reports, "quick", "first")
+    held = load_baseline(reports, "quick")
+    old = replace(held, rows=held.rows.select(*CELL, "realisation", *OLDEST_COLUMNS))
+    save_run(reports.baseline("quick"), old, BASELINE_ROWS)
+    found = load_baseline(reports, "quick")
+    assert "peak_snr" not in found.rows.columns
+    tonight = make_run(rows=make_rows().with_columns(peak_snr=pl.lit(9.0), error_deg=pl.col("error_deg") * (1 + 1e-9)))
+    verdict = judge(tonight, found, reports).verdict
+    assert verdict.state == "fine"
+    assert any("lacks" in note and "judged from the next accepted baseline on" in note for note in verdict.notes)
 
 
 @pytest.mark.parametrize(("reason", "said"), [("", "0 characters"), (" \n", "0 characters"), ("x" * 1001, "1001")])

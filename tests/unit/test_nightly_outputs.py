@@ -42,7 +42,7 @@ def test_the_same_night_gives_the_same_bytes(tmp_path, run):
 def test_json_holds_the_verdict(tmp_path, run):
     verdict = regression(run, notes=["Versions differ."])
     data = json.loads(written(tmp_path, run, verdict)["verdict.json"])
-    assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (1, "regression", 1, False)
+    assert (data["schema"], data["state"], data["exit_code"], data["bit_equal"]) == (2, "regression", 1, False)
     assert data["counts"] == {**dict.fromkeys(OUTCOMES, 0), "worse": 2, "same": 2, "better": 2, "equivalent": 2}
     assert data["notes"] == ["Versions differ."]
     assert data["run"] == RUN
@@ -83,7 +83,7 @@ def test_junit_counts_what_it_lists(run):
     for count in ("tests", "failures", "errors"):
         assert int(root.get(count)) == sum(int(suite.get(count)) for suite in root)
     (failure, *_) = suites["quick.first"].iter("failure")
-    assert failure.get("message") == "mean_deg: 1.1 deg, baseline 1 deg, margin 0.02 deg, p 0.0001 (Holm)"
+    assert failure.get("message") == "worse: mean_deg: 1.1 deg, baseline 1 deg, margin 0.02 deg, p 0.0001 (Holm)"
     (failed,) = suites["quick.canaries"].iter("failure")
     assert failed.get("message") == "axis_ratio = 0.2: must be 0.9 to 1.1"
 
@@ -176,7 +176,7 @@ def test_tables_are_whole(run):
 def test_the_counts_by_experiment(run):
     text = summary(judged(run, no_baseline()))
     assert "| first | 16 | 15 | 1 | 0 |" in text
-    assert "| second | 15 | 15 | 0 | 1 |" in text
+    assert "| second | 16 | 16 | 0 | 1 |" in text
 
 
 def test_a_huge_verdict_fits_a_comment(run):
@@ -227,3 +227,18 @@ def test_the_badge_tells_equal_bytes(run):
     fine = Verdict("fine", True, pl.DataFrame(schema=COMPARISONS), (), BASELINE)
     assert "fine, bit-equal" in badge(judged(run, fine))
     assert "bit-equal" not in badge(judged(run, dataclasses.replace(fine, bit_equal=False)))
+
+
+def test_causes_stand_first_and_changes_fail_their_cell(run):
+    changed = regression(run, outcomes=("changed", "same"))
+    verdict = dataclasses.replace(
+        changed, state="changed", causes=("cone_axis in first, plane: the law is 6 deg, was 1 deg.",)
+    )
+    text = summary(judged(run, verdict))
+    assert text.splitlines()[0] == f"## Nightly quick: changed: {verdict.unexplained.height} figures to explain"
+    assert text.splitlines()[2] == "- cone_axis in first, plane: the law is 6 deg, was 1 deg."
+    assert "### Changed, to be explained" in text
+    failures = list(ET.fromstring(junit(judged(run, verdict))).iter("failure"))
+    of_cells = [failure.get("message") for failure in failures][: verdict.unexplained.height]
+    assert all(message.startswith("changed: ") for message in of_cells)
+    assert "changed: " in badge(judged(run, verdict))

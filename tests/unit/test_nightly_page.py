@@ -14,6 +14,7 @@ import pytest
 from test_report import EVIL, make_item, make_rows
 
 from benchmarks.nights import history_of, run_of, verdict_of
+from simtest.nightly.gate.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.page.ladder_figures import FLOOR_DEG, ladder
 from simtest.nightly.page.run_tables import comparisons
@@ -23,6 +24,8 @@ from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun,
 from simtest.pages.chart_web import BUNDLE, packed
 from simtest.pages.style import colours
 from simtest.validation.results_table import SCHEMA
+from simtest.validation.worst import WorstCase
+from tests.unit.nightly_samples import make_run
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
 
@@ -175,14 +178,39 @@ def test_no_text_of_the_night_becomes_markup(tmp_path, night):
 
 @pytest.mark.parametrize(
     ("state", "told"),
-    [("fine", "Fine: nothing is worse"), ("no baseline", "No baseline:"), ("regression", "figures are worse than")],
+    [
+        ("fine", "Fine: nothing is worse"),
+        ("no baseline", "No baseline:"),
+        ("regression", "figures are worse than"),
+        ("changed", "Changed: nothing is worse, but "),
+    ],
 )
 def test_each_state_is_told(tmp_path, night, state, told):
     verdict = verdict_of(night, state=state)
     _, page = written(tmp_path, night, verdict)
     assert told in page.text
-    bit_equal = {"fine": "yes: all rows", "no baseline": "not known", "regression": "no: some rows"}[state]
+    bit_equal = {
+        "fine": "yes: all rows",
+        "no baseline": "not known",
+        "regression": "no: some rows",
+        "changed": "no: some rows",
+    }[state]
     assert bit_equal in page.text
+
+
+def test_the_causes_come_before_all_else(tmp_path, night):
+    cause = "cone_axis in overview, plane: the mean error is 3 deg, was 1 deg (worse)."
+    _, page = written(tmp_path, night, replace(verdict_of(night), causes=(cause, "<b>second</b>")))
+    assert page.text.index("Regression:") < page.text.index(cause) < page.text.index("Bit-equal")
+    assert "<b>second</b>" in page.text
+
+
+def test_a_first_night_has_one_line_and_no_table_of_what_is_new(tmp_path):
+    first = make_run()
+    text, page = written(tmp_path, first, compare(first, None))
+    assert "There is no baseline." in page.text
+    assert "no baseline has been accepted" in page.text
+    assert 'class="outcome new"' not in text
 
 
 def test_a_canary_alone_can_make_a_regression(tmp_path, night):
@@ -220,6 +248,25 @@ def test_a_gallery_file_that_is_none_is_told(tmp_path, night):
     broken.write_bytes(b"none")
     _, page = written(tmp_path / "page", night, verdict_of(night), gallery=(broken,))
     assert "worst-00.npz: not a gallery file" in page.text
+
+
+def test_a_worst_case_shows_what_was_before(tmp_path, night):
+    make_item(tmp_path / "worst-00.npz")
+    row = {
+        "experiment": "overview", "setting": "s", "realisation": 2, "estimator": "circle_pose", "true_id": 0,
+        "status": "ok", "error_deg": 0.25, "normal_x": 0.0, "normal_y": 0.0, "normal_z": -1.0,
+    }  # fmt: skip
+    before = pl.DataFrame([row, {**row, "realisation": 3, "error_deg": 7.0}])
+    case = WorstCase("overview", "s", 2, "circle_pose", "why")
+    judged = JudgedRun(
+        night, verdict_of(night), pl.DataFrame(), (tmp_path / "worst-00.npz",), cases=(case,), before=before
+    )
+    told = Page(write_nightly_page(tmp_path / "page", judged).read_text(encoding="utf-8")).text
+    assert "In the baseline: highlight 0: 0.25°" in told
+    assert "circle_pose (baseline)" in told
+    # A baseline of an older version has no normals.
+    older = write_nightly_page(tmp_path / "older", replace(judged, before=before.drop("normal_x")))
+    assert "In the baseline" not in Page(older.read_text(encoding="utf-8")).text
 
 
 def test_the_same_night_gives_the_same_page(tmp_path, night, history):

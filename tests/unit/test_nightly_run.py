@@ -31,7 +31,7 @@ from simtest.runtime.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.runner import definition
-from tests.unit.nightly_samples import STARTED, canary, make_run, regression
+from tests.unit.nightly_samples import STARTED, canary, make_rows, make_run, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -513,10 +513,13 @@ def test_the_command_prints_a_table_and_the_page(measured, here, tmp_path):
 def test_the_command_prints_what_is_worse(measured, here, monkeypatch):
     assert here()[0] == 0
     assert here("accept", "--reason", "first")[0] == 0
-    monkeypatch.setattr(verdict_module, "compare", lambda tonight, baseline: regression(tonight))
+    worse = make_run(rows=make_rows().with_columns(pl.col("error_deg") * 1.5))
+    measured[:] = [worse]
     code, output, _ = here()
     assert code == 1
-    assert "worse: first, plane, tilt_deg=0, cone_axis, mean_deg: 1.1 deg, baseline 1 deg" in output.splitlines()
+    told = [line for line in output.splitlines() if line.startswith(("cone_axis in ", "circle_pose in "))]
+    assert len(told) >= 4
+    assert any(" in first, plane, tilt_deg=" in line and " deg, was " in line for line in told)
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,29 @@ def test_workflows_pass_their_checkers(command):
     subprocess.run([program, *command[1:], *map(str, WORKFLOWS)], check=True, capture_output=True, timeout=60)
 
 
+@pytest.mark.parametrize("kept", ["11", "12", None])
+def test_the_history_outlasts_a_lost_cache(tmp_path, kept):
+    """The step's own script, with a command `gh` of ours: of nights 13, 12, 11 some have an artifact with a history."""
+    text = (ROOT / ".github" / "workflows" / "nightly.yml").read_text()
+    step = text[text.index("- name: Take up the history that an earlier night kept") :]
+    assert "cache-matched-key == ''" in step
+    script = re.search(r"run: \|\n((?: {10}.*\n)+)", step)[1]
+    gh = tmp_path / "bin" / "gh"
+    gh.parent.mkdir()
+    gh.write_text(f"""#!/bin/sh
+if [ "$2" = list ]; then echo 13; echo 12; echo 11; exit; fi
+[ "$3" = 13 ] && mkdir -p earlier/nightly && exit
+[ "$3" = "{kept}" ] || exit 1
+mkdir -p earlier/history/date=2026-01-01 && echo "$3" > earlier/history/date=2026-01-01/night
+""")
+    gh.chmod(0o755)
+    path = f"{gh.parent}:{os.environ['PATH']}"
+    subprocess.run(["bash", "-e", "-c", script], cwd=tmp_path, env={"PATH": path}, check=True, capture_output=True)
+    found = tmp_path / "reports" / "history" / "date=2026-01-01" / "night"
+    assert (found.read_text().strip() if found.exists() else None) == kept
+    assert not (tmp_path / "earlier").exists()
+
+
 def parsed(name):
     # A unit's keys may come twice and are case-sensitive.
     parser = configparser.RawConfigParser(strict=False, comment_prefixes=("#", ";"), delimiters=("=",))

@@ -1,21 +1,36 @@
 """The gate: tonight against the baseline."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
+from simtest.nightly.gate.causes import causes
+from simtest.nightly.gate.checks import inconsistent
 from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
-from simtest.nightly.gate.expectations import canaries, costs
+from simtest.nightly.gate.expectations import canaries, costs, rungs
 from simtest.nightly.gate.holm import holm
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.missing_results import digests, lost_highlights, missing_cells
-from simtest.nightly.gate.notes import large_and_undecided, notes_on, redefined
-from simtest.nightly.gate.pairing import pairing, pairs
+from simtest.nightly.gate.notes import large_and_undecided, notes_on, nothing_to_compare, redefined
+from simtest.nightly.gate.pairing import frames_taken, pairing, pairs, with_all_frames
 from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
-from simtest.nightly.gate.quantities import PENALISED, WHERE_MIXED, Quantity, harms, quantities
-from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict
+from simtest.nightly.gate.published import unlike_rows
+from simtest.nightly.gate.quantities import (
+    RESULT_COLUMNS,
+    SAME_AS,
+    WHERE_MIXED,
+    Quantity,
+    harms,
+    quantities,
+    told_twice,
+)
+from simtest.nightly.gate.single_results import moved
+from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict, to_explain
+from simtest.validation.results_table import SCHEMA
 
 DEFAULTS = Limits()
 
@@ -23,12 +38,12 @@ ROUNDING = 1e-12
 """Two figures of the same results that differ by less, as a share, are the same: sums may be taken in another order."""
 
 _WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
-"""Columns of comparisons before `_judged`: `better` is the p-value of the mirror image, `within` as in `Outcomes`; an
-outcome that is set already stands."""
+"""Columns of comparisons before `_judged`: `p` is that of a rise, `better` that of a fall, `within` as in `Outcomes`;
+an outcome that is set already stands."""
 
 
 def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = DEFAULTS) -> Verdict:
-    """Compare a run with the baseline, if there is one; canaries are judged all the same.
+    """Compare a run with the baseline, if there is one; canaries and the run's own consistency are judged all the same.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
     are the same, with all tests as one family (docs/gate.md).
@@ -36,32 +51,76 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
     Returns
     -------
     Verdict
-        "regression" where a comparison is worse, else "no baseline" or "fine". What tonight lacks (a cell, true
-        highlights of a cell whose seeds are the same, a canary) is worse.
+        "regression" where a comparison is worse, "changed" where one is better or has changed, else "no baseline" or
+        "fine". What tonight lacks (a cell, true highlights of a cell whose seeds are the same, a canary) is worse.
     """
     before = None if baseline is None else baseline.figures
-    same_machine = baseline is None or baseline.record.processor == tonight.record.processor
-    made = [canaries(tonight.figures, before), costs(tonight.figures, before, limits, same_machine)]
-    state, bit_equal = "no baseline", None
-    notes: tuple[str, ...] = ("There is no baseline: nothing but the canaries was judged.",)
+    same_machine = baseline is None or _machine(baseline.record) == _machine(tonight.record)
+    same_processor = baseline is None or baseline.record.processor == tonight.record.processor
+    made = [
+        canaries(tonight.figures, before),
+        costs(tonight.figures, before, limits, same_processor),
+        inconsistent(tonight.rows, None if baseline is None else baseline.rows),
+        unlike_rows(tonight.figures, tonight.rows),
+    ]
+    bit_equal, notes = None, nothing_to_compare(tonight)
     if baseline is not None:
-        state = "fine"
+        same_versions = _versions(baseline.record) == _versions(tonight.record)
         first, second = digests(baseline.figures), digests(tonight.figures)
         bit_equal = first.select(*CELL, "digest").equals(second.select(*CELL, "digest"))
         shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
         equal = pl.col("digest") == pl.col("digest_2")
         made += [
+            rungs(tonight.figures, baseline.figures, limits, same_versions),
             missing_cells(first, second),
             _same(shared.filter(equal).select(CELL), baseline.figures, tonight.figures, limits),
         ]
-        tested, unmatched, short = _tested(baseline, tonight, shared.filter(~equal).select(CELL), limits)
+        aligned, absent = _aligned(baseline, tonight)
+        tested, unmatched, short = _tested(*aligned, shared.filter(~equal).select(CELL), limits, same_machine)
         made += tested
-        notes = notes_on(baseline, tonight, bit_equal, unmatched, short, limits)
-    comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *made], how="diagonal_relaxed"), limits)
-    if (comparisons["outcome"] == "worse").any():
-        state = "regression"
+        notes = notes_on(baseline, tonight, bit_equal, unmatched, short, absent, limits)
+    held = [table for table in made if table.height]
+    comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *held], how="diagonal_relaxed"), limits)
+    if baseline is None:
+        # All would be new: nothing was compared.
+        comparisons = comparisons.filter(pl.col("outcome") != "new")
     notes += large_and_undecided(comparisons)
-    return Verdict(state, bit_equal, comparisons, notes, None if baseline is None else baseline.record)
+    record = None if baseline is None else baseline.record
+    found = causes(comparisons, tonight, baseline)
+    return Verdict(_state(comparisons, baseline), bit_equal, comparisons, notes, record, found)
+
+
+def _state(comparisons: pl.DataFrame, baseline: NightlyRun | None) -> str:
+    if (comparisons["outcome"] == "worse").any():
+        return "regression"
+    if baseline is None:
+        return "no baseline"
+    return "changed" if comparisons.filter(to_explain()).height else "fine"
+
+
+def _machine(record: RunRecord) -> tuple[str | None, ...]:
+    """Return what else than the code decides the last digits of a result."""
+    return record.processor, record.variant, record.llvm, record.python
+
+
+def _versions(record: RunRecord) -> dict[str, str]:
+    """Return the versions of the packages that numbers depend on."""
+    # simtest's own version does not count: the gate is there to judge it.
+    return {**record.versions, "simtest": ""}
+
+
+def _aligned(baseline: NightlyRun, tonight: NightlyRun) -> tuple[tuple[NightlyRun, NightlyRun], list[str]]:
+    """Return both runs with the columns that the gate reads, and the names of those that the baseline lacks.
+
+    What the baseline lacks is null in both: it is judged from the next accepted baseline on.
+    """
+    held = baseline.rows.columns
+    absent = [name for name in RESULT_COLUMNS if name not in held]
+    lacking = [pl.lit(None, SCHEMA[name]).alias(name) for name in absent]
+    if ON_INSTRUMENT not in held:
+        lacking.append(pl.lit(None, pl.Boolean()).alias(ON_INSTRUMENT))
+    both = [run.rows.with_columns(lacking) for run in (baseline, tonight)]
+    return (replace(baseline, rows=both[0]), replace(tonight, rows=both[1])), absent
 
 
 def _same(equal: pl.DataFrame, baseline: pl.DataFrame, tonight: pl.DataFrame, limits: Limits) -> pl.DataFrame:
@@ -96,7 +155,7 @@ def _same(equal: pl.DataFrame, baseline: pl.DataFrame, tonight: pl.DataFrame, li
 
 
 def _tested(
-    baseline: NightlyRun, tonight: NightlyRun, differing: pl.DataFrame, limits: Limits
+    baseline: NightlyRun, tonight: NightlyRun, differing: pl.DataFrame, limits: Limits, same_machine: bool
 ) -> tuple[list[pl.DataFrame], int, int]:
     """Compare cells whose results differ; return also how many are no pairs, and how many lost highlights."""
     if differing.is_empty():
@@ -106,14 +165,19 @@ def _tested(
     before, after = (harms(run.rows, cells) for run in (baseline, tonight))
     matched = pairing(before, after)
     comparable = _comparable(baseline.record, tonight.record, cells)
-    in_pairs = pl.col("cell").is_in(list(matched.cells & comparable))
-    # Choose the quantities and add up
-    without = _not_tested(pl.concat([before, after]))
-    chosen = [run.join(without, on=("cell", "quantity"), how="anti", maintain_order="left") for run in (before, after)]
-    of_pairs = paired_sums(pairs(*(run.filter(in_pairs) for run in chosen)))
-    of_each = [sums(run.filter(~in_pairs)) for run in chosen]
-    # Test
+    of_same_seeds = matched.cells & comparable
     made = [lost_highlights(matched.lost, cells, comparable)]
+    if same_machine:
+        own = cells.filter(pl.col("cell").is_in(list(of_same_seeds)))
+        made.append(moved(*(run.rows.join(own, on=CELL, how="semi") for run in (baseline, tonight))))
+    # Choose the quantities and add up
+    in_pairs = pl.col("cell").is_in(list(of_same_seeds))
+    without = _not_tested(pl.concat([before, after]), *(told_twice(run.rows, cells) for run in (baseline, tonight)))
+    chosen = [run.join(without, on=("cell", "quantity"), how="anti", maintain_order="left") for run in (before, after)]
+    taken = frames_taken(baseline.figures, tonight.figures, cells)
+    of_pairs = paired_sums(with_all_frames(pairs(*(run.filter(in_pairs) for run in chosen)), taken, before, after))
+    of_each = [sums(with_all_frames(run.filter(~in_pairs), taken, run)) for run in chosen]
+    # Test
     for name, quantity in quantities(limits).items():
         own = of_pairs.filter(pl.col("quantity") == name).sort("cell")
         first, second = _shared(*(table.filter(pl.col("quantity") == name) for table in of_each))
@@ -123,7 +187,7 @@ def _tested(
             names = table.select("cell").join(cells, on="cell", maintain_order="left").select(CELL)
             made.append(_compared(names, name, quantity, outcomes, method, quantity.unit))
             made += _pooled(names, name, quantity, outcomes, method)
-        if name != PENALISED and name not in WHERE_MIXED:
+        if name not in SAME_AS and name not in WHERE_MIXED:
             rest = cells.join(own, on="cell", how="anti").join(first, on="cell", how="anti").sort("cell")
             made.append(_untested(rest, name, quantity, before, after))
     return made, cells.height - len(matched.cells), matched.lost.height
@@ -131,24 +195,23 @@ def _tested(
 
 def _comparable(baseline: RunRecord, tonight: RunRecord, cells: pl.DataFrame) -> frozenset[int]:
     """Return the cells whose seeds mean the same in both runs: of the same definition, made by the same versions."""
-    # simtest's own version does not count: the gate is there to judge it.
-    first, second = ({**run.versions, "simtest": ""} for run in (baseline, tonight))
-    if first != second:
+    if _versions(baseline) != _versions(tonight):
         return frozenset()
-    moved = redefined(baseline, tonight)
-    return frozenset(cells.filter(~pl.col("experiment").is_in(moved))["cell"].to_list())
+    moved_on = redefined(baseline, tonight)
+    return frozenset(cells.filter(~pl.col("experiment").is_in(moved_on))["cell"].to_list())
 
 
-def _not_tested(harms: pl.DataFrame) -> pl.DataFrame:
+def _not_tested(harms: pl.DataFrame, *twice: pl.DataFrame) -> pl.DataFrame:
     """Return the cells and quantities of two runs' harms that are not tested.
 
-    Where all highlights are answered the penalised mean is the mean, and would be tested twice; an indicator of
+    A quantity that is another one in both runs would be tested twice (`twice`, of each run); an indicator of
     `WHERE_MIXED` is tested in the cells where it takes both values across the two runs.
     """
-    found = harms.group_by("cell", "quantity").agg(kinds=pl.col("value").n_unique(), most=pl.col("value").max())
-    answered = found.filter(pl.col("quantity") == "unanswered", pl.col("most") == 0)
+    found = harms.group_by("cell", "quantity").agg(kinds=pl.col("value").n_unique())
     alike = found.filter(pl.col("quantity").is_in(WHERE_MIXED), pl.col("kinds") == 1)
-    return pl.concat([answered.select("cell", quantity=pl.lit(PENALISED)), alike.select("cell", "quantity")])
+    first, second = twice
+    both = first.join(second, on=("cell", "quantity"), how="semi")
+    return pl.concat([both, alike.select("cell", "quantity")])
 
 
 def _shared(first: pl.DataFrame, second: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -213,27 +276,33 @@ def _untested(
 
 
 def _judged(made: pl.DataFrame, limits: Limits) -> pl.DataFrame:
-    """Correct the p-values, of one family, and settle the outcomes."""
-    # Correct both sides
+    """Correct the p-values, of one family of both sides, and settle the outcomes."""
+    # Correct both sides together: a fall is a finding as a rise is.
     family = made["p"].is_not_null().to_numpy()
     weights = _weights((made["setting"] == POOLED).fill_null(False).to_numpy()[family], limits.pooled_weight)
+    p = np.stack([made[name].to_numpy()[family] for name in ("p", "better")])
     corrected = np.full((2, made.height), np.nan)
-    for side, name in enumerate(("p", "better")):
-        corrected[side, family] = holm(made[name].to_numpy()[family], weights)
-    made = made.with_columns(p_holm=corrected[0], better=corrected[1]).with_columns(
-        pl.col("p_holm", "better").fill_nan(None)
+    corrected[:, family] = holm(p.ravel(), np.tile(weights, 2)).reshape(p.shape)
+    made = made.with_columns(rises=corrected[0], falls=corrected[1]).with_columns(
+        pl.col("rises", "falls").fill_nan(None)
     )
     # Settle
     margin = pl.col("margin")
     inside = (pl.col("low") >= -margin) & (pl.col("high") <= margin)
+    level = pl.col("quantity").is_in([name for name, own in quantities(limits).items() if own.level])
+    changed = pl.min_horizontal("rises", "falls") <= limits.alpha
     outcome = (
         pl.when(pl.col("outcome").is_not_null()).then("outcome")
-        .when(pl.col("p_holm") <= limits.alpha).then(pl.lit("worse"))
-        .when(pl.col("better") <= limits.alpha).then(pl.lit("better"))
+        .when(level & changed).then(pl.lit("changed"))
+        .when(pl.col("rises") <= limits.alpha).then(pl.lit("worse"))
+        .when(pl.col("falls") <= limits.alpha).then(pl.lit("better"))
         .when(inside.fill_null(False) | pl.col("within").fill_null(False)).then(pl.lit("equivalent"))
         .otherwise(pl.lit("undecided"))
     )  # fmt: skip
-    return made.with_columns(outcome=outcome).select(*COMPARISONS)
+    # Of both sides the surer one is shown.
+    fell = (pl.col("falls") < pl.col("rises")).fill_null(False)
+    shown = {"p": pl.when(fell).then("better").otherwise("p"), "p_holm": pl.when(fell).then("falls").otherwise("rises")}
+    return made.with_columns(outcome=outcome, **shown).select(*COMPARISONS)
 
 
 def _weights(is_pooled: np.ndarray, share: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Figures that are judged without a test: canaries, by their bounds, and costs, by their intervals."""
+"""Figures that are judged without a test: canaries by their bounds, costs by intervals, the ladder by a margin."""
 
 import polars as pl
 
@@ -45,13 +45,37 @@ def costs(
     return _both(tonight, baseline, "cost").select(*_compared(), margin=margin, outcome=outcome)
 
 
+def rungs(tonight: pl.DataFrame, baseline: pl.DataFrame, limits: Limits, same_versions: bool) -> pl.DataFrame:
+    """Compare the error ladder's rungs, by value: worse where one rose beyond the margin, or is missing tonight.
+
+    The ladder's seed is fixed, so that unchanged code gives its values again. With other versions of the packages the
+    noise may be another: intervals must then lie apart as well.
+    """
+    margin = pl.max_horizontal(limits.relative * _BEFORE.abs(), pl.lit(limits.absolute_deg))
+    difference = _VALUE - _BEFORE
+    above, below = pl.col("low") > pl.col("high_before"), pl.col("high") < pl.col("low_before")
+    apart = [pl.lit(True) if same_versions else side.fill_null(True) for side in (above, below)]
+    outcome = (
+        pl.when(_BEFORE.is_null()).then(pl.lit("new"))
+        .when(_VALUE.is_null()).then(pl.lit("worse"))
+        .when(_VALUE == _BEFORE).then(pl.lit("same"))
+        .when((difference > margin) & apart[0]).then(pl.lit("worse"))
+        .when((difference < -margin) & apart[1]).then(pl.lit("better"))
+        .when(difference.abs() <= margin).then(pl.lit("equivalent"))
+        .otherwise(pl.lit("undecided"))
+    )  # fmt: skip
+    found = _both(tonight, baseline, "ladder").filter(_VALUE.is_not_null() | _BEFORE.is_not_null())
+    return found.select(*_compared(), margin=margin, outcome=outcome).with_columns(method=pl.lit("ladder"))
+
+
 def _both(tonight: pl.DataFrame, baseline: pl.DataFrame | None, kind: str) -> pl.DataFrame:
     """Join the figures of a kind with the baseline's, `*_before`; values that are no number count as unknown."""
     numbers = pl.col("value", "low", "high").fill_nan(None)
     before = tonight.clear() if baseline is None else baseline
     before = before.filter(pl.col("kind") == kind).select(*_KEY, numbers.name.suffix("_before"))
     after = tonight.filter(pl.col("kind") == kind).with_columns(numbers)
-    return after.join(before, on=_KEY, how="full", coalesce=True, maintain_order="left_right")
+    # A name that does not apply, such as the surface of a rung, is null.
+    return after.join(before, on=_KEY, how="full", coalesce=True, nulls_equal=True, maintain_order="left_right")
 
 
 def _compared() -> list[pl.Expr]:

@@ -1,7 +1,7 @@
 """Figures of a run's rows by cell, and the hash of each cell's results."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import polars as pl
@@ -9,44 +9,62 @@ from scipy import stats
 
 from simtest.nightly.gate.quantities import RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
+from simtest.validation.results_table import SCHEMA
 from simtest.validation.statistics import CONFIDENCE, figures, student_interval
 
 DIGEST_KEYS = ("realisation", "true_id", "specularity", "seed")
 """Order of the rows within a cell."""
 
-DIGEST_NUMBERS = (
-    "error_deg", "error_oracle_deg", "error_look_deg", "error_law_deg", "n_candidates", "choice_margin", "rank_correct",
-    "normal_x", "normal_y", "normal_z", "truth_x", "truth_y", "truth_z", "bp_x_px", "bp_y_px", "bp_true_x_px",
-    "bp_true_y_px", "look_x_px", "look_y_px", "cov_11", "cov_12", "cov_22", "mahalanobis2", "distance_mm", "kd_min",
-    "kd_max", "eps_over_d", "peak_snr", "axis_ratio", "axis_ratio_law", "saturated_share", "gain_1", "gain_2",
-    "gain_error", "gain_oracle_error", "direction_error_deg",
-)  # fmt: skip
-"""Result columns that are hashed, in this order, beside keys and status; messages and names are not."""
+DIGEST_NUMBERS = tuple(
+    name for name, dtype in SCHEMA.items() if dtype != pl.String() and name not in ("realisation", *DIGEST_KEYS)
+)
+"""Result columns that are hashed, in this order, beside keys and status: all numbers."""
+
+DIGEST_NAMES = ("status", "laws", "target", "isovalues", "reflectance")
+"""Columns of names that are hashed. Flags are hashed of answers: those of failures are messages."""
+
+PLAIN_FIGURES = ("rms_deg", "std_deg", "median_deg", "p95_deg", "max_deg", "mean_oracle_deg", "mean_base_deg")
+"""Figures of `simtest.validation.statistics.Figures` that are published as they are."""
 
 
-def setting_figures(rows: pl.DataFrame) -> pl.DataFrame:
+Frames = Mapping[tuple[str, str], int]
+"""Number of frames by experiment and setting, those without a row included."""
+
+
+def setting_figures(rows: pl.DataFrame, frames: Frames | None = None) -> pl.DataFrame:
     """Compute the figures of a run's rows by cell.
 
     Parameters
     ----------
     rows : polars.DataFrame
         Columns of `simtest.validation.results_table.SCHEMA`.
+    frames : mapping, optional
+        How many frames were taken. Without it frames without a row, in which nothing is found and nothing is isolated,
+        are not known, and false detections are divided by those that have one.
 
     Returns
     -------
     polars.DataFrame
-        Columns `FIGURES`, kind "setting", in the order of the rows: of each cell `n` (true highlights), `n_ok`,
-        `failed`, `missed`, `unanswered` (shares of n), `false` (detections a frame), `mean_deg`, `median_deg`,
-        `p95_deg`, `mean_penalised_deg`, `coverage95`, `axis_ratio` (mean deviation from the law over the law, at most 1
-        a row) and `axis_ratio_median`. Unknown figures are left out.
+        Columns `FIGURES`, kind "setting", in the order of the rows: of each cell `frames`, `n` (true highlights),
+        `n_ok`, `failed`, `missed`, `unanswered` (shares of n), `false` (detections a frame), `mean_deg`, `rms_deg`,
+        `std_deg`, `median_deg`, `p95_deg`, `max_deg`, `mean_oracle_deg`, `mean_base_deg`, `mean_penalised_deg`,
+        `coverage95`, `axis_ratio` (mean deviation from the law over the law, at most 1 a row) and `axis_ratio_median`.
+        Unknown figures are left out.
     """
-    cells = rows.group_by(CELL, maintain_order=True)
-    return figure_table(figure for cell, own in cells for figure in _cell_figures(Cell(*cell), own))
+    # Where surfaces share a setting's name, each has some of its frames.
+    shared = rows.group_by("experiment", "setting").agg(pl.col("surface").n_unique()).filter(pl.col("surface") > 1)
+    several = set(shared.select("experiment", "setting").iter_rows())
+    known = {key: count for key, count in (frames or {}).items() if key not in several}
+    cells, hashes = rows.group_by(CELL, maintain_order=True), digests_of(rows)
+    return figure_table(
+        figure
+        for cell, own in ((Cell(*names), own) for names, own in cells)
+        for figure in _cell_figures(cell, own, known.get((cell.experiment or "", cell.setting or ""), 0), hashes[cell])
+    )
 
 
-def _cell_figures(cell: Cell, rows: pl.DataFrame) -> Iterator[Figure]:
-    """Yield the known figures of one cell."""
-    hashed = digest(rows)
+def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> Iterator[Figure]:
+    """Yield the known figures of one cell, of which so many frames are known to have been taken."""
 
     def figure(
         quantity: str, unit: str, value: float | None, n: int,
@@ -61,8 +79,9 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame) -> Iterator[Figure]:
         return figure(quantity, "", count / n, n, _share_interval(count, n), f"{count} of {n}")
 
     # Counts and shares
-    found, frames = figures(rows), rows["realisation"].n_unique()
+    found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
     n, n_ok, missed, failed = found.n, found.n_ok, found.n_missed, sum(found.n_failed_by_reason.values())
+    yield from figure("frames", "", frames, frames)
     yield from figure("n", "", n, n)
     yield from figure("n_ok", "", n_ok, n)
     if n:
@@ -72,9 +91,11 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame) -> Iterator[Figure]:
     yield from figure("false", "a frame", found.n_false / frames, frames)
     # Errors
     yield from figure("mean_deg", "deg", found.mean_deg, n_ok, found.ci95_deg)
-    yield from figure("median_deg", "deg", found.median_deg, n_ok)
-    yield from figure("p95_deg", "deg", found.p95_deg, n_ok)
+    for name in PLAIN_FIGURES:
+        yield from figure(name, "deg", getattr(found, name), n_ok)
     yield from figure("mean_penalised_deg", "deg", found.mean_penalised_deg, n)
+    if found.n_instrument is not None:
+        yield from figure("n_instrument", "", found.n_instrument, rows.height)
     if found.coverage95 is not None:
         stated = _results_with_region(rows)
         yield from share("coverage95", round(found.coverage95 * stated), stated)
@@ -101,17 +122,37 @@ def _share_interval(count: int, n: int) -> tuple[float, float]:
 
 
 def digest(rows: pl.DataFrame) -> str:
-    """Hash a cell's results, rows in any order: equal for two runs exactly where all numbers are the same bytes.
+    """Hash the results of one cell; see `digests_of`."""
+    nameless = rows.with_columns(pl.lit("").alias(name) for name in CELL)
+    return digests_of(nameless).get(Cell(), "")
 
-    SHA-256, hexadecimal, over the rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the numbers
-    as float64, little-endian, and the status. A column that is absent counts as null.
+
+def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:
+    """Hash each cell's results, rows in any order: equal for two runs exactly where all numbers are the same bytes.
+
+    SHA-256, hexadecimal, over the cell's rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the
+    numbers as float64, little-endian, the names, and the flags of answers. A column that is absent counts as null.
     """
-    ordered = rows.sort(*DIGEST_KEYS, nulls_last=True)
-    found = hashlib.sha256(f"{ordered.height} {DIGEST_KEYS} {DIGEST_NUMBERS}".encode())
+    held = rows.sort(*CELL, *DIGEST_KEYS, nulls_last=True)
+    parts = []
     for names, kind, dtype in ((DIGEST_KEYS, pl.Int64, "<i8"), (DIGEST_NUMBERS, pl.Float64, "<f8")):
-        columns = [(pl.col(name) if name in ordered.columns else pl.lit(None)).cast(kind).alias(name) for name in names]
-        table = ordered.select(columns)
-        found.update(np.ascontiguousarray(table.select(pl.all().is_null()).to_numpy()).tobytes())
-        found.update(np.ascontiguousarray(table.fill_null(0).to_numpy(), dtype=dtype).tobytes())
-    found.update("\n".join(ordered["status"].fill_null("").to_list()).encode())
-    return found.hexdigest()
+        columns = [_column(held, name).cast(kind).alias(name) for name in names]
+        table = held.select(columns)
+        parts.append(np.ascontiguousarray(table.select(pl.all().is_null()).to_numpy()))
+        parts.append(np.ascontiguousarray(table.fill_null(0).to_numpy(), dtype=dtype))
+    flags = pl.when(pl.col("status") == "ok").then(_column(held, "flags")).alias("flags")
+    texts = held.select(*(_column(held, name).alias(name) for name in DIGEST_NAMES), flags).fill_null("").rows()
+    cells = held.with_row_index("row").group_by(CELL, maintain_order=True).agg(first="row").rows()
+    made = {}
+    for *cell, index in cells:
+        own = slice(index[0], index[-1] + 1)
+        found = hashlib.sha256(f"{len(index)} {DIGEST_KEYS} {DIGEST_NUMBERS} {DIGEST_NAMES}".encode())
+        for part in parts:
+            found.update(part[own].tobytes())
+        found.update(repr(texts[own]).encode())
+        made[Cell(*cell)] = found.hexdigest()
+    return made
+
+
+def _column(table: pl.DataFrame, name: str) -> pl.Expr:
+    return pl.col(name) if name in table.columns else pl.lit(None)

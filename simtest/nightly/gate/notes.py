@@ -1,10 +1,15 @@
 """Notes of a verdict: in what two runs differ beside the comparisons."""
 
+from collections.abc import Sequence
+
 import polars as pl
 
+from simtest.errors import Reason
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, KEY
 from simtest.nightly.records import CELL, POOLED, NightlyRun, RunRecord
+
+NO_CONTOUR = str(Reason.NO_CLOSED_ISOPHOTE)
 
 _FAR, _FAR_DEG = 10, 1.0
 """A rise by so many margins and so many degrees is reported even where nothing can be decided."""
@@ -31,12 +36,18 @@ def large_and_undecided(comparisons: pl.DataFrame) -> tuple[str, ...]:
 
 
 def notes_on(
-    baseline: NightlyRun, tonight: NightlyRun, bit_equal: bool, unmatched: int, short: int, limits: Limits
+    baseline: NightlyRun,
+    tonight: NightlyRun,
+    bit_equal: bool,
+    unmatched: int,
+    short: int,
+    absent: Sequence[str],
+    limits: Limits,
 ) -> tuple[str, ...]:
     """Report in what two runs differ beside their numbers, in plain sentences.
 
     `unmatched` counts the cells whose results differ and whose rows are no exact pairs, `short` those that have lost
-    highlights of the baseline.
+    highlights of the baseline, `absent` names columns that the baseline lacks.
     """
     before, after = baseline.record, tonight.record
     first, second = before.versions, after.versions
@@ -56,9 +67,23 @@ def notes_on(
         made.append(f"Seeds or rows of {unmatched} cells differ from the baseline's: these were compared unpaired.")
     if short:
         made.append(f"In {short} cells highlights of the baseline are missing tonight, in frames of the same seeds.")
+    if absent:
+        made.append(
+            f"The baseline, of an older version, lacks {len(absent)} columns of results (such as {absent[0]}): what is "
+            "made of them is judged from the next accepted baseline on."
+        )
     if not bit_equal:
         made += _numbers(baseline, tonight, limits)
     return tuple(note for note in made if note)
+
+
+def nothing_to_compare(tonight: NightlyRun) -> tuple[str, ...]:
+    """Return the note of a run without a baseline: what was judged all the same."""
+    count, agree = tonight.figures_of("canary").height, "whether the results agree with each other"
+    if not count:
+        return (f"There is no baseline. Judged was {agree}; canaries were not measured.",)
+    canaries = "canary" if count == 1 else "canaries"
+    return (f"There is no baseline. Judged were the {count} {canaries}, and {agree}.",)
 
 
 def _changed(what: str, before: str | None, after: str | None, consequence: str = "") -> str:
@@ -79,23 +104,31 @@ def _numbers(baseline: NightlyRun, tonight: NightlyRun, limits: Limits) -> list[
             f"Medians agree to {limits.medians_deg:g} deg in {int((apart <= limits.medians_deg).sum())} of "
             f"{both.height} cells; they differ by {float(apart.to_numpy().max()):.2g} deg at most."
         )
-    # Status by highlight: isophotes that opened, highlights that are no longer found
+    # Status by highlight: of the same seeds and definition, what changed is the code's.
     first, second = (
         rows.filter(IS_TRUE).select(*KEY, "status", answered=ANSWERED).unique(KEY, keep="first") for rows in tables
     )
     both = first.join(second, on=KEY, suffix="_2")
     before, after = pl.col("answered"), pl.col("answered_2")
     other = pl.col("status").ne_missing(pl.col("status_2"))
-    status, lost, gained = both.select(status=other, lost=before & ~after, gained=after & ~before).sum().row(0)
+    # Only isophotes that open change a contour's topology; other reasons are named for what they are.
+    opened = other & (before | after) & pl.any_horizontal(pl.col("status", "status_2") == NO_CONTOUR)
+    counts = both.select(
+        status=other, lost=before & ~after, gained=after & ~before, opened=opened,
+        missed=pl.any_horizontal(pl.col("status", "status_2") == "missed") & other,
+    ).sum()  # fmt: skip
+    status, lost, gained, open_now, missed = counts.row(0)
     # Detections by frame
     frame = ("experiment", "setting", "realisation", "seed")
     first, second = (rows.group_by(frame).agg(found=pl.col("specularity").drop_nulls().n_unique()) for rows in tables)
     frames = first.join(second, on=frame, suffix="_2")
     detections = frames.filter(pl.col("found") != pl.col("found_2")).height
     if both.height:
+        why = f" In {open_now} of them an isophote opened or closed." if open_now else ""
+        why += f" In {missed} of them the highlight was detected in one run alone." if missed else ""
         made.append(
             f"Of {both.height} pairs of results {status} differ in status, {lost} of them answered in the baseline "
             f"alone and {gained} tonight alone; of {frames.height} frames {detections} have another number of "
-            "detections: contours that changed topology."
+            f"detections.{why}"
         )
     return made

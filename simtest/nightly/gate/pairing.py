@@ -6,6 +6,7 @@ import polars as pl
 
 from simtest.nightly.gate.pairing_units import UNIT
 from simtest.nightly.gate.quantities import PENALISED
+from simtest.nightly.records import CELL
 
 _FALSE = pl.col("quantity") == "false"
 
@@ -61,3 +62,40 @@ def pairs(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
     frames = frames.join(second.filter(_FALSE), on=UNIT, how="full", coalesce=True, maintain_order="left_right")
     frames = frames.with_columns(pl.col("baseline", "tonight").fill_null(0.0))
     return pl.concat([table.select(*UNIT, "baseline", "tonight") for table in (rows, frames)])
+
+
+def frames_taken(first: pl.DataFrame, second: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
+    """Return how many frames were taken of some cells, the fewer of two runs: `cell`, `frames`.
+
+    Cells of which a run does not know it are left out. `cells` numbers the names of the cells as `cell`.
+    """
+    held = [
+        run.filter(pl.col("kind") == "setting", pl.col("quantity") == "frames").select(
+            *CELL, pl.col("value").alias(name)
+        )
+        for run, name in ((first, "before"), (second, "after"))
+    ]
+    found = cells.join(held[0], on=CELL).join(held[1], on=CELL)
+    return found.select("cell", frames=pl.min_horizontal("before", "after").cast(pl.Int64))
+
+
+def with_all_frames(values: pl.DataFrame, frames: pl.DataFrame, *rows: pl.DataFrame) -> pl.DataFrame:
+    """Add a value of 0 for the false detections of each frame that has no row.
+
+    Parameters
+    ----------
+    values : polars.DataFrame
+        `UNIT`, and numbers by run.
+    frames : polars.DataFrame
+        See `frames_taken`.
+    rows : polars.DataFrame
+        `harms` that hold all frames with rows.
+    """
+    held = values.filter(_FALSE).select("cell").unique()
+    numbered = frames.join(held, on="cell", how="semi").select("cell", realisation=pl.int_ranges("frames"))
+    numbered = numbered.explode("realisation").drop_nulls().cast({"realisation": values.schema["realisation"]})
+    for table in rows:
+        numbered = numbered.join(table, on=("cell", "realisation"), how="anti", maintain_order="left")
+    constants = {name: 0.0 for name in ("value", "baseline", "tonight") if name in values.columns}
+    empty = numbered.with_columns(quantity=pl.lit("false"), **{name: pl.lit(v) for name, v in constants.items()})
+    return pl.concat([values, empty], how="diagonal_relaxed") if empty.height else values

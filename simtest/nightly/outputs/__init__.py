@@ -13,7 +13,7 @@ from simtest.nightly.phrases import headline
 from simtest.nightly.records import JudgedRun
 from simtest.runtime.files import write_atomically, write_json
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 FILES = VERDICT, JUNIT, SUMMARY, BADGE = "verdict.json", "junit.xml", "summary.md", "badge.svg"
 """Names of the files, which lie beside the page."""
@@ -36,6 +36,7 @@ def _verdict_json(judged: JudgedRun) -> dict[str, Any]:
         "exit_code": verdict.exit_code,
         "headline": headline(verdict),
         "bit_equal": verdict.bit_equal,
+        "causes": list(verdict.causes),
         "notes": list(verdict.notes),
         "run": run.record.to_json(),
         "baseline": None if verdict.baseline is None else verdict.baseline.to_json(),

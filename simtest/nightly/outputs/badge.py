@@ -6,7 +6,7 @@ from simtest.nightly.phrases import headline
 from simtest.nightly.records import JudgedRun
 
 # White on these has a contrast of 4.5 or more (WCAG AA).
-COLOURS = {"fine": "#1a7f37", "regression": "#c62828", "no baseline": "#5f6368"}
+COLOURS = {"fine": "#1a7f37", "changed": "#9a6700", "regression": "#c62828", "no baseline": "#5f6368"}
 _LEFT = "#444444"
 
 _CHARACTER_PX, _PADDING_PX, _HEIGHT_PX = 7.0, 10.0, 20

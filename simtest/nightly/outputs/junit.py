@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import polars as pl
 
 from simtest.nightly.phrases import cell_name, joined, plain
-from simtest.nightly.records import CELL, JudgedRun
+from simtest.nightly.records import CELL, JudgedRun, to_explain
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 has no way to write."""
@@ -26,7 +26,8 @@ class _Case(NamedTuple):
 def junit(judged: JudgedRun) -> str:
     """Return the report as XML text.
 
-    A cell fails where one of its figures is worse, and is skipped where there is nothing to compare it with.
+    A cell fails where one of its figures is worse or must be explained, and is skipped where there is nothing to
+    compare it with.
     """
     record = judged.run.record
     # A suite an experiment, then the canaries
@@ -73,13 +74,14 @@ def _judgement(comparisons: pl.DataFrame | None) -> tuple[str | None, str | None
     """Return why a cell failed, and why it was skipped."""
     if comparisons is None:
         return None, "nothing to compare with"
-    worse = [
-        f"{row['quantity']}: {plain(row['tonight'], row['unit'])}, baseline {plain(row['baseline'], row['unit'])}, "
+    findings = [
+        f"{row['outcome']}: {row['quantity']}: {plain(row['tonight'], row['unit'])}, "
+        f"baseline {plain(row['baseline'], row['unit'])}, "
         f"margin {plain(row['margin'], row['unit'])}, p {plain(row['p_holm'])} (Holm)"
-        for row in comparisons.filter(pl.col("outcome") == "worse").iter_rows(named=True)
+        for row in comparisons.filter((pl.col("outcome") == "worse") | to_explain()).iter_rows(named=True)
     ]
-    if worse:
-        return "\n".join(worse), None
+    if findings:
+        return "\n".join(findings), None
     if comparisons["outcome"].is_in(["new", "gone"]).all():
         return None, f"the cell is {comparisons['outcome'][0]}"
     return None, None

@@ -20,12 +20,15 @@ def summary(judged: JudgedRun) -> str:
     notes = [f"- {escaped(note)}" for note in verdict.notes[:MAX_NOTES]]
     if len(verdict.notes) > MAX_NOTES:
         notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
+    causes = [f"- {escaped(cause)}" for cause in verdict.causes]
     parts = [
         f"## Nightly {escaped(record.profile)}: {headline(verdict)}",
+        *(["\n".join(causes)] if causes else []),
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),
         *_changes("Worse", judged.with_outcome("worse")),
         *_canaries(judged.run.failed_canaries),
+        *_changes("Changed, to be explained", judged.with_outcome("changed")),
         *_changes("Better", judged.with_outcome("better")),
         "### By experiment",
         _by_experiment(judged),

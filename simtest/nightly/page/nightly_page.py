@@ -66,6 +66,7 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         mark=phrases.MARKS[verdict.state],
         headline=phrases.headline_sentence(judged),
         lines=phrases.verdict_lines(judged),
+        causes=verdict.causes,
         notes=[*verdict.notes, *unread],
         counts=phrases.counts(verdict),
         compared=tables.comparisons(verdict),
@@ -103,11 +104,12 @@ def _estimators(judged: JudgedRun, items: Iterable[GalleryItem], past: Trends | 
 
 
 def _trend_data(past: Trends, verdict: Verdict, colours: dict[str, str]) -> str:
-    """Return what the page's script needs of the trends, packed; they open with the first regression, if any."""
+    """Return what the page's script needs of the trends, packed; they open with the first finding, if any."""
     names = ("experiment", "quantity", "setting")
+    findings = pl.concat([verdict.regressions, verdict.unexplained])
     data = past.data | {
         "colours": [colours[name] for name in past.data["names"]["estimator"]],
-        "start": next(verdict.regressions.select(names).iter_rows(named=True), dict.fromkeys(names)),
+        "start": next(findings.select(names).iter_rows(named=True), dict.fromkeys(names)),
         "baseline": None if verdict.baseline is None else verdict.baseline.started,
         "median": MEDIAN,
     }

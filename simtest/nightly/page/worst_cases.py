@@ -1,20 +1,66 @@
-"""The worst cases: frames with overlays, each with the command that makes it again."""
+"""The worst cases: frames with overlays, before and after, each with the command that makes it again."""
 
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import polars as pl
 
 from simtest.errors import InputError
 from simtest.nightly.records import JudgedRun
-from simtest.report.run_folder import GalleryItem, read_item
+from simtest.report.run_folder import GalleryItem, KeptEstimate, read_item
+
+if TYPE_CHECKING:
+    from simtest.validation.worst import WorstCase
 
 MOST_CASES = 12
 
+_NORMAL = ("normal_x", "normal_y", "normal_z")
+_NEEDED = ("experiment", "setting", "realisation", "estimator", "true_id", "status", "error_deg", *_NORMAL)
+
 
 def read_cases(judged: JudgedRun) -> tuple[list[GalleryItem], list[str]]:
-    """Read the gallery items; returns those that can be read, and a line for each that cannot."""
+    """Read the gallery items; returns those that can be read, and a line for each that cannot.
+
+    To the answers of tonight those of the baseline are added, of the estimator that missed: the picture shows what was
+    and what is.
+    """
     items, lines = [], []
-    for path in judged.gallery[:MOST_CASES]:
+    paths = judged.gallery[:MOST_CASES]
+    for path, case in zip_longest(paths, judged.cases[: len(paths)]):
         try:
-            items.append(read_item(Path(path)))
+            item = read_item(Path(path))
         except InputError as error:
             lines.append(str(error))
+            continue
+        items.append(item if case is None else _with_baseline(item, case, judged.before))
     return items, lines
+
+
+def _with_baseline(item: GalleryItem, case: "WorstCase", before: pl.DataFrame) -> GalleryItem:
+    """Return an item with the baseline's answers at the true highlights of its frame."""
+    if not set(_NEEDED) <= set(before.columns):
+        return item
+    was = tuple(_answers(case, before))
+    if not was:
+        return item
+    told = "; ".join(f"highlight {one.true_id}: {one.result}" for one in was)
+    meta = item.meta
+    why = f"{meta.why} In the baseline: {told}.".strip()
+    return replace(item, meta=meta.model_copy(update={"estimates": (*meta.estimates, *was), "why": why}))
+
+
+def _answers(case: "WorstCase", before: pl.DataFrame) -> Iterator[KeptEstimate]:
+    own = before.filter(
+        pl.col("experiment") == case.experiment, pl.col("setting") == case.setting,
+        pl.col("realisation") == case.realisation, pl.col("estimator") == case.estimator,
+        pl.col("true_id").is_not_null(),
+    )  # fmt: skip
+    for row in own.select(_NEEDED).iter_rows(named=True):
+        normal = tuple(row[name] for name in _NORMAL)
+        yield KeptEstimate(
+            estimator=f"{case.estimator} (baseline)", status=row["status"], true_id=row["true_id"],
+            normal=None if None in normal else normal, error_deg=row["error_deg"],
+        )  # fmt: skip

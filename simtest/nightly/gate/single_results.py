@@ -1,0 +1,130 @@
+"""Single results of the same seeds, versions and machine: each is compared with itself.
+
+Unchanged code gives the same result again, to the last digits. So no test is needed: a result that moved by more than
+rounding could move it was moved by the code, and a night that holds one has changed.
+"""
+
+from typing import NamedTuple
+
+import polars as pl
+
+from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, REGION_DEG, is_false
+from simtest.nightly.records import CELL
+
+
+class Step(NamedTuple):
+    """How far a number may move: both parts must be exceeded, `share` as a share of the smaller of both values."""
+
+    value: pl.Expr
+    unit: str
+    absolute: float
+    share: float
+    of_answers: bool = True  # compared where both runs answered; else for every true highlight
+
+
+STEPS = {
+    "error": Step(pl.col("error_deg"), "deg", 0.01, 1.0),
+    "better error": Step(pl.col("error_oracle_deg"), "deg", 0.01, 1.0),
+    "law": Step(pl.col("error_law_deg"), "deg", 0.01, 0.02),
+    "region": Step(REGION_DEG, "deg", 0.002, 0.5),
+    "noise part": Step(pl.col("budget_noise_deg"), "deg", 0.002, 0.5),
+    "axis ratio": Step(pl.col("axis_ratio"), "", 0.02, 0.05),
+    "gain error": Step(pl.col("gain_error"), "", 0.05, 1.0),
+    "direction": Step(pl.col("direction_error_deg"), "deg", 1.0, 1.0),
+    "light": Step(pl.col("eps_over_d"), "", 1e-6, 1e-3, of_answers=False),
+    "peak": Step(pl.col("peak_snr"), "", 0.1, 0.02, of_answers=False),
+    "distance": Step(pl.col("distance_mm"), "mm", 1e-4, 1e-4, of_answers=False),
+    "curvature": Step(pl.col("kd_min"), "", 1e-4, 1e-3, of_answers=False),
+    "larger curvature": Step(pl.col("kd_max"), "", 1e-4, 1e-3, of_answers=False),
+}  # fmt: skip
+"""Numbers of a result by name. Other rounding moved errors by 3.2e-5 deg at most (docs/gate.md)."""
+
+SINGLE = "single"
+"""Method of these comparisons."""
+
+_KEY = (*CELL, "realisation", "true_id", "seed")
+_LOST_HALF = 0.5
+
+
+def moved(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    """Compare the results of two runs one by one, as comparisons; a row for each cell and number that moved.
+
+    Parameters
+    ----------
+    before, after : polars.DataFrame
+        Rows of cells whose seeds mean the same in both runs, of the same columns.
+
+    Returns
+    -------
+    polars.DataFrame
+        `n` counts the results that moved; `baseline` and `tonight` are those of the one that moved farthest, of the
+        status the numbers of answers, of flags those of answers with a flag, of false detections their numbers.
+        "worse" where half of a cell's answers are lost, else "changed".
+    """
+    chosen = (*_KEY, "answered", "status", "flags", *STEPS)
+    first, second = (
+        rows.filter(IS_TRUE).with_columns(
+            answered=ANSWERED, **{name: step.value.cast(pl.Float64) for name, step in STEPS.items()}
+        ).select(chosen).unique(_KEY, keep="first", maintain_order=True)
+        for rows in (before, after)
+    )  # fmt: skip
+    both = first.join(second, on=_KEY, suffix="_2", nulls_equal=True, maintain_order="left")
+    made = [_status(both), _flags(both), _false(before, after), *(_number(both, *item) for item in STEPS.items())]
+    return pl.concat(made, how="diagonal").with_columns(method=pl.lit(SINGLE), margin=pl.lit(0.0))
+
+
+def _told(found: pl.DataFrame, quantity: str, unit: str, outcome: pl.Expr | None = None) -> pl.DataFrame:
+    """Return comparisons of cells, with `n`, `baseline` and `tonight`; those without a moved result are left out."""
+    return found.filter(pl.col("n") > 0).select(
+        *CELL, quantity=pl.lit(quantity), unit=pl.lit(unit), n=pl.col("n").cast(pl.Int64),
+        baseline=pl.col("baseline").cast(pl.Float64), tonight=pl.col("tonight").cast(pl.Float64),
+        difference=pl.col("tonight").cast(pl.Float64) - pl.col("baseline").cast(pl.Float64),
+        outcome=pl.lit("changed") if outcome is None else outcome,
+    )  # fmt: skip
+
+
+def _status(both: pl.DataFrame) -> pl.DataFrame:
+    before, after = pl.col("answered"), pl.col("answered_2")
+    found = both.group_by(CELL, maintain_order=True).agg(
+        n=pl.col("status").ne_missing(pl.col("status_2")).sum(), baseline=before.sum(), tonight=after.sum(),
+        lost=(before & ~after).sum(),
+    )  # fmt: skip
+    many = (pl.col("lost") > 0) & (pl.col("lost") >= _LOST_HALF * pl.col("baseline"))
+    return _told(found, "single answers", "", pl.when(many).then(pl.lit("worse")).otherwise(pl.lit("changed")))
+
+
+def _flags(both: pl.DataFrame) -> pl.DataFrame:
+    answered = both.filter(pl.col("answered") & pl.col("answered_2"))
+    was, now = (pl.col(name).fill_null("") for name in ("flags", "flags_2"))
+    found = answered.group_by(CELL, maintain_order=True).agg(
+        n=(was != now).sum(), baseline=(was != "").sum(), tonight=(now != "").sum()
+    )
+    return _told(found, "single flags", "")
+
+
+def _false(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    frame = (*CELL, "realisation")
+    first, second = (
+        rows.group_by(frame, maintain_order=True).agg(found=is_false(rows).sum().cast(pl.Int64))
+        for rows in (before, after)
+    )
+    both = first.join(second, on=frame, how="full", coalesce=True, suffix="_2", maintain_order="left_right")
+    was, now = pl.col("found").fill_null(0), pl.col("found_2").fill_null(0)
+    found = both.group_by(CELL, maintain_order=True).agg(n=(was != now).sum(), baseline=was.sum(), tonight=now.sum())
+    return _told(found, "single false", "")
+
+
+def _number(both: pl.DataFrame, name: str, step: Step) -> pl.DataFrame:
+    was, now = pl.col(name), pl.col(f"{name}_2")
+    compared = both.filter(pl.col("answered") & pl.col("answered_2")) if step.of_answers else both
+    size = (now - was).abs()
+    far = (size > step.absolute) & (size > step.share * pl.min_horizontal(was.abs(), now.abs()))
+    # A number that appears or vanishes has moved as well.
+    far = far.fill_null(False) | (was.is_finite().fill_null(False) != now.is_finite().fill_null(False))
+    marked = compared.with_columns(far=far, size=size.fill_nan(None).fill_null(float("inf")))
+    worst = pl.col("size").filter("far").arg_max()
+    found = marked.group_by(CELL, maintain_order=True).agg(
+        n=pl.col("far").sum(), baseline=was.filter("far").get(worst, null_on_oob=True),
+        tonight=now.filter("far").get(worst, null_on_oob=True),
+    )  # fmt: skip
+    return _told(found, f"single {name}", step.unit)
