@@ -78,7 +78,7 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
         # Canaries first: a fault that they see is known before the experiments run.
         if profile.canaries:
             steps.show("canaries")
-            figures += [run_canaries(None, options.variant), or_failed_canary("error ladder", _ladder)]
+            figures += [run_canaries(None, options.variant), or_failed_canary("error ladder", measured_ladder)]
         before = time.monotonic()
         runs = run_experiments(
             [(experiment, folder / experiment.name) for experiment in experiments], options.command, options.variant,
@@ -115,7 +115,8 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
     return NightlyRun(record, rows, pl.concat([table.select(*FIGURES) for table in figures]))
 
 
-def _ladder() -> pl.DataFrame:
+def measured_ladder() -> pl.DataFrame:
+    """Measure the error ladder; return its figures and its canary."""
     figures = ladder_figures()
     return pl.concat([figures, ladder_canary(figures)])
 

@@ -56,6 +56,16 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Figure]:
     ]
 
 
+def protocol_noise() -> list[Figure]:
+    """Measure the noise that the published protocol adds to its picture."""
+    pipeline = Pipeline(PaperSetting(sigma=SIGMA), {})
+    made = pipeline.stages(from_integer(60))
+    left, count = float(np.std(made.noisy - made.clean)), made.clean.size
+    about = f"{SIGMA:g} within 5 standard errors"
+    bounds = _around(SIGMA, 5 * SIGMA / np.sqrt(2 * count))
+    return [canary("noise", "protocol_sigma", "", left, *bounds, count, about)]
+
+
 def published() -> list[Figure]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)

@@ -1,0 +1,100 @@
+"""One mutant, planted in a process of its own: `python -m studies.mutants.child STAGE NAME [FOLDER]` prints one line.
+
+Stages: canaries; night, which also wants the folder that holds the unchanged night, and makes that of "unchanged".
+"""
+
+import json
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from simtest.nightly.canaries import measures
+from simtest.nightly.canaries.canary import or_failed_canary
+from simtest.nightly.measure import measured_ladder
+from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
+from studies.gate.faults import planted
+from studies.mutants.catalogue import BY_NAME, UNCHANGED
+from studies.mutants.kinds import measures_of, naming
+from studies.mutants.mutant import Mutant
+
+PROFILE = "quick"
+
+
+LADDER = "error_ladder"
+"""What measures the ladder and its canaries, beside `simtest.nightly.canaries.measures`."""
+
+
+def canaries_of(mutant: Mutant) -> dict[str, Any]:
+    """Return the canaries that fail under a mutant, as [name, quantity, value].
+
+    Those that should name it are asked first; where they do the others are left out.
+    """
+    first = measures_of(mutant.kind)
+    failed: list[list[Any]] = []
+    with planted(*mutant.mutations()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        all_measures = {**measures(), LADDER: measured_ladder}
+        for some in (first, [name for name in all_measures if name not in first]):
+            figures = [or_failed_canary(name, all_measures[name]) for name in some]
+            dead = pl.concat([pl.DataFrame(schema=FIGURES), *figures]).filter(
+                pl.col("kind") == "canary", ~pl.col("passed").fill_null(False)
+            )
+            failed += [list(row) for row in dead.select("experiment", "quantity", "value").iter_rows()]
+            if naming(mutant.kind, [name for name, *_ in failed]):
+                break
+    return {"failed": failed}
+
+
+def night_of(mutant: Mutant, folder: Path) -> dict[str, Any]:
+    """Make the quick night under a mutant, and return what the gate calls worse against the unchanged one.
+
+    The night runs in this one process, since others would not have the fault.
+    """
+    from simtest.errors import SimtestError
+    from simtest.nightly.gate.compare import compare
+    from simtest.nightly.measure import RunOptions, measure_run
+    from simtest.spec import load_profile
+
+    profile = load_profile(PROFILE).model_copy(update={"costs": False})
+    try:
+        with tempfile.TemporaryDirectory() as scratch, planted(*mutant.mutations()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            night = measure_run(profile, Path(scratch), mutant.name, RunOptions(workers=1))
+    except SimtestError as error:
+        return {"worse": [["the night stops", str(error)]]}
+    if mutant is UNCHANGED:
+        _write(night, folder)
+    verdict = compare(night, _read(folder))
+    found = verdict.regressions.select("experiment", "quantity").unique(maintain_order=True)
+    return {"worse": [list(row) for row in found.iter_rows()], "cells": night.rows.select(CELL).n_unique()}
+
+
+def _write(night: NightlyRun, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    night.rows.write_parquet(folder / "rows.parquet")
+    night.figures.write_parquet(folder / "figures.parquet")
+    (folder / "record.json").write_text(json.dumps(night.record.to_json()), encoding="utf-8")
+
+
+def _read(folder: Path) -> NightlyRun:
+    record = RunRecord.model_validate(json.loads((folder / "record.json").read_text(encoding="utf-8")))
+    figures = pl.read_parquet(folder / "figures.parquet").select(*FIGURES)
+    return NightlyRun(record, pl.read_parquet(folder / "rows.parquet"), figures)
+
+
+def main(stage: str, name: str, folder: str = "") -> int:
+    """Run a stage of a mutant, and print what it found as one line of JSON."""
+    mutant, started = BY_NAME[name], time.process_time()
+    found = canaries_of(mutant) if stage == "canaries" else night_of(mutant, Path(folder))
+    line = {"name": name, "stage": stage, **found, "processor_s": round(time.process_time() - started, 1)}
+    print(json.dumps(line), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,144 @@
+"""Ask canaries, and then the gate, about each mutant; a line of JSON for each answer, from which a later call goes on.
+
+Each mutant runs in a process of its own: compiled kernels, caches and registered plugins of one would hide another.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from studies.mutants.catalogue import BY_NAME, UNCHANGED
+from studies.mutants.kinds import QUANTITIES, naming
+from studies.mutants.mutant import Mutant
+
+LIMIT_S = {"canaries": 900, "night": 7200}
+"""A mutant may hang; its time is up after as many seconds of the clock."""
+
+Answers = dict[tuple[str, str], dict[str, Any]]
+"""What was found, by mutant and stage."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What saw a mutant.
+
+    Parameters
+    ----------
+    mutant : Mutant
+        The fault.
+    naming : list of str
+        Canaries that failed and name it.
+    others : list of str
+        Other canaries that failed.
+    worse : list of str or None
+        Quantities that the gate calls worse and that name it; None where the gate was not asked.
+    stopped : str
+        Why the canaries could not be asked; empty where they were.
+    """
+
+    mutant: Mutant
+    naming: list[str]
+    others: list[str]
+    worse: list[str] | None
+    stopped: str
+
+    @property
+    def by_name(self) -> bool:
+        """Whether somebody named it."""
+        return bool(self.naming or self.worse)
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether anybody raised an alarm."""
+        return bool(self.naming or self.others or self.worse or self.stopped)
+
+
+def read(file: Path) -> Answers:
+    """Read the answers of earlier calls; a line that a kill cut short is left out."""
+    found: Answers = {}
+    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
+        try:
+            answer = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        found[answer["name"], answer["stage"]] = answer
+    return found
+
+
+def ask(names: Iterable[str], stage: str, file: Path, workers: int, told: Callable[[str], None]) -> Answers:
+    """Ask about all mutants that the file has no answer of, and add the answers to it; return all of the file."""
+    known = read(file)
+    open_ = [name for name in names if (name, stage) not in known]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(workers) as threads, file.open("a", encoding="utf-8") as out:
+        if out.tell() and not file.read_text(encoding="utf-8").endswith("\n"):
+            out.write("\n")
+        for number, answer in enumerate(threads.map(lambda name: _asked(name, stage, file), open_), 1):
+            out.write(json.dumps(answer) + "\n")
+            out.flush()
+            told(f"{stage} {number}/{len(open_)}: {answer['name']}")
+    return read(file)
+
+
+def night_folder(file: Path) -> Path:
+    """Return the folder of the unchanged night, beside the answers."""
+    return file.with_suffix(".night")
+
+
+def _asked(name: str, stage: str, file: Path) -> dict[str, Any]:
+    command = [sys.executable, "-m", "studies.mutants.child", stage, name, str(night_folder(file))]
+    environment = {**os.environ}
+    if BY_NAME[name].spoils_kept_arrays:
+        # What is kept for later processes must not hold the fault, nor hide it.
+        environment["SIMTEST_CACHE"] = "off"
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S[stage], env=environment)
+    except subprocess.TimeoutExpired:
+        return {"name": name, "stage": stage, "stopped": f"no answer after {LIMIT_S[stage]} s"}
+    lines = done.stdout.strip().splitlines()
+    if done.returncode or not lines:
+        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        return {"name": name, "stage": stage, "stopped": f"exit {done.returncode}: {last}"}
+    answer: dict[str, Any] = json.loads(lines[-1])
+    return answer
+
+
+def judged(answers: Answers, names: Iterable[str]) -> Iterator[Judged]:
+    """Yield who saw each mutant that the canaries were asked about."""
+    for name in names:
+        found, night = answers.get((name, "canaries")), answers.get((name, "night"))
+        if found is None:
+            continue
+        mutant = BY_NAME[name]
+        failed = [canary for canary, *_ in found.get("failed", ())]
+        named = naming(mutant.kind, failed)
+        others = [canary for canary in dict.fromkeys(failed) if canary not in named]
+        worse = None
+        if night is not None:
+            told = QUANTITIES.get(mutant.kind, ())
+            pairs = night.get("worse", ())
+            worse = [
+                f"{where} {what}" for where, what in pairs if what in told or where in naming(mutant.kind, [where])
+            ]
+        yield Judged(mutant, named, others, worse, found.get("stopped", ""))
+
+
+def run(
+    names: Iterable[str], file: Path, workers: int, told: Callable[[str], None], nights: bool = True
+) -> list[Judged]:
+    """Ask the canaries about all mutants and, unless `nights` is false, the gate about those that they do not name."""
+    names = list(dict.fromkeys([UNCHANGED.name, *names]))
+    answers = ask(names, "canaries", file, workers, told)
+    if nights:
+        unnamed = [each.mutant.name for each in judged(answers, names) if not each.by_name]
+        if unnamed != [UNCHANGED.name]:
+            # The unchanged night first: the others are held against it.
+            ask([UNCHANGED.name], "night", file, 1, told)
+            answers = ask(unnamed, "night", file, workers, told)
+    return list(judged(answers, names))
