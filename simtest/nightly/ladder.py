@@ -32,16 +32,20 @@ def ladder_figures(seed: int = 0) -> pl.DataFrame:
 
 
 def ladder_canary(figures: pl.DataFrame) -> pl.DataFrame:
-    """Return the canaries of the ladder: rungs without a result, and rungs whose height is known.
-
-    Of a closed form every rung has a result. Where the pose, or the cone of a plane, is exact nothing is left. Pixels
-    widen an isophote as smoothing does, and a round cone's pose errs by the root of the widening (docs/theory.md,
-    sections 3 and 4). Noise and curvature leave what a prototype apart from this package measured there.
-    """
+    """Return the canary that counts rungs without a result: of a closed form, every rung has one."""
     without = figures.filter(pl.col("value").is_null())
     named = "; ".join(", ".join(names) for names in without.select("setting", "estimator", "quantity").iter_rows())
     about = f"rungs without an answer: {named}" if named else "each rung of a closed form has an answer"
-    made = [canary("error ladder", "unanswered", "", without.height, 0.0, n=figures.height, about=about)]
+    return figure_table([canary("error ladder", "unanswered", "", without.height, 0.0, n=figures.height, about=about)])
+
+
+def ladder_values(figures: pl.DataFrame) -> pl.DataFrame:
+    """Return the canaries of the rungs whose height is known.
+
+    Where the pose, or the cone of a plane, is exact nothing is left. Pixels widen an isophote as smoothing does, and a
+    round cone's pose errs by the root of the widening (docs/theory.md, sections 3 and 4). Noise and curvature leave
+    what a prototype apart from this package measured there.
+    """
     plane, pose = pl.col("setting").str.starts_with("plane"), pl.col("estimator") == "circle_pose"
 
     def largest(*rungs: str, where: pl.Expr) -> float:
@@ -51,7 +55,7 @@ def ladder_canary(figures: pl.DataFrame) -> pl.DataFrame:
         return _known(figures.filter(where, pl.col("quantity") == rung)["value"].mean())
 
     exact = largest("exact pose", where=pl.lit(True))
-    made.append(canary("error ladder", "exact_pose", "deg", exact, 1e-9, about="the normal itself: rounding"))
+    made = [canary("error ladder", "exact_pose", "deg", exact, 1e-9, about="the normal itself: rounding")]
     round_cones = largest("exact cone", "exact contour", where=plane)
     made.append(
         canary("error ladder", "exact_cone", "deg", round_cones, 1e-4, about="of a plane; rounding at the branch")

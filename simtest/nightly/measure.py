@@ -15,7 +15,7 @@ from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.canary import or_failed_canary
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.ladder import ladder_canary, ladder_figures
+from simtest.nightly.ladder import ladder_canary, ladder_figures, ladder_values
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord, figure_table
 from simtest.rendering import backend
 from simtest.runtime import provenance
@@ -116,9 +116,9 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
 
 
 def measured_ladder() -> pl.DataFrame:
-    """Measure the error ladder; return its figures and its canary."""
+    """Measure the error ladder; return its figures and its canaries."""
     figures = ladder_figures()
-    return pl.concat([figures, ladder_canary(figures)])
+    return pl.concat([figures, ladder_canary(figures), ladder_values(figures)])
 
 
 class _Steps:

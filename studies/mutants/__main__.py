@@ -1,6 +1,7 @@
 """Print the table of docs/gate.md: `python -m studies.mutants [--out FILE] [--only NAME...] [--workers N]`.
 
-With --canaries the gate is not asked. What --out holds from an earlier call is not asked again.
+Canaries are asked first, and the gate about those faults alone that they do not name; with --canaries it is not asked.
+What --out holds from an earlier call is not asked again.
 """
 
 import argparse
@@ -9,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 from studies.mutants.catalogue import BY_NAME, MUTANTS, UNCHANGED
+from studies.mutants.further import FURTHER
 from studies.mutants.judging import Judged, run
 
 
@@ -34,15 +36,16 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--only", nargs="+", metavar="NAME", help="of mutants, as the table has them")
     parser.add_argument("--workers", type=int, default=2, help="mutants at once (default 2)")
     parser.add_argument("--canaries", action="store_true", help="leave out the gate")
+    parser.add_argument("--further", action="store_true", help="the ten faults that no canary was made for")
+    parser.add_argument("--profile", default="quick", help="of the gate's nights, a name or a path (default quick)")
     options = parser.parse_args(arguments)
-    names = options.only or [mutant.name for mutant in MUTANTS]
+    names = options.only or [mutant.name for mutant in (FURTHER if options.further else MUTANTS)]
     if unknown := next((name for name in names if name not in BY_NAME), None):
         print(f"mutant {unknown!r}: unknown; must be a name of studies/mutants/catalogue.py", file=sys.stderr)
         return 2
     file = options.out or Path(tempfile.gettempdir()) / "mutants.jsonl"
-    found = run(
-        names, file, options.workers, lambda line: print(line, file=sys.stderr, flush=True), not options.canaries
-    )
+    profile = None if options.canaries else options.profile
+    found = run(names, file, options.workers, lambda line: print(line, file=sys.stderr, flush=True), profile)
     print(table(found))
     return 0 if all(each.by_name != (each.mutant is UNCHANGED) for each in found) else 1
 

@@ -1,6 +1,7 @@
 """All mutants, in the order of the table."""
 
 from studies.mutants.camera_and_sensor import CAMERA, SENSOR
+from studies.mutants.further import FURTHER
 from studies.mutants.mutant import Mutant
 from studies.mutants.results import COVARIANCE, DATASET, ROWS, SEEDS, STATISTICS
 from studies.mutants.scene import LIGHT, TISSUE, TRUTH
@@ -12,4 +13,4 @@ MUTANTS = (
     *CAMERA, *SENSOR, *LIGHT, *TISSUE, *TRUTH, *SEEDS, *STATISTICS, *ROWS, *COVARIANCE, *DATASET,
 )  # fmt: skip
 
-BY_NAME = {mutant.name: mutant for mutant in (UNCHANGED, *MUTANTS)}
+BY_NAME = {mutant.name: mutant for mutant in (UNCHANGED, *MUTANTS, *FURTHER)}

@@ -1,6 +1,6 @@
-"""One mutant, planted in a process of its own: `python -m studies.mutants.child STAGE NAME [FOLDER]` prints one line.
+"""One mutant, in a process of its own: `python -m studies.mutants.child STAGE NAME [FOLDER PROFILE]` prints a line.
 
-Stages: canaries; night, which also wants the folder that holds the unchanged night, and makes that of "unchanged".
+Stages: canaries; night, which also wants a profile and the folder of the unchanged night, which "unchanged" makes.
 """
 
 import json
@@ -21,9 +21,6 @@ from studies.gate.faults import planted
 from studies.mutants.catalogue import BY_NAME, UNCHANGED
 from studies.mutants.kinds import measures_of, naming
 from studies.mutants.mutant import Mutant
-
-PROFILE = "quick"
-
 
 LADDER = "error_ladder"
 """What measures the ladder and its canaries, beside `simtest.nightly.canaries.measures`."""
@@ -50,8 +47,8 @@ def canaries_of(mutant: Mutant) -> dict[str, Any]:
     return {"failed": failed}
 
 
-def night_of(mutant: Mutant, folder: Path) -> dict[str, Any]:
-    """Make the quick night under a mutant, and return what the gate calls worse against the unchanged one.
+def night_of(mutant: Mutant, folder: Path, profile_name: str) -> dict[str, Any]:
+    """Make a profile's night under a mutant, and return what the gate calls worse against the unchanged one.
 
     The night runs in this one process, since others would not have the fault.
     """
@@ -60,7 +57,7 @@ def night_of(mutant: Mutant, folder: Path) -> dict[str, Any]:
     from simtest.nightly.measure import RunOptions, measure_run
     from simtest.spec import load_profile
 
-    profile = load_profile(PROFILE).model_copy(update={"costs": False})
+    profile = load_profile(profile_name).model_copy(update={"costs": False})
     try:
         with tempfile.TemporaryDirectory() as scratch, planted(*mutant.mutations()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -87,10 +84,10 @@ def _read(folder: Path) -> NightlyRun:
     return NightlyRun(record, pl.read_parquet(folder / "rows.parquet"), figures)
 
 
-def main(stage: str, name: str, folder: str = "") -> int:
+def main(stage: str, name: str, folder: str = "", profile: str = "") -> int:
     """Run a stage of a mutant, and print what it found as one line of JSON."""
     mutant, started = BY_NAME[name], time.process_time()
-    found = canaries_of(mutant) if stage == "canaries" else night_of(mutant, Path(folder))
+    found = canaries_of(mutant) if stage == "canaries" else night_of(mutant, Path(folder), profile)
     line = {"name": name, "stage": stage, **found, "processor_s": round(time.process_time() - started, 1)}
     print(json.dumps(line), flush=True)
     return 0

@@ -71,7 +71,9 @@ def read(file: Path) -> Answers:
     return found
 
 
-def ask(names: Iterable[str], stage: str, file: Path, workers: int, told: Callable[[str], None]) -> Answers:
+def ask(
+    names: Iterable[str], stage: str, file: Path, workers: int, told: Callable[[str], None], profile: str = ""
+) -> Answers:
     """Ask about all mutants that the file has no answer of, and add the answers to it; return all of the file."""
     known = read(file)
     open_ = [name for name in names if (name, stage) not in known]
@@ -79,7 +81,7 @@ def ask(names: Iterable[str], stage: str, file: Path, workers: int, told: Callab
     with ThreadPoolExecutor(workers) as threads, file.open("a", encoding="utf-8") as out:
         if out.tell() and not file.read_text(encoding="utf-8").endswith("\n"):
             out.write("\n")
-        for number, answer in enumerate(threads.map(lambda name: _asked(name, stage, file), open_), 1):
+        for number, answer in enumerate(threads.map(lambda name: _asked(name, stage, file, profile), open_), 1):
             out.write(json.dumps(answer) + "\n")
             out.flush()
             told(f"{stage} {number}/{len(open_)}: {answer['name']}")
@@ -91,8 +93,8 @@ def night_folder(file: Path) -> Path:
     return file.with_suffix(".night")
 
 
-def _asked(name: str, stage: str, file: Path) -> dict[str, Any]:
-    command = [sys.executable, "-m", "studies.mutants.child", stage, name, str(night_folder(file))]
+def _asked(name: str, stage: str, file: Path, profile: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "studies.mutants.child", stage, name, str(night_folder(file)), profile]
     environment = {**os.environ}
     if BY_NAME[name].spoils_kept_arrays:
         # What is kept for later processes must not hold the fault, nor hide it.
@@ -130,15 +132,18 @@ def judged(answers: Answers, names: Iterable[str]) -> Iterator[Judged]:
 
 
 def run(
-    names: Iterable[str], file: Path, workers: int, told: Callable[[str], None], nights: bool = True
+    names: Iterable[str], file: Path, workers: int, told: Callable[[str], None], profile: str | None = "quick"
 ) -> list[Judged]:
-    """Ask the canaries about all mutants and, unless `nights` is false, the gate about those that they do not name."""
+    """Ask the canaries about all mutants, and the gate about those that they do not name, by nights of a profile.
+
+    Without a profile the gate is not asked.
+    """
     names = list(dict.fromkeys([UNCHANGED.name, *names]))
     answers = ask(names, "canaries", file, workers, told)
-    if nights:
+    if profile is not None:
         unnamed = [each.mutant.name for each in judged(answers, names) if not each.by_name]
         if unnamed != [UNCHANGED.name]:
             # The unchanged night first: the others are held against it.
-            ask([UNCHANGED.name], "night", file, 1, told)
-            answers = ask(unnamed, "night", file, workers, told)
+            ask([UNCHANGED.name], "night", file, 1, told, profile)
+            answers = ask(unnamed, "night", file, workers, told, profile)
     return list(judged(answers, names))

@@ -6,7 +6,7 @@ leads nowhere near it, and does not count.
 
 KINDS: dict[str, tuple[str, ...]] = {
     "pixel centre": ("sightlines", "sub_pixel", "photometry", "camera files"),
-    "conic": ("circle_pose", "conditioning", "isovalue", "published"),
+    "conic": ("circle_pose", "conditioning", "ellipse", "isovalue", "published"),
     "lens": ("lens", "lens_rays"),
     "masks": ("view_mask", "mask", "instances"),
     "noise width": ("noise", "shot_noise", "read_noise", "noise_model", "noise_estimate"),
@@ -31,6 +31,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "budget": ("budget",),
     "estimators": ("axis_ratio", "curvature", "bisector"),
     "encodings": ("encoding",),
+    "files": ("camera files",),
+    "exposure": ("columns", "encoding"),
     "control": (),
 }
 """Names of canaries (their column `experiment`) by kind of fault."""
@@ -48,7 +50,7 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 
 MEASURES: dict[str, tuple[str, ...]] = {
     "sightlines": ("sightlines",), "sub_pixel": ("isophotes",), "isovalue": ("isophotes",),
-    "conditioning": ("conditioning",), "circle_pose": ("pose",), "published": ("published",),
+    "conditioning": ("conditioning",), "circle_pose": ("pose",), "ellipse": ("ellipse",), "published": ("published",),
     "photometry": ("photometry",), "truth": ("truth",), "light_offset": ("plane_errors",),
     "cylinder": ("curved_errors",), "axis_ratio": ("curved_errors",), "rotated_camera": ("rotated",),
     "noise": ("noises", "protocol_noise"), "seeds": ("branches",), "lens": ("lenses",), "lens_rays": ("lens_rays",),

@@ -32,7 +32,7 @@ from simtest.rendering import Session
 __all__ = ["measures", "run_canaries"]
 
 ALONE = (
-    geometry.sightlines, geometry.conditioning, geometry.pose, geometry.isophotes, noise.published,
+    geometry.sightlines, geometry.conditioning, geometry.ellipse, geometry.pose, geometry.isophotes, noise.published,
     noise.protocol_noise,
     lenses.lenses, lenses.view_masks, lenses.camera_files, lenses.rigs,
     sensors.photon_noise, sensors.stated_noise, sensors.curves, sensors.quantisation, sensors.vignetting,
