@@ -1,8 +1,10 @@
-"""One mutant, in a process of its own: `python -m studies.mutants.child STAGE NAME [FOLDER PROFILE]` prints a line.
+"""Mutants in a process of their own: `python -m studies.mutants.child STAGE FOLDER PROFILE NAME...`, a line each.
 
 Stages: canaries; night, which also wants a profile and the folder of the unchanged night, which "unchanged" makes.
 """
 
+import functools
+import gc
 import json
 import sys
 import tempfile
@@ -25,6 +27,9 @@ from studies.mutants.mutant import Mutant
 LADDER = "error_ladder"
 """What measures the ladder and its canaries, beside `simtest.nightly.canaries.measures`."""
 
+REGISTERED = "register"
+"""Caches of this name say which plugins the renderer has; it refuses to be told twice."""
+
 
 def canaries_of(mutant: Mutant) -> dict[str, Any]:
     """Return the canaries that fail under a mutant, as [name, quantity, value].
@@ -37,14 +42,32 @@ def canaries_of(mutant: Mutant) -> dict[str, Any]:
         warnings.simplefilter("ignore")
         all_measures = {**measures(), LADDER: measured_ladder}
         for some in (first, [name for name in all_measures if name not in first]):
-            figures = [or_failed_canary(name, all_measures[name]) for name in some]
-            dead = pl.concat([pl.DataFrame(schema=FIGURES), *figures]).filter(
-                pl.col("kind") == "canary", ~pl.col("passed").fill_null(False)
-            )
-            failed += [list(row) for row in dead.select("experiment", "quantity", "value").iter_rows()]
+            failed += _failed([or_failed_canary(name, all_measures[name]) for name in some])
             if naming(mutant.kind, [name for name, *_ in failed]):
                 break
     return {"failed": failed}
+
+
+def control_of(mutants: list[Mutant]) -> list[list[Any]]:
+    """Return the canaries, of those that mutants were asked about, that fail on unchanged code."""
+    some = dict.fromkeys(name for mutant in mutants for name in measures_of(mutant.kind))
+    all_measures = {**measures(), LADDER: measured_ladder}
+    return _failed([or_failed_canary(name, all_measures[name]) for name in some])
+
+
+def forget_everything() -> None:
+    """Empty the package's caches, so that nothing that a mutant made is there for the next one."""
+    for found in gc.get_objects():
+        ours = isinstance(found, functools._lru_cache_wrapper) and str(found.__module__).startswith("simtest.")
+        if ours and found.__name__ != REGISTERED:
+            found.cache_clear()
+
+
+def _failed(figures: list[pl.DataFrame]) -> list[list[Any]]:
+    dead = pl.concat([pl.DataFrame(schema=FIGURES), *figures]).filter(
+        pl.col("kind") == "canary", ~pl.col("passed").fill_null(False)
+    )
+    return [list(row) for row in dead.select("experiment", "quantity", "value").iter_rows()]
 
 
 def night_of(mutant: Mutant, folder: Path, profile_name: str) -> dict[str, Any]:
@@ -84,12 +107,21 @@ def _read(folder: Path) -> NightlyRun:
     return NightlyRun(record, pl.read_parquet(folder / "rows.parquet"), figures)
 
 
-def main(stage: str, name: str, folder: str = "", profile: str = "") -> int:
-    """Run a stage of a mutant, and print what it found as one line of JSON."""
-    mutant, started = BY_NAME[name], time.process_time()
-    found = canaries_of(mutant) if stage == "canaries" else night_of(mutant, Path(folder), profile)
-    line = {"name": name, "stage": stage, **found, "processor_s": round(time.process_time() - started, 1)}
-    print(json.dumps(line), flush=True)
+def main(stage: str, folder: str, profile: str, *names: str) -> int:
+    """Run a stage of mutants one after the other, and print what each found as a line of JSON.
+
+    Several mutants share a process only for canaries; these are then asked once more, without a fault.
+    """
+    mutants = [BY_NAME[name] for name in names]
+    for mutant in mutants:
+        started = time.process_time()
+        forget_everything()
+        found = canaries_of(mutant) if stage == "canaries" else night_of(mutant, Path(folder), profile)
+        line = {"name": mutant.name, "stage": stage, **found, "processor_s": round(time.process_time() - started, 1)}
+        print(json.dumps(line), flush=True)
+    if len(mutants) > 1:
+        forget_everything()
+        print(json.dumps({"control": control_of(mutants)}), flush=True)
     return 0
 
 

@@ -1,6 +1,7 @@
 """Ask canaries, and then the gate, about each mutant; a line of JSON for each answer, from which a later call goes on.
 
-Each mutant runs in a process of its own: compiled kernels, caches and registered plugins of one would hide another.
+A few mutants at a time share a process, one after the other, with the package's caches emptied between them. Unchanged
+code must raise no alarm after them; else each of them is asked again in a process of its own, as the gate's nights are.
 """
 
 import json
@@ -19,6 +20,9 @@ from studies.mutants.mutant import Mutant
 
 LIMIT_S = {"canaries": 900, "night": 7200}
 """A mutant may hang; its time is up after as many seconds of the clock."""
+
+BATCH = 8
+"""Mutants whose canaries are asked in one process: to start one takes longer than to ask."""
 
 Answers = dict[tuple[str, str], dict[str, Any]]
 """What was found, by mutant and stage."""
@@ -77,14 +81,18 @@ def ask(
     """Ask about all mutants that the file has no answer of, and add the answers to it; return all of the file."""
     known = read(file)
     open_ = [name for name in names if (name, stage) not in known]
+    size = BATCH if stage == "canaries" else 1
+    batches = [open_[first : first + size] for first in range(0, len(open_), size)]
     file.parent.mkdir(parents=True, exist_ok=True)
+    done = 0
     with ThreadPoolExecutor(workers) as threads, file.open("a", encoding="utf-8") as out:
         if out.tell() and not file.read_text(encoding="utf-8").endswith("\n"):
             out.write("\n")
-        for number, answer in enumerate(threads.map(lambda name: _asked(name, stage, file, profile), open_), 1):
-            out.write(json.dumps(answer) + "\n")
+        for answers in threads.map(lambda batch: _asked(batch, stage, file, profile), batches):
+            out.writelines(json.dumps(answer) + "\n" for answer in answers)
             out.flush()
-            told(f"{stage} {number}/{len(open_)}: {answer['name']}")
+            done += len(answers)
+            told(f"{stage} {done}/{len(open_)}")
     return read(file)
 
 
@@ -93,22 +101,27 @@ def night_folder(file: Path) -> Path:
     return file.with_suffix(".night")
 
 
-def _asked(name: str, stage: str, file: Path, profile: str) -> dict[str, Any]:
-    command = [sys.executable, "-m", "studies.mutants.child", stage, name, str(night_folder(file)), profile]
+def _asked(names: list[str], stage: str, file: Path, profile: str) -> list[dict[str, Any]]:
+    """Return the answers about some mutants that share a process.
+
+    Where it ends early, or unchanged code fails a canary after them, each is asked again in a process of its own.
+    """
+    command = [sys.executable, "-m", "studies.mutants.child", stage, str(night_folder(file)), profile, *names]
     environment = {**os.environ}
-    if BY_NAME[name].spoils_kept_arrays:
+    if any(BY_NAME[name].spoils_kept_arrays for name in names):
         # What is kept for later processes must not hold the fault, nor hide it.
         environment["SIMTEST_CACHE"] = "off"
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S[stage], env=environment)
+        lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+        stopped = f"exit {done.returncode}: {(done.stderr.strip().splitlines() or ['no output'])[-1]}"
     except subprocess.TimeoutExpired:
-        return {"name": name, "stage": stage, "stopped": f"no answer after {LIMIT_S[stage]} s"}
-    lines = done.stdout.strip().splitlines()
-    if done.returncode or not lines:
-        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        return {"name": name, "stage": stage, "stopped": f"exit {done.returncode}: {last}"}
-    answer: dict[str, Any] = json.loads(lines[-1])
-    return answer
+        lines, stopped = [], f"no answer after {LIMIT_S[stage]} s"
+    if len(names) == 1:
+        return lines or [{"name": names[0], "stage": stage, "stopped": stopped}]
+    if lines and lines[-1].get("control") == []:
+        return lines[:-1]
+    return [answer for name in names for answer in _asked([name], stage, file, profile)]
 
 
 def judged(answers: Answers, names: Iterable[str]) -> Iterator[Judged]:

@@ -59,14 +59,17 @@ def asked(monkeypatch):
     """Answers without processes: the canaries name statistics and nothing else, the gate calls `n` worse."""
     names = []
 
-    def answer(name, stage, file, profile):
+    def answer(name, stage):
         names.append((name, stage))
         if stage == "night":
             return {"name": name, "stage": stage, "worse": [] if name == UNCHANGED.name else [["grid", "n"]]}
         failed = [["statistics", "mean_off", 1.0]] if name == "mean is the median" else []
         return {"name": name, "stage": stage, "failed": failed}
 
-    monkeypatch.setattr(judging, "_asked", answer)
+    def answers(some, stage, file, profile):
+        return [answer(name, stage) for name in some]
+
+    monkeypatch.setattr(judging, "_asked", answers)
     return names
 
 
@@ -101,7 +104,7 @@ def test_an_unknown_mutant_is_refused(capsys):
 
 
 def test_a_process_that_ends_without_an_answer_is_told(tmp_path):
-    answer = judging._asked("mean is the median", "night", tmp_path / "a.jsonl", "a profile that nobody wrote")
+    (answer,) = judging._asked(["mean is the median"], "night", tmp_path / "a.jsonl", "a profile that nobody wrote")
     assert answer["stopped"].startswith("exit 1: ")
     assert "a profile that nobody wrote" in answer["stopped"]
 

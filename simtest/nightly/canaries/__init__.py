@@ -42,10 +42,10 @@ ALONE = (
 )  # fmt: skip
 IN_SESSION = (
     rendered.photometry, rendered.truth, rendered.plane_errors, rendered.curved_errors, rendered.rotated,
-    reflections.lobes, reflections.emission, labels.surfaces, labels.frame_files, labels.dataset,
+    reflections.lobes, reflections.emission, labels.surfaces, labels.frame_files,
     tables.counts, tables.columns, tables.thresholds, tissues.relief,
 )  # fmt: skip
-BY_VARIANT = (noise.noises, lenses.lens_rays, reflections.bounces)
+BY_VARIANT = (noise.noises, lenses.lens_rays, reflections.bounces, labels.dataset)
 
 
 def run_canaries(rows: pl.DataFrame | None = None, variant: str | None = None) -> pl.DataFrame:

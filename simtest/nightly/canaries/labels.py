@@ -136,7 +136,7 @@ def encodings() -> list[Figure]:
     return made
 
 
-def dataset(session: Session) -> list[Figure]:
+def dataset(variant: str | None) -> list[Figure]:
     """Make one sample of a plane, and compare its pictures, parts, regions and depth with the radiance by hand."""
     described = {
         "samples": 1, "highlights": 0, "shard_mb": 1.0, "splits": {"train": 1.0, "validation": 0.0, "test": 0.0},
@@ -147,7 +147,7 @@ def dataset(session: Session) -> list[Figure]:
         }}],
     }  # fmt: skip
     plan = Plan(Dataset.model_validate({"name": "canary", "estimators": ["brightest_point"], **described}))
-    sample = Maker(plan).make(0)
+    sample = Maker(plan, variant).make(0)
     meta, images = sample.meta, {name: np.asarray(image) for name, image in sample.images.items()}
     rays = _rays()
     normal = by_hand.anchor_normal(12.0, float(meta["scene"]["surface"]["azimuth_deg"]))
