@@ -116,6 +116,9 @@ def test_repeated_noise_shows_in_the_rows():
     assert [canary.quantity for canary in noise.noises_of(again) if not canary.passed] == ["repeated_answers"]
     seeds = table.with_columns(seed=pl.lit(5, pl.Int64))
     assert [canary.value for canary in noise.noises_of(seeds)] == [5, 0]
+    # Two settings that share their seeds have the same noise.
+    other = table.with_columns(setting=pl.lit("another"), normal_x=pl.col("normal_x") + 1)
+    assert [canary.value for canary in noise.noises_of(pl.concat([table, other]))] == [6, 0]
 
 
 def experiment(sigma, **group):
