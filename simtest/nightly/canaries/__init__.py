@@ -41,7 +41,8 @@ ALONE = (
     labels.encodings, tissues.translucency, tissues.glints,
 )  # fmt: skip
 IN_SESSION = (
-    rendered.photometry, rendered.truth, rendered.plane_errors, rendered.curved_errors, rendered.rotated,
+    rendered.photometry, rendered.exposure, rendered.truth,
+    rendered.plane_errors, rendered.curved_errors, rendered.rotated,
     reflections.lobes, reflections.emission, labels.surfaces, labels.frame_files,
     tables.counts, tables.columns, tables.thresholds, tissues.relief,
 )  # fmt: skip

@@ -64,6 +64,20 @@ def photometry(session: Session) -> list[Figure]:
     return [canary("photometry", "residual", "", float(off), 1e-4, n=int(bright.sum()), about=about)]
 
 
+def exposure(session: Session) -> list[Figure]:
+    """Expose a plane at a given full scale and a gain of 2: its frame is twice the radiance by hand over that scale."""
+    scale = 0.02
+    sensor = {"noise_sigma": 0.0, "exposure": {"full_scale": scale, "gain": 2.0}}
+    frame = render_view(session, described(PLANE, LIGHT_MM, sensor=sensor)).frame(0).astype(float)
+    normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
+    points = by_hand.plane_points(normal, DISTANCE_MM)
+    expected = 2 * by_hand.phong_radiance(points, normal, np.array(LIGHT_MM), EXPONENT) / scale
+    bright = expected > 1e-3 * expected.max()
+    off = np.abs(frame[bright] / expected[bright] - 1).max()
+    about = "gain times radiance over full scale, every pixel; single precision"
+    return [canary("exposure", "residual", "", float(off), 1e-4, n=int(bright.sum()), about=about)]
+
+
 def truth(session: Session) -> list[Figure]:
     """Compare the truth of a tilted plane with its own description."""
     session.update(described(PLANE, LIGHT_MM))

@@ -1,6 +1,7 @@
 """Canaries of wet tissue: relief, translucency and the law of glints, against statistics and formulas taken anew."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,27 @@ from simtest.surfaces.relief_field import make_relief
 from simtest.validation.relief_laws import cloud_covariance, glint_count, relief_error
 
 SLOPE_DEG, WAVE_MM = 5.0, 1.5
-RELIEF = {"bands": [{"slope_deg": SLOPE_DEG, "wavelength_mm": WAVE_MM}], "seed": 3}
+RELIEF: dict[str, Any] = {"bands": [{"slope_deg": SLOPE_DEG, "wavelength_mm": WAVE_MM}], "seed": 3}
 POINTS = 12_000
 
 
 def relief(session: Session) -> list[Figure]:
-    """Measure slope and wavelength of a relief by differences of its heights, and the fine normals that it makes."""
-    field = make_relief(Relief.model_validate(RELIEF))
+    """Measure slope and wavelength of reliefs by differences of their heights, and the fine normals that one makes."""
+    slope, wave = _section(RELIEF)
+    # Bands are independent, so that their squared slopes add.
+    both, _ = _section({**RELIEF, "bands": [*RELIEF["bands"], {"slope_deg": 4.0, "wavelength_mm": 3.0}]})
+    about = "differences of heights on planes of all orientations; of a field of 16 waves a side"
+    return [
+        canary("relief", "slope", "x", slope / SLOPE_DEG, 1.04, 0.96, POINTS, about),
+        canary("relief", "wavelength", "x", wave / WAVE_MM, 1.04, 0.96, POINTS, about),
+        canary("relief", "slope_of_two", "x", both / math.hypot(SLOPE_DEG, 4.0), 1.04, 0.96, POINTS, about),
+        _fine_normals(session),
+    ]
+
+
+def _section(described: dict[str, Any]) -> tuple[float, float]:
+    """Measure a relief's slope along one direction, deg, and its wavelength 2 pi sqrt(m2/m4), mm, on planes."""
+    field = make_relief(Relief.model_validate(described))
     rng = np.random.default_rng(50)
     points = rng.uniform(-20, 20, (POINTS, 3))
     # A plane through each point, of random orientation
@@ -42,13 +57,7 @@ def relief(session: Session) -> list[Figure]:
     slopes = [(a - b) / (2 * step) for a, b in sides]
     laplace = sum((a + b - 2 * here) / step**2 for a, b in sides)
     m2, m4 = float(np.mean(slopes[0] ** 2 + slopes[1] ** 2)), float(np.mean(laplace**2))
-    slope = math.atan(math.sqrt(m2 / 2)) * 180 / math.pi
-    about = "differences of heights on planes of all orientations; of a field of 16 waves a side"
-    return [
-        canary("relief", "slope", "x", slope / SLOPE_DEG, 1.04, 0.96, POINTS, about),
-        canary("relief", "wavelength", "x", 2 * math.pi * math.sqrt(m2 / m4) / WAVE_MM, 1.04, 0.96, POINTS, about),
-        _fine_normals(session),
-    ]
+    return math.degrees(math.atan(math.sqrt(m2 / 2))), 2 * math.pi * math.sqrt(m2 / m4)
 
 
 def _fine_normals(session: Session) -> Figure:
