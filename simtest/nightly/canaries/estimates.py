@@ -4,6 +4,7 @@ Frames are drawn here, from the closed form of a Phong plane with the light at t
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -19,6 +20,8 @@ from simtest.nightly.canaries.canary import canary
 from simtest.nightly.records import Figure
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
+from simtest.validation.metrics import estimate_row
+from simtest.validation.results_table import ResultRow
 
 FRAMES, SIGMA, EXPONENT = 400, 0.05, 60.0
 CAMERA = {"width": 72, "height": 64, "fx": 130.0, "fy": 130.0, "cx": 30.0, "cy": 36.0}
@@ -70,11 +73,20 @@ def budgets() -> list[Figure]:
             added = added + part
         gap = float(np.abs(estimate.covariance - added).max() / np.trace(added))
     about = "parts of the budget, added by hand, over their trace"
+    # The columns of results: the root of each part's trace, deg
+    stated = estimate_row(ResultRow(), estimate).budget if parts and isinstance(estimate, Estimate) else {}
+    roots = {f"budget_{name}_deg": math.degrees(math.sqrt(np.trace(part))) for name, part in _parts(estimate).items()}
+    apart = max((abs(stated.get(name, math.nan) / root - 1) for name, root in roots.items()), default=math.nan)
     return [
+        canary("budget", "columns_off", "", float(apart), 1e-9, n=parts, about="root of a part's trace, deg"),
         canary("budget", "sum_off", "", gap, 1e-12, n=parts, about=about),
         canary("budget", "parts", "", parts, 8, 4, about="noise, light offset, camera and response at least"),
         *_camera_part(camera, estimate), _light_part(), _gains(),
     ]  # fmt: skip
+
+
+def _parts(estimate: Estimate | Failure) -> Mapping[str, Array]:
+    return {} if isinstance(estimate, Failure) or estimate.budget is None else estimate.budget
 
 
 def _camera_part(camera: Camera, estimate: Estimate | Failure) -> list[Figure]:

@@ -51,6 +51,12 @@ def surfaces(session: Session) -> list[Figure]:
             for quantity, (value, unit, scale) in off.items():
                 label = f"{side}_{name}_{quantity}"
                 made.append(canary("labels", label, unit, float(value), close * scale, n=int(hit.sum()), about=about))
+        # The light is at the camera: the highlight is the point nearest to it.
+        at = [(own.distance - DISTANCE_MM, own.kd_min - k * DISTANCE_MM, own.kd_max - k * DISTANCE_MM)
+              for own in session.highlights()]  # fmt: skip
+        gap = float(np.abs(at).max()) if len(at) == 1 else math.nan
+        about = "distance, and distance times curvatures, of the one highlight"
+        made.append(canary("labels", f"{side}_highlight_off", "", gap, 1e-6, about=about))
         covered = {"exact": truth.mask, "traced": labels.instance == 0, "depth": np.isfinite(labels.depth)}
         for name, mask in covered.items():
             wrong = float((mask != hit).sum())

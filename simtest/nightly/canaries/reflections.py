@@ -23,6 +23,7 @@ CAMERA = {"width": 80, "height": 64, "fx": 75.0, "fy": 75.0, "cx": 41.5, "cy": 3
 """Half of `by_hand.CAMERA` in each direction."""
 
 ALPHA, INDEX, ALBEDO = 0.1, 1.4, 0.6
+GRAZING_DEG = 85.0
 LIGHT_MM = (3.0, -4.0, 0.0)
 """Far enough aside that Fresnel's reflectance differs over the plane."""
 
@@ -50,7 +51,23 @@ def lobes(session: Session) -> list[Figure]:
         made.append(_residual("film", f"{name}_lobe", seen.specular, facets.lobe(ALPHA, INDEX, ggx), about))
         about = "T T / index^2 albedo/pi / (1 - albedo r), with r by quadrature"
         made.append(_residual("film", f"{name}_base", seen.diffuse, facets.base_below(ALPHA, INDEX, ALBEDO), about))
-    return [*made, *_widths()]
+    return [*made, _grazing(session), *_widths()]
+
+
+def _grazing(session: Session) -> Figure:
+    """Compare a film's lobe at grazing light and view, where facets hide each other, with D G F / (4 cos_o)."""
+    normal, view = by_hand.anchor_normal(GRAZING_DEG, AZIMUTH_DEG), np.array([0.0, 0.0, -1.0])
+    # In the mirror direction from the anchor, as far as the camera
+    light = np.array([0.0, 0.0, DISTANCE_MM]) + DISTANCE_MM * (2 * (normal @ view) * normal - view)
+    facets = _Facets(light, GRAZING_DEG)
+    film = {"index": INDEX, "alpha": ALPHA, "distribution": "beckmann"}
+    seen = _rendered(session, {"type": "tissue", "film": film}, {"position_mm": light.tolist()}, GRAZING_DEG).specular
+    lobe = facets.lobe(ALPHA, INDEX, ggx=False)
+    row, column = int(CAMERA["cy"]), int(CAMERA["cx"])
+    near = np.s_[row - 2 : row + 3, column - 2 : column + 3]
+    off = float(np.abs(seen[near] / lobe[near] - 1).max())
+    about = f"25 pixels about an anchor tilted by {GRAZING_DEG:g} deg; single precision"
+    return canary("film", "grazing_off", "", off, 2e-3, n=25, about=about)
 
 
 def emission(session: Session) -> list[Figure]:
@@ -127,13 +144,13 @@ def bounces(variant: str | None) -> list[Figure]:
 class _Facets:
     """A tilted plane under a light aside, pixel by pixel: directions, cosines, and what facets reflect."""
 
-    def __init__(self, light: Array) -> None:
+    def __init__(self, light: Array, tilt_deg: float = TILT_DEG) -> None:
         x, y = np.meshgrid(np.arange(CAMERA["width"]) + 0.5, np.arange(CAMERA["height"]) + 0.5)
         rays = np.stack(
             [(x - CAMERA["cx"]) / CAMERA["fx"], (y - CAMERA["cy"]) / CAMERA["fy"], np.ones_like(x)], axis=-1
         )
         rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
-        self.normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
+        self.normal = by_hand.anchor_normal(tilt_deg, AZIMUTH_DEG)
         points = rays * (DISTANCE_MM * self.normal[2] / (rays @ self.normal))[..., None]
         towards = light - points
         self.squared = (towards**2).sum(axis=-1)
@@ -230,9 +247,11 @@ def _widths() -> list[Figure]:
     return made
 
 
-def _rendered(session: Session, reflectance: dict[str, Any], light: dict[str, Any] | None = None) -> Any:
+def _rendered(
+    session: Session, reflectance: dict[str, Any], light: dict[str, Any] | None = None, tilt_deg: float = TILT_DEG
+) -> Any:
     scene = {
-        "surface": {"type": "plane", "distance_mm": DISTANCE_MM, "tilt_deg": TILT_DEG, "azimuth_deg": AZIMUTH_DEG},
+        "surface": {"type": "plane", "distance_mm": DISTANCE_MM, "tilt_deg": tilt_deg, "azimuth_deg": AZIMUTH_DEG},
         "camera": CAMERA,
         "rig": {"lights": [light or {"position_mm": list(LIGHT_MM)}]},
         "reflectance": reflectance,

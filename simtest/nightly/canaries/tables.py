@@ -21,7 +21,7 @@ from simtest.spec.paper import PaperSetting
 from simtest.validation import laws
 from simtest.validation.cases import expand
 from simtest.validation.matching import match
-from simtest.validation.metrics import curvature_errors, mahalanobis2, rows
+from simtest.validation.metrics import curvature_errors, mahalanobis2, rows, scene_row
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.realisation import Realisation, realise
 from simtest.validation.results_table import ResultRow, table
@@ -120,6 +120,12 @@ def columns(session: Session) -> list[Figure]:
     snr = _value(row.peak_snr) * SIGMA
     figures_.append(
         canary("columns", "peak_snr", "x", snr, 1.02, 0.85, about="peak over the noise; smoothing lowers it")
+    )
+    # Of a bent surface: curvatures in their order, and the ratio of 1 + d k
+    bent = scene_row(made.view.scene, ResultRow(), replace(made.truths[0], kd_min=-0.3, kd_max=0.8))
+    gap = abs(_value(bent.kd_min) + 0.3) + abs(_value(bent.kd_max) - 0.8) + abs(_value(bent.axis_ratio_law) - 0.7 / 1.8)
+    figures_.append(
+        canary("columns", "bent_off", "", gap, 1e-12, n=3, about="k d of -0.3 and 0.8, as they were put in")
     )
     return [*figures_, *_candidates(made), *_of_protocol(), *_curvature_errors(made), _distance(made)]
 
