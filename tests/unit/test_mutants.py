@@ -51,7 +51,7 @@ def test_what_is_kept_on_disk_is_not_spoilt():
 def test_only_canaries_of_the_faults_subject_name_it():
     assert naming("lens", ["photometry", "lens", "lens", "plane"]) == ["lens"]
     assert naming("lens", ["photometry"]) == []
-    assert measures_of("light sign") == ["rigs", "photometry"]
+    assert measures_of("light sign") == ["rigs", "photometry", "told_light"]
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ ALONE = (
 )  # fmt: skip
 IN_SESSION = (
     rendered.photometry, rendered.exposure, rendered.truth,
-    rendered.plane_errors, rendered.curved_errors, rendered.rotated,
+    rendered.plane_errors, rendered.told_light, rendered.curved_errors, rendered.rotated,
     reflections.lobes, reflections.emission, labels.surfaces, labels.frame_files,
     tables.counts, tables.columns, tables.thresholds, tissues.relief,
 )  # fmt: skip

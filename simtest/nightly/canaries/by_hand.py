@@ -1,12 +1,13 @@
 """Rays, normals and radiance computed anew, from docs/theory.md: canaries share no code with what they watch."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from simtest.runtime.arrays import Array
 
-CAMERA = {"width": 160, "height": 128, "fx": 150.0, "fy": 150.0, "cx": 83.0, "cy": 61.0}
+CAMERA: dict[str, Any] = {"width": 160, "height": 128, "fx": 150.0, "fy": 150.0, "cx": 83.0, "cy": 61.0}
 """Camera of the rendered canaries."""
 
 FINE = {name: 3 * value for name, value in CAMERA.items()}

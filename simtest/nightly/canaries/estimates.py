@@ -6,6 +6,7 @@ Frames are drawn here, from the closed form of a Phong plane with the light at t
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from simtest.validation.metrics import estimate_row
 from simtest.validation.results_table import ResultRow
 
 FRAMES, SIGMA, EXPONENT = 400, 0.05, 60.0
-CAMERA = {"width": 72, "height": 64, "fx": 130.0, "fy": 130.0, "cx": 30.0, "cy": 36.0}
+CAMERA: dict[str, Any] = {"width": 72, "height": 64, "fx": 130.0, "fy": 130.0, "cx": 30.0, "cy": 36.0}
 ESTIMATORS = ("cone_axis", "photometric")
 """Those whose stated noise is their whole error on a plane; `brightest_point` and others state more on purpose."""
 

@@ -70,7 +70,7 @@ def frame_files(session: Session) -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         write_frame(make_frame(scene, session.variant), Path(folder))
         truth = dict(np.load(Path(folder) / "truth.npz"))
-        picture = cv2.imread(str(Path(folder) / "frame.png"), cv2.IMREAD_UNCHANGED)
+        picture: Any = cv2.imread(str(Path(folder) / "frame.png"), cv2.IMREAD_UNCHANGED)
         described = json.loads((Path(folder) / "frame.json").read_text(encoding="utf-8"))
     mask, rays = truth["mask"], _rays()
     points = truth["position_mm"][mask].astype(float)
@@ -154,7 +154,8 @@ def dataset(variant: str | None) -> list[Figure]:
     }  # fmt: skip
     plan = Plan(Dataset.model_validate({"name": "canary", "estimators": ["brightest_point"], **described}))
     sample = Maker(plan, variant).make(0)
-    meta, images = sample.meta, {name: np.asarray(image) for name, image in sample.images.items()}
+    meta: Any = sample.meta
+    images = {name: np.asarray(image) for name, image in sample.images.items()}
     rays = _rays()
     normal = by_hand.anchor_normal(12.0, float(meta["scene"]["surface"]["azimuth_deg"]))
     cosine = -(rays @ normal)

@@ -76,10 +76,11 @@ def emission(session: Session) -> list[Figure]:
     cosine = -(facets.to_light @ axis) / math.sqrt(axis @ axis)
     angle = np.arccos(np.clip(cosine, -1, 1)) * 180 / math.pi
     matt = ALBEDO / math.pi * facets.cos_light / facets.squared
-    table = {"type": "table", "angle_deg": [0.0, 30.0, 70.0], "value": [1.0, 0.7, 0.1]}
-    lights = {
+    angles, shares = [0.0, 30.0, 70.0], [1.0, 0.7, 0.1]
+    table = {"type": "table", "angle_deg": angles, "value": shares}
+    lights: dict[str, tuple[dict[str, Any], Array]] = {
         "cosine": ({"profile": {"type": "cosine", "power": 3.0}}, cosine**3),
-        "table": ({"profile": table}, np.interp(angle, table["angle_deg"], table["value"])),
+        "table": ({"profile": table}, np.interp(angle, angles, shares)),
         "spot": ({"spot_deg": 40.0, "soft_edge_deg": 8.0}, np.clip((20.0 - angle) / 8.0, 0, 1)),
     }
     made = []
@@ -219,7 +220,7 @@ def _widths() -> list[Figure]:
         return low
 
     film = {"index": INDEX, "alpha": 0.05}
-    stated = {
+    stated: dict[str, tuple[Any, float]] = {
         "phong": (PhongReflectance(exponent=40.0), half(lambda a: np.cos(2 * a) ** 40)),
         "plastic": (RoughPlasticReflectance(alpha=0.2), half(lambda a: ggx(np.tan(a), 0.2))),
         "conductor": (RoughConductorReflectance(alpha=0.3), half(lambda a: ggx(np.tan(a), 0.3))),

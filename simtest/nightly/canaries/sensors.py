@@ -24,6 +24,10 @@ LEVELS = (0.15, 0.4, 0.8)
 FULL_WELL, READ_NOISE = 2000.0, 24.0
 GAMMA = 2.2
 
+PLAIN: dict[str, Any] = {}
+PROCESSED: dict[str, Any] = {"overlay": {}}
+"""A sensor without, and with, a stage behind its response: each has a way of its own through the camera chain."""
+
 SRGB = ((0.001, 0.01292), (0.05, 0.247801), (0.18, 0.461356), (0.5, 0.735357), (0.9, 0.954687))
 """Linear light and value of sRGB (IEC 61966-2-1), worked out apart from this package, to six digits."""
 
@@ -33,7 +37,7 @@ def photon_noise() -> list[Figure]:
     rng = np.random.default_rng(20)
     count = len(LEVELS) * SIDE_PX**2
     made = []
-    for name, more in (("variance_over_mean", {}), ("variance_over_mean_processed", {"overlay": {}})):
+    for name, more in (("variance_over_mean", PLAIN), ("variance_over_mean_processed", PROCESSED)):
         sensor = Sensor.model_validate({"full_well": FULL_WELL, **more})
         shares = [np.mean((_captured(level, sensor, rng) - level) ** 2) * FULL_WELL / level for level in LEVELS]
         bounds = _about(1.0, 5 * math.sqrt(2 / count))
@@ -83,9 +87,7 @@ def curves() -> list[Figure]:
         np.abs(to_uint8(linear) / 255 - encoded).max() - 0.5 / 255,
     )  # fmt: skip
     # The sensor's own way, with and without a stage behind the curve.
-    sensors = [
-        Sensor.model_validate({"response": {"type": "gamma", "gamma": GAMMA}, **m}) for m in ({}, {"overlay": {}})
-    ]
+    sensors = [Sensor.model_validate({"response": {"type": "gamma", "gamma": GAMMA}, **m}) for m in (PLAIN, PROCESSED)]
     whole = max(float(np.abs(capture(picture, 1.0, s, None)[0] - values).max()) for s in sensors)
     about = "light^(1/2.2) and back; tables of 16 bits leave 5e-5"
     return [
@@ -118,9 +120,10 @@ def vignetting() -> list[Figure]:
     cosine = by_hand.sightlines()[..., 2]
     seen = collect(even, Sensor.model_validate({"vignetting": {"type": "cosine", "power": 3.0}}), camera)
     off = float(np.abs(seen / cosine**3 - 1).max())
-    table = {"type": "table", "angle_deg": [0.0, 20.0, 60.0], "value": [1.0, 0.8, 0.2]}
+    angles, shares = [0.0, 20.0, 60.0], [1.0, 0.8, 0.2]
+    table = {"type": "table", "angle_deg": angles, "value": shares}
     tabled = collect(even, Sensor.model_validate({"vignetting": table}), camera)
-    wanted = np.interp(np.arccos(cosine) * 180 / math.pi, table["angle_deg"], table["value"])
+    wanted = np.interp(np.arccos(cosine) * 180 / math.pi, angles, shares)
     # What reconstruction divides by, of a picture that fell off by hand.
     calibration = Calibration(camera, vignetting=AngularProfile(2.0), emission=AngularProfile(1.0))
     mended = calibration.correct((cosine**3).astype(np.float32)).intensity

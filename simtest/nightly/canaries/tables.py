@@ -10,7 +10,7 @@ from simtest.detection.regions import detect, half_height_component
 from simtest.estimators import Estimate, load_estimators
 from simtest.nightly.canaries import by_hand
 from simtest.nightly.canaries.canary import canary
-from simtest.nightly.canaries.rendered import DISTANCE_MM, LIGHT_MM, PLANE, TILT_DEG, described
+from simtest.nightly.canaries.rendered import AZIMUTH_DEG, DISTANCE_MM, LIGHT_MM, PLANE, TILT_DEG, described
 from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
@@ -88,7 +88,7 @@ def columns(session: Session) -> list[Figure]:
     made = _realised(session, SIGMA)
     wanted = [row for row in made.rows if row.estimator == "cone_axis" and row.status == "ok"]
     row = wanted[0] if len(wanted) == 1 else ResultRow()
-    normal = by_hand.anchor_normal(TILT_DEG, float(PLANE["azimuth_deg"]))
+    normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     light = np.array(LIGHT_MM)
     point = by_hand.highlight_of_plane(normal, DISTANCE_MM, light)
     far = math.sqrt(float(point @ point))
@@ -188,7 +188,7 @@ def law_values() -> list[Figure]:
 def _candidates(made: Realisation) -> list[Figure]:
     """Check error and better error of two candidates, one of which is the truth."""
     truth = made.truths[0]
-    other = by_hand.anchor_normal(TILT_DEG + 5.0, float(PLANE["azimuth_deg"]))
+    other = by_hand.anchor_normal(TILT_DEG + 5.0, AZIMUTH_DEG)
     own = next(iter(made.specularities[next(iter(made.matched))].estimates.values()))
     if not isinstance(own, Estimate):
         return [canary("columns", "oracle_off", "deg", math.nan, 0, about="no estimate to change")]

@@ -11,7 +11,7 @@ from simtest.nightly.canaries.canary import canary
 from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.rendering.subsurface import spread, transfer
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Mask
 from simtest.spec import scene_from_dict
 from simtest.spec.relief import Relief
 from simtest.spec.translucency import Translucency
@@ -118,7 +118,7 @@ def translucency() -> list[Figure]:
     ]
 
 
-def _within(x: Array, y: Array) -> Array:
+def _within(x: Array, y: Array) -> Mask:
     """Return the middle two thirds, whose width is a whole number of stripes of 40 px."""
     return np.asarray((np.abs(x) < 40) & (np.abs(y) < 40))
 
