@@ -86,7 +86,8 @@ def frame_files(session: Session) -> list[Figure]:
     # Colours: OpenCV reads blue first.
     red = np.zeros((2, 2, 3), dtype=np.float32)
     red[..., 0], red[..., 1] = 1.0, 0.2158605
-    decoded = cv2.imdecode(np.frombuffer(encoded_png(red, Sensor()), np.uint8), cv2.IMREAD_COLOR)[0, 0].tolist()
+    read: Any = cv2.imdecode(np.frombuffer(encoded_png(red, Sensor()), np.uint8), cv2.IMREAD_COLOR)
+    decoded = read[0, 0].tolist()
     return [
         canary("labels", "file_depth_off", "mm", float(along), 2e-5, n=len(points), about="length of position_mm"),
         canary("labels", "file_rays_off", "deg", float(aside), 1e-4, n=len(points), about="on the sightline"),

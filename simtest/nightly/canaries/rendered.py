@@ -1,6 +1,6 @@
 """Canaries that render: radiance, truth and noise-free reconstructions against formulas computed by hand."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -167,7 +167,7 @@ def rotated(session: Session) -> list[Figure]:
     return [canary("rotated_camera", "normal_off", "deg", float(turned.max()), 0.05, n=turned.size, about=about)]
 
 
-def _realised(session: Session, scene: Scene, names: Iterable[str] = ESTIMATORS) -> Realisation:
+def _realised(session: Session, scene: Scene, names: Sequence[str] = ESTIMATORS) -> Realisation:
     """Make the one realisation of a noise-free scene, as an experiment does."""
     experiment = Experiment(name="canary", realisations=1, groups=[{"scene": "plane", "isolated": False}])
     (case,) = expand(experiment)
