@@ -16,7 +16,7 @@ from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.canary import or_failed_canary
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.ladder import ladder_canary, ladder_figures
+from simtest.nightly.ladder import ladder_canary, ladder_figures, ladder_values
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord, figure_table
 from simtest.rendering import backend
 from simtest.runtime import provenance
@@ -79,7 +79,7 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
         # Canaries first: a fault that they see is known before the experiments run.
         if profile.canaries:
             steps.show("canaries")
-            figures += [run_canaries(None, options.variant), or_failed_canary("error ladder", _ladder)]
+            figures += [run_canaries(None, options.variant), or_failed_canary("error ladder", measured_ladder)]
         before = time.monotonic()
         runs = run_experiments(
             [(experiment, folder / experiment.name) for experiment in experiments], options.command, options.variant,
@@ -116,9 +116,10 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
     return NightlyRun(record, rows, pl.concat([table.select(*FIGURES) for table in figures]))
 
 
-def _ladder() -> pl.DataFrame:
+def measured_ladder() -> pl.DataFrame:
+    """Measure the error ladder; return its figures and its canaries."""
     figures = ladder_figures()
-    return pl.concat([figures, ladder_canary(figures)])
+    return pl.concat([figures, ladder_canary(figures), ladder_values(figures)])
 
 
 class _Steps:

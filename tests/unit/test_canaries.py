@@ -7,11 +7,13 @@ import pytest
 from gate_nights import rows
 
 from simtest.geometry import Camera
-from simtest.nightly.canaries import geometry, run_canaries
+from simtest.nightly.canaries import geometry, measures, run_canaries
 from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.records import FIGURES
 from simtest.spec import Experiment
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
+from studies.mutants.catalogue import MUTANTS
+from studies.mutants.kinds import KINDS, MEASURES, measures_of
 
 DETECTORS = {
     "sign flip of an axis": ("circle_pose", "normal_off"),
@@ -59,10 +61,36 @@ def test_a_fault_of_the_geometry_kills_its_canary(fault):
 def test_a_planted_fault_kills_its_canary(fault):
     with planted(*FAULTS[fault]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert DETECTORS[fault] in failed(run_canaries())
+        all_measures = measures()
+        own = [all_measures[name]() for name in MEASURES[DETECTORS[fault][0]]]
+        assert DETECTORS[fault] in failed(pl.concat(own))
     # And is gone afterwards.
     with pytest.raises(LookupError):
         Mutation(FAULTS[fault][0].function, FAULTS[fault][0].new + "nowhere", "").code()
+
+
+WITHOUT_RENDERING = (
+    "lenses", "view_masks", "camera_files", "rigs", "photon_noise", "stated_noise", "curves", "quantisation",
+    "vignetting", "widths", "branches", "statistics", "law_values", "ellipse", "protocol_noise",
+)  # fmt: skip
+"""Measures of canaries that take some milliseconds each."""
+
+
+@pytest.mark.parametrize(
+    "mutant", [own for own in MUTANTS if set(measures_of(own.kind)) <= set(WITHOUT_RENDERING)], ids=lambda own: own.name
+)
+def test_a_mutant_is_named_without_rendering(mutant):
+    own = {name: measure for name, measure in measures().items() if name in measures_of(mutant.kind)}
+    assert not failed(pl.concat(measure() for measure in own.values()))
+    with planted(*mutant.mutations()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        dead = failed(pl.concat(measure() for measure in own.values()))
+    assert {name for name, _ in dead} & set(KINDS[mutant.kind])
+
+
+def test_the_noise_of_canaries_is_the_same_each_time():
+    own = [measures()[name] for name in ("photon_noise", "stated_noise", "rigs", "glints")]
+    assert pl.concat(measure() for measure in own).equals(pl.concat(measure() for measure in own))
 
 
 @pytest.mark.render
@@ -88,6 +116,9 @@ def test_repeated_noise_shows_in_the_rows():
     assert [canary.quantity for canary in noise.noises_of(again) if not canary.passed] == ["repeated_answers"]
     seeds = table.with_columns(seed=pl.lit(5, pl.Int64))
     assert [canary.value for canary in noise.noises_of(seeds)] == [5, 0]
+    # Two settings that share their seeds have the same noise.
+    other = table.with_columns(setting=pl.lit("another"), normal_x=pl.col("normal_x") + 1)
+    assert [canary.value for canary in noise.noises_of(pl.concat([table, other]))] == [6, 0]
 
 
 def experiment(sigma, **group):

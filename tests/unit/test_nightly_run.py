@@ -419,6 +419,7 @@ def parts(monkeypatch, finished):
 
     monkeypatch.setattr(measure, "run_canaries", tells("canaries", figure_of("canary", "pose")))
     monkeypatch.setattr(measure, "ladder_figures", tells("ladder", figure_of("ladder", "error ladder")))
+    monkeypatch.setattr(measure, "ladder_values", lambda figures: figures.clear())
     monkeypatch.setattr(measure, "run_experiments", work)
     monkeypatch.setattr(measure.noise, "noises_of", tells("noises_of", []))
     monkeypatch.setattr(measure.cost, "run_times", tells("costs", figure_of("cost", "cost")))

@@ -47,6 +47,27 @@ def conditioning() -> list[Figure]:
     return [canary("conditioning", "circle_off", "px", float(off), 1e-9, n=len(phase), about=about)]
 
 
+def ellipse() -> list[Figure]:
+    """Fit a turned ellipse from its own points, and compare centre, half-axes and direction with what drew it."""
+    centre, major, minor, angle = np.array([41.0, 57.0]), 19.0, 7.0, 0.6
+    phase = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    along, across = major * np.cos(phase), minor * np.sin(phase)
+    points = np.stack(
+        [along * np.cos(angle) - across * np.sin(angle), along * np.sin(angle) + across * np.cos(angle)], -1
+    )
+    fitted = fit_ellipse(centre + points)
+    off, turned = np.nan, np.nan
+    if not isinstance(fitted, Failure):
+        found = ellipse_of_conic(fitted.image)
+        axes = abs(found.semi_major - major), abs(found.semi_minor - minor)
+        off, turned = max(*axes, *np.abs(found.centre - centre)), abs(found.angle - angle)
+    about = "half-axes 19 and 7 px, turned by 0.6 rad from x to y"
+    return [
+        canary("ellipse", "off", "px", float(off), 1e-9, n=len(phase), about=about),
+        canary("ellipse", "angle_off", "rad", float(turned), 1e-9, n=len(phase), about=about),
+    ]
+
+
 def pose() -> list[Figure]:
     """Project a circle in space point by point, and compare its plane and its cone's axis with the true ones."""
     camera = Camera(640, 480, FX, FY, CX, CY)

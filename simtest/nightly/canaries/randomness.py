@@ -56,6 +56,16 @@ def noises(variant: str | None = None, seed: int = 0) -> list[Figure]:
     ]
 
 
+def protocol_noise() -> list[Figure]:
+    """Measure the noise that the published protocol adds to its picture."""
+    pipeline = Pipeline(PaperSetting(sigma=SIGMA), {})
+    made = pipeline.stages(from_integer(60))
+    left, count = float(np.std(made.noisy - made.clean)), made.clean.size
+    about = f"{SIGMA:g} within 5 standard errors"
+    bounds = _around(SIGMA, 5 * SIGMA / np.sqrt(2 * count))
+    return [canary("noise", "protocol_sigma", "", left, *bounds, count, about)]
+
+
 def published() -> list[Figure]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)
@@ -78,7 +88,7 @@ def _distinct(name: str, frames: list[np.ndarray]) -> Figure:
 
 
 def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = None) -> list[Figure]:
-    """Count the realisations of noisy settings that repeat another's seed, or its results to the last bit.
+    """Count the realisations of noisy settings that repeat any other's seed, or one's results to the last bit.
 
     Parameters
     ----------
@@ -91,9 +101,9 @@ def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = Non
     lost = _without_noise(rows, experiments)
     setting = ("experiment", "setting")
     noisy = rows.filter(pl.col("noise_sigma") > 0)
-    # Repeated seeds
+    # Repeated seeds, of one setting or of two
     frames = noisy.select(*setting, "realisation", "seed").unique()
-    seeds = frames.group_by(setting).agg(repeated=pl.len() - pl.col("seed").n_unique())["repeated"].sum()
+    seeds = frames.height - frames["seed"].n_unique()
     # Repeated results: three numbers of white noise are not equal by chance, it is the same noise.
     results = noisy.filter(pl.col("status") == "ok", pl.col("true_id").is_not_null(), pl.col("specularity") == 0)
     normals = pl.struct("normal_x", "normal_y", "normal_z")
@@ -104,7 +114,7 @@ def noises_of(rows: pl.DataFrame, experiments: Sequence[Experiment] | None = Non
     return [
         canary(
             "noise", "repeated_seeds", "", float("nan") if lost else float(seeds), 0, n=frames.height,
-            about="of the night's noisy settings" + more,
+            about="of all noisy settings of the night" + more,
         ),
         canary(
             "noise", "repeated_answers", "", float("nan") if lost or silent else float(same), 0, n=results.height,

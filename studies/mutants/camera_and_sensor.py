@@ -1,0 +1,91 @@
+"""Faults of cameras, lenses, sensors and smoothing."""
+
+from studies.mutants.mutant import Change, Mutant, mutant
+
+_CAMERA = "simtest.geometry.camera:Camera"
+_BROWN = "simtest.geometry.distortion:BrownConrady"
+_FISHEYE = "simtest.geometry.distortion:KannalaBrandt"
+_CHAIN = "simtest.simulation.camera_chain"
+_RESPONSE = "simtest.calibration.response"
+
+CAMERA: tuple[Mutant, ...] = (
+    mutant("pixel centres of the camera at integers", "pixel centre", f"{_CAMERA}.pixel_centres",
+           "x = np.arange(self.width) + PIXEL_CENTRE", "x = np.arange(self.width) + 0.0"),
+    mutant("rays of the renderer through the pixels' corners", "pixel centre",
+           "simtest.rendering.rays:Sightlines.centre", "self.mi.Float(lanes.row) + PIXEL_CENTRE",
+           "self.mi.Float(lanes.row)"),
+    mutant("peak of a patch at the pixel's corner", "pixel centre", "simtest.geometry.patch:Patch.cut",
+           "position + PIXEL_CENTRE + corner", "position + corner"),
+    mutant("MATLAB's principal point kept as it is", "pixel centre", "simtest.spec.camera_formats.matlab:read_matlab",
+           "float(matrix[0, 2]) - PIXEL_CENTRE", "float(matrix[0, 2])"),
+    mutant("OpenCV's principal point kept as it is", "pixel centre", "simtest.spec.camera_formats.opencv:read_opencv",
+           "float(matrix[1, 2]) + PIXEL_CENTRE", "float(matrix[1, 2])"),
+    mutant("cone of a conic with the transposed matrix", "conic", "simtest.geometry.conics:cone_of_conic",
+           "np.swapaxes(H, -1, -2) @ conic.normalised @ H", "H @ conic.normalised @ np.swapaxes(H, -1, -2)"),
+    mutant("half-axes of an ellipse swapped", "conic", "simtest.geometry.conics:ellipse_of_conic",
+           "float(np.sqrt(level / values[0])), float(np.sqrt(level / values[1]))",
+           "float(np.sqrt(level / values[1])), float(np.sqrt(level / values[0]))"),
+    mutant("circle pose: g with l1 + l3", "conic", "simtest.geometry.circle_from_cone:circle_poses",
+           "g, h = np.sqrt((l1 - l2) / (l1 - l3))", "g, h = np.sqrt((l1 - l2) / (l1 + l3))"),
+    mutant("tangential coefficients p1 and p2 swapped", "lens", f"{_BROWN}._forward",
+           "p1, p2 = self.p1, self.p2", "p1, p2 = self.p2, self.p1"),
+    mutant("k3 of a perspective lens lost", "lens", f"{_BROWN}._radial_polynomials", "self.k2, self.k3]",
+           "self.k2, 0.0]"),
+    mutant("k6 of a perspective lens has k5's power", "lens", f"{_BROWN}._radial_polynomials",
+           "self.k4, self.k5, self.k6]", "self.k4, self.k5 + self.k6, 0.0]"),
+    mutant("k4 of a fisheye lost", "lens", f"{_FISHEYE}._radial", "self.k3, self.k4]", "self.k3, 0.0]"),
+    mutant("fisheye measures the tangent in place of the angle", "lens", f"{_FISHEYE}.distort",
+           "share = self._radial(theta)[0] / across", "share = self._radial(np.tan(theta))[0] / across"),
+    Mutant("skew has the wrong sign, both ways", "lens", (
+        Change(f"{_CAMERA}.unproject", "- self.skew * y) / self.fx", "+ self.skew * y) / self.fx"),
+        Change(f"{_CAMERA}.project", "self.fx * x + self.skew * y", "self.fx * x - self.skew * y"),
+    )),
+    mutant("skew forgotten by the renderer's rays", "lens", "simtest.rendering.rays:Sightlines.rays",
+           'a = (mi.Float64(x) - n["cx"] - n["skew"] * b)', 'a = (mi.Float64(x) - n["cx"])'),
+    mutant("round field of view 5 % too wide", "masks", "simtest.geometry.camera:ViewMask.contains",
+           "x**2 + y**2 <= self.radius**2", "x**2 + y**2 <= (1.05 * self.radius) ** 2"),
+)  # fmt: skip
+
+SENSOR: tuple[Mutant, ...] = (
+    mutant("white noise 20 % too small", "noise width", f"{_CHAIN}:expose", "np.float32(noise_sigma) *",
+           "np.float32(0.8 * noise_sigma) *"),
+    mutant("the published protocol's noise 20 % too small", "noise width",
+           "simtest.validation.paper.published_pipeline:Pipeline.stages", "clean + setting.sigma *",
+           "clean + 0.8 * setting.sigma *"),
+    mutant("shot noise has twice its variance", "noise width", f"{_CHAIN}:_electrons",
+           "rng.poisson(np.minimum(mean, MAX_COUNT))", "2 * rng.poisson(np.minimum(mean, MAX_COUNT) / 2)"),
+    mutant("shot noise of processed pictures 10 % too small", "noise width", "simtest.simulation.shot_noise:poisson",
+           "root * normal + square", "0.9 * root * normal + square"),
+    mutant("read noise half as large", "noise width", f"{_CHAIN}:_electrons", "counts + read_noise *",
+           "counts + 0.5 * read_noise *"),
+    mutant("noise model: shot noise over the square of the full well", "noise width",
+           "simtest.calibration.noise_model:NoiseModel.at", "np.maximum(x, 0) / self.full_well +",
+           "np.maximum(x, 0) / self.full_well**2 +"),
+    mutant("noise of a frame estimated 20 % too large", "noise width",
+           "simtest.calibration.noise_estimate:estimate_noise", "/ 6.0)", "/ 5.0)"),
+    mutant("gamma 10 % off", "sensor curve", f"{_RESPONSE}:Response.encode", "x ** (1 / self.gamma)",
+           "x ** (1 / (1.1 * self.gamma))"),
+    mutant("gamma of processed pictures 10 % off", "sensor curve", f"{_RESPONSE}:Response.encode_picture",
+           "cv2.pow(x, 1 / self.gamma)", "cv2.pow(x, 1 / (1.1 * self.gamma))"),
+    Mutant("exponent of sRGB 2.2, both ways", "sensor curve", (
+        Change(f"{_RESPONSE}:srgb_encode", "** (1 / 2.4)", "** (1 / 2.2)"),
+        Change(f"{_RESPONSE}:srgb_decode", "** 2.4)", "** 2.2)"),
+    )),
+    mutant("values cut off in place of rounded", "sensor curve", f"{_CHAIN}:encode", "np.rint(values * largest)",
+           "np.floor(values * largest)"),
+    mutant("full scale not clipped", "sensor curve", f"{_CHAIN}:encode",
+           "np.clip(frame, 0.0, 1.0) if sensor.clips else frame)\n    if",
+           "np.maximum(frame, 0.0) if sensor.clips else frame)\n    if"),
+    mutant("cos^k falloff with half its power, in scene and calibration alike", "vignetting",
+           "simtest.geometry.angular_profile:AngularProfile.at", "np.maximum(c, 0.0) ** self.power",
+           "np.maximum(c, 0.0) ** (self.power / 2)"),
+    mutant("vignetting about the image's first pixel", "vignetting", "simtest.calibration.calibration:falloff_map",
+           "camera.unproject(camera.pixel_centres())",
+           "camera.unproject(camera.pixel_centres() + [camera.cx / 4, 0.0])"),
+    mutant("point spread 20 % too narrow", "point spread", f"{_CHAIN}:collect", "sensor.point_spread_px)",
+           "0.8 * sensor.point_spread_px)"),
+    mutant("smoothing 10 % wider than stated", "smoothing", "simtest.geometry.gaussian_smoothing:_blurred",
+           "(0, 0), sigma_px,", "(0, 0), 1.1 * sigma_px,"),
+    mutant("picture written with blue for red", "encodings", "simtest.simulation.frame_files:encoded_png",
+           "picture[:, :, ::-1]", "picture"),
+)  # fmt: skip
