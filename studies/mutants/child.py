@@ -90,7 +90,9 @@ def night_of(mutant: Mutant, folder: Path, profile_name: str) -> dict[str, Any]:
     if mutant is UNCHANGED:
         _write(night, folder)
     verdict = compare(night, _read(folder))
-    found = verdict.regressions.select("experiment", "quantity").unique(maintain_order=True)
+    # Worse, or changed without a reason.
+    told = pl.concat([verdict.regressions, verdict.unexplained])
+    found = told.select("experiment", "quantity").unique(maintain_order=True)
     return {"worse": [list(row) for row in found.iter_rows()], "cells": night.rows.select(CELL).n_unique()}
 
 
