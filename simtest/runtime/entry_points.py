@@ -9,6 +9,7 @@ from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.resources import shown
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class EntryPointGroup:
         """
         found = self._registered(name)
         if not found:
-            raise InputError(f"{self.kind} {name!r}: not installed; allowed: {', '.join(self.names())}")
+            raise InputError(f"{self.kind} {shown(name, 80)!r}: not installed; allowed: {', '.join(self.names())}")
         if len(found) > 1:
             full = " or ".join(sorted(f"{_package(point)}:{point.name}" for point in found))
             raise InputError(f"{self.kind} {name!r}: registered by {len(found)} packages; name one of them: {full}")

@@ -12,8 +12,10 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
+from simtest.runtime.limits import check_file, check_limit
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
+from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.repair import Repairs, repair
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
@@ -21,10 +23,6 @@ WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
 
 MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
-
-MAX_FACES = 5_000_000
-MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
-"""About the size of `MAX_FACES` faces as text; reading takes some ten times as much memory."""
 
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
@@ -55,7 +53,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{path}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{shown(path)}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
     _check_file(path, suffix)
     try:
         with _quiet():
@@ -64,7 +62,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
         raise
     except Exception as error:
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
-        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_first_line(error)})") from error
+        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_told(error)})") from error
     _check_arrays(path, vertices, faces)
     count = len(faces)
     with _quiet():
@@ -89,28 +87,35 @@ def other_unit(extent: float) -> str:
 
 
 def _check_file(path: Path, suffix: str) -> None:
-    """Check what can be checked without parsing the file: size, and number of faces where the header holds it."""
-    if not path.is_file():
-        raise InputError(f"{path}: {'is a folder; a file is needed' if path.is_dir() else 'no such file'}")
+    """Check what can be checked without reading the file: kind, size, and the faces that its header announces."""
+    size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
+    if size == 0:
+        raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
     try:
-        size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(4096)
+        if suffix == ".ply":
+            check_ply(path, size)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    # size of the file
-    if size == 0:
-        raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    if size > MAX_BYTES[suffix]:
-        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
-    # faces that the header declares
-    declared = 0
-    if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
-        declared = int(match[1])
-    elif suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
-        declared = count
-    if declared > MAX_FACES:  # before any memory is asked for
-        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed: decimate the mesh")
+        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    if suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
+        check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
+    # OBJ is text, which its reader would make a hundred million words of before it finds nothing in them.
+    if suffix == ".obj" and b"\0" in head:
+        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+    if suffix == ".vtk":
+        _check_vtk(path, head, size)
+
+
+def _check_vtk(path: Path, head: bytes, size: int) -> None:
+    """Raise `InputError` where a VTK file is none, or announces more points or cells than it has bytes."""
+    if not head.startswith((b"# vtk DataFile", b"<?xml", b"<VTKFile")):
+        raise InputError(f"{shown(path)}: no VTK file; its first line must be # vtk DataFile Version ...")
+    for name, count in re.findall(rb"^(POINTS|POLYGONS|CELLS|TRIANGLE_STRIPS)\s+(-?\d{1,18})\b", head, re.MULTILINE):
+        if not 0 <= int(count) <= size:
+            raise InputError(
+                f"{shown(path)}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them"
+            )
 
 
 @contextmanager
@@ -181,8 +186,9 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         raise InputError(f"{path}: {len(vertices)} points and no faces; at least {MIN_FACES} triangles are needed")
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"{path}: faces of {faces.shape[-1]} corners; triangles are needed")
-    if not MIN_FACES <= len(faces) <= MAX_FACES:
-        raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; allowed: {MIN_FACES} to {MAX_FACES}")
+    if len(faces) < MIN_FACES:
+        raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; at least {MIN_FACES} are needed")
+    check_limit("mesh_faces", len(faces), path, "faces", "decimate the mesh")
     # values
     _check_indices(path, faces.ravel(), len(vertices))
     if not np.isfinite(vertices).all():
@@ -198,9 +204,12 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def _first_line(error: Exception) -> str:
+def _told(error: Exception) -> str:
+    """Return what a reader ran into; a fault of its own, such as an index out of range, says nothing to a user."""
     lines = str(error).strip().splitlines()
-    return (lines[0] if lines else type(error).__name__)[:160]
+    if isinstance(error, IndexError | KeyError | TypeError | AttributeError | AssertionError) or not lines:
+        return "its elements do not fit what its header announces, or a line is cut short"
+    return lines[0][:160]
 
 
 # Writing -------------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.runtime.locks import LOCK
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
@@ -406,6 +407,7 @@ def _check_folder(folder: Path) -> None:
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     # What is no part of a run.
+    held.pop(LOCK, None)
     strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:

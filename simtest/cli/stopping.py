@@ -1,0 +1,27 @@
+"""SIGTERM, answered as Ctrl-C is: between two steps, with what is finished kept and no process left behind."""
+
+import signal
+import threading
+from types import FrameType
+
+
+class Termination:
+    """Hands SIGTERM on to whatever answers Ctrl-C, and remembers that it came."""
+
+    def __init__(self) -> None:
+        self.came = False
+
+    def listen(self) -> None:
+        """Answer SIGTERM from now on; in a thread, which gets no signals, nothing is done."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._answer)
+
+    def _answer(self, number: int, frame: FrameType | None) -> None:
+        self.came = True
+        # A progress bar waits for the end of its step; otherwise KeyboardInterrupt is raised here.
+        interrupt = signal.getsignal(signal.SIGINT)
+        if callable(interrupt):
+            interrupt(number, frame)
+        else:
+            # Started with SIGINT ignored, as by nohup or in the background of a script.
+            raise KeyboardInterrupt
