@@ -157,8 +157,8 @@ def sample_views(
     from simtest.simulation.view_files import ViewWriter
     from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
-    if not 1 <= count <= (most := limit("views")):
-        raise InputError(f"count = {count}: must be 1 to {most}")
+    if not 1 <= count <= limit("views"):
+        raise InputError(f"count = {count}: must be 1 to {limit('views')}")
     described = _scene(scene, settings)
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     with exclusive_folder(Path(out)):

@@ -50,8 +50,8 @@ def fit(
     from simtest.spec.dataset_recipe import load_dataset
 
     check_out(out)
-    if not 1 <= size <= (most := limit("generated_frames")):
-        raise InputError(f"--size {size}: must be 1 to {most}")
+    if not 1 <= size <= limit("generated_frames"):
+        raise InputError(f"--size {size}: must be 1 to {limit('generated_frames')}")
     dataset = one_family(load_dataset(recipe), scene)
     opened, kept = open_frames(frames), bank or out.with_suffix(".bank")
     with exclusive_file(out), exclusive_folder(kept, "--bank"):

@@ -206,7 +206,7 @@ def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> F
     path = folder / shard.name
     part = folder / (shard.name + PART)
     # finished, but not in the manifest: the run was killed in between
-    if path.exists() and _is_whole(path, shard):
+    if path.is_file() and _is_whole(path, shard):
         for _ in shard.indices:
             on_step()
         return file_entry(path)

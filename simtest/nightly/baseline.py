@@ -17,6 +17,7 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
+from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
 
@@ -100,7 +101,7 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
 def _replaced(reports: Reports, profile: str) -> str | None:
     """Return the id of the run that was the baseline, if its record can still be read."""
     try:
-        found = json.loads((reports.baseline(profile) / RUN_FILE).read_text(encoding="utf-8"))
+        found = json.loads(require_plain(reports.baseline(profile) / RUN_FILE).read_text(encoding="utf-8"))
         return str(found["id"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -109,8 +109,8 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     InputError
         If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
-    if not 1 <= count <= (most := limit("generated_frames")):
-        raise InputError(f"--count {count}: must be 1 to {most}")
+    if not 1 <= count <= limit("generated_frames"):
+        raise InputError(f"--count {count}: must be 1 to {limit('generated_frames')}")
     path = Path(against)
     if path.is_dir() and (path / "manifest.json").is_file():
         return _dataset(path, count, surfaces)

@@ -18,7 +18,7 @@ from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
-from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.machine_errors import disk_problem
 from simtest.runtime.resources import shown
@@ -161,7 +161,7 @@ class _Run:
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        frame = TrackedFrame.from_json(json.loads(path.read_text(encoding="utf-8")))
+        frame = TrackedFrame.from_json(json.loads(require_plain(path).read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return frame if frame.name == name else None

@@ -52,11 +52,12 @@ def read_bitmap(path: Path, variant: str | None = None) -> Image:
     mi = backend.load(variant)
     try:
         with _two_threads():
-            bitmap = mi.Bitmap(str(path)).convert(component_format=mi.Struct.Type.Float32)
+            bitmap = mi.Bitmap(str(path))
     except Exception as error:
-        # Mitsuba raises whatever OpenEXR runs into, which also differs from channel to channel.
+        # Mitsuba hands on whatever OpenEXR runs into.
         raise InputError(f"{shown(path)}: cannot be read ({shown(_last_line(error), 120)})") from None
-    return np.array(bitmap, dtype=np.float32)
+    # Converted here: Mitsuba converts no image of one channel that is called Z, as depth is.
+    return np.array(np.array(bitmap), dtype=np.float32)
 
 
 def _last_line(error: Exception) -> str:

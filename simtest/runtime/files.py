@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import stat
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,13 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
+
+
+def require_plain(path: Path) -> Path:
+    """Return a path that is a plain file; raise `OSError` if it is none: a pipe or a device might never end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.ENXIO, "is no plain file", str(path))
+    return path
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:

@@ -17,6 +17,7 @@ from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.repair import Repairs, repair
+from simtest.surfaces.vtk_file import read_vtk
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
@@ -54,15 +55,22 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise InputError(f"{shown(path)}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
-    _check_file(path, suffix)
+    announced = _check_file(path, suffix)
     try:
         with _quiet():
-            vertices, faces = _load_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
+            vertices, faces = read_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
     except InputError:
         raise
     except Exception as error:
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
         raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_told(error)})") from error
+    # Its reader says nothing of lines that are missing.
+    held = (len(vertices), len(faces))
+    if held[0] < announced[0] or held[1] < announced[1]:
+        raise InputError(
+            f"{shown(path)}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
+            f"{announced[1]}: it is cut short, or a line is malformed"
+        )
     _check_arrays(path, vertices, faces)
     count = len(faces)
     with _quiet():
@@ -86,8 +94,12 @@ def other_unit(extent: float) -> str:
     return ""
 
 
-def _check_file(path: Path, suffix: str) -> None:
-    """Check what can be checked without reading the file: kind, size, and the faces that its header announces."""
+def _check_file(path: Path, suffix: str) -> tuple[int, int]:
+    """Check what can be checked without reading the file: kind, size, and what its header announces.
+
+    Returns the vertices and faces that the file must hold at least.
+    """
+    announced = (0, 0)
     size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
     if size == 0:
         raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
@@ -95,7 +107,7 @@ def _check_file(path: Path, suffix: str) -> None:
         with path.open("rb") as file:
             head = file.read(4096)
         if suffix == ".ply":
-            check_ply(path, size)
+            announced = check_ply(path, size)
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     if suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
@@ -105,6 +117,7 @@ def _check_file(path: Path, suffix: str) -> None:
         raise InputError(f"{shown(path)}: no OBJ file; it is no text")
     if suffix == ".vtk":
         _check_vtk(path, head, size)
+    return announced
 
 
 def _check_vtk(path: Path, head: bytes, size: int) -> None:
@@ -145,31 +158,6 @@ def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
         loaded = trimesh.util.concatenate(parts)
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
     return vertices, np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
-
-
-def _load_vtk(path: Path) -> tuple[Array, IntArray]:
-    import pyvista  # slow to import
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
-
-    displayed, verbosity = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    vtkObject.GlobalWarningDisplayOff()
-    try:
-        data = pyvista.read(path)
-        if isinstance(data, pyvista.UnstructuredGrid):
-            _check_indices(path, np.asarray(data.cell_connectivity), data.n_points)
-            data = data.extract_surface(algorithm="dataset_surface")
-        if not isinstance(data, pyvista.PolyData):
-            raise InputError(f"{path}: a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
-        # VTK's filters trust the indices, so they are checked first.
-        for cells in (data.GetPolys(), data.GetStrips()):
-            _check_indices(path, pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
-        data = data.triangulate()
-        faces = np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
-        return np.array(data.points, dtype=np.float64), faces
-    finally:
-        vtkObject.SetGlobalWarningDisplay(displayed)
-        vtkLogger.SetStderrVerbosity(verbosity)
 
 
 def _check_indices(path: Path, indices: IntArray, count: int) -> None:
@@ -219,10 +207,13 @@ def check_target(path: Path) -> None:
     """Raise `InputError` if a mesh cannot be written to a path; called before any work is done."""
     if path.suffix.lower() not in WRITTEN_SUFFIXES:
         raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
-    if path.is_dir():
-        raise InputError(f"--out {shown(path)}: is a folder; must be a file")
-    if not path.parent.is_dir():
-        raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
+    try:
+        if path.is_dir():
+            raise InputError(f"--out {shown(path)}: is a folder; must be a file")
+        if not path.parent.is_dir():
+            raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
+    except OSError as error:
+        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:

@@ -28,7 +28,7 @@ class _Element:
     words: int = 0
 
 
-def check_ply(path: Path, size: int) -> None:
+def check_ply(path: Path, size: int) -> tuple[int, int]:
     """Check that a PLY file can hold what its header announces, before any memory is asked for.
 
     Parameters
@@ -37,6 +37,11 @@ def check_ply(path: Path, size: int) -> None:
         A plain file.
     size : int
         Its bytes.
+
+    Returns
+    -------
+    tuple of int
+        Vertices and faces that the header announces.
 
     Raises
     ------
@@ -78,6 +83,7 @@ def check_ply(path: Path, size: int) -> None:
     if held + 1 < least:
         announced = " and ".join(f"{found[name].count} {name} elements" for name in ("vertex", "face"))
         raise InputError(f"{where}: {held} bytes follow the header; {announced} take {least} at least: it is cut short")
+    return found["vertex"].count, found["face"].count
 
 
 def _parse(text: str, where: str) -> tuple[str, list[_Element]]:

@@ -21,7 +21,7 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
-from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.runtime.files import Json, require_plain, write_atomically, write_json
 from simtest.runtime.locks import LOCK
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
@@ -371,9 +371,9 @@ def _record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+        record = json.loads(require_plain(folder / "summary.json").read_text(encoding="utf-8"))["run"]
         return dict(record) if "fingerprint" in record else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -42,11 +42,23 @@ def _good() -> Iterator[Case]:
             yield _case(
                 f"good {option} .{suffix}", option, f"d.{suffix}", wanted=Wanted.DONE, **{f"d__{suffix}": content}
             )
-    yield _case("good reference", "--reference", "m.ply", "--camera-from-model", "p.toml", wanted=Wanted.DONE,
-                m__ply=files.ply(), p__toml=files.POSE)  # fmt: skip
+    yield _case(
+        "good reference",
+        "--reference",
+        "m.ply",
+        "--camera-from-model",
+        "p.toml",
+        wanted=Wanted.DONE,
+        m__ply=files.ply(),
+        p__toml=files.POSE,
+    )
     for suffix in (".png", ".jpg", ".tif", ".webp", ".bmp"):
-        yield Case(f"reconstruct: good picture {suffix}", ("reconstruct", f"x{suffix}", "--fov", "60", "--out", "out"),
-                   {f"x{suffix}": files.encoded(suffix)}, Wanted.DONE)  # fmt: skip
+        yield Case(
+            f"reconstruct: good picture {suffix}",
+            ("reconstruct", f"x{suffix}", "--fov", "60", "--out", "out"),
+            {f"x{suffix}": files.encoded(suffix)},
+            Wanted.DONE,
+        )
 
 
 def _pictures() -> Iterator[Case]:
@@ -68,8 +80,12 @@ def _pictures() -> Iterator[Case]:
     for number, suffix in enumerate((".png", ".jpg", ".tif", ".webp", ".bmp")):
         good = files.encoded(suffix)
         for i, data in enumerate(files.damaged(good, 100 + number, 9)):
-            yield Case(f"reconstruct: damaged {suffix} {i}", ("reconstruct", f"x{suffix}", *command),
-                       {f"x{suffix}": data}, Wanted.ORDERLY)  # fmt: skip
+            yield Case(
+                f"reconstruct: damaged {suffix} {i}",
+                ("reconstruct", f"x{suffix}", *command),
+                {f"x{suffix}": data},
+                Wanted.ORDERLY,
+            )
     for i, data in enumerate(files.damaged(b"RIFF\x10\0\0\0AVI LIST" + bytes(200), 120, 3)):
         yield Case(f"reconstruct: damaged film {i}", ("reconstruct", "x.avi", *command), {"x.avi": data})
 
@@ -84,8 +100,13 @@ def _sizes() -> Iterator[Case]:
     for kind, suffix in (("GIF", "gif"), ("PNG", "png"), ("WEBP", "webp"), ("TIFF", "tif")):
         for sizes in (False, True):
             name = f"reconstruct: animated {kind}{', pages of several sizes' if sizes else ''}"
-            yield Case(name, ("reconstruct", f"x.{suffix}", *command[2:]),
-                       {f"x.{suffix}": files.animated(kind, sizes=sizes and kind == "TIFF")}, Wanted.ORDERLY, "x.")  # fmt: skip
+            yield Case(
+                name,
+                ("reconstruct", f"x.{suffix}", *command[2:]),
+                {f"x.{suffix}": files.animated(kind, sizes=sizes and kind == "TIFF")},
+                Wanted.ORDERLY,
+                "x.",
+            )
 
 
 def _write_png(path: Any, width: int, height: int) -> None:
@@ -94,14 +115,20 @@ def _write_png(path: Any, width: int, height: int) -> None:
 
 
 GOOD_CAMERAS: dict[str, bytes | str] = {
-    "toml": files.CAMERA, "yaml": files.OPENCV_YAML, "yml": files.ROS_YAML, "xml": files.OPENCV_XML,
-    "json": files.OPENCV_JSON, "mat": files.matlab(),
-}  # fmt: skip
+    "toml": files.CAMERA,
+    "yaml": files.OPENCV_YAML,
+    "yml": files.ROS_YAML,
+    "xml": files.OPENCV_XML,
+    "json": files.OPENCV_JSON,
+    "mat": files.matlab(),
+}
 
 
 GOOD_DEPTHS = {
-    "npy": files.npy(files.depth()), "exr": files.exr(files.depth()), "tif": files.encoded(".tif", files.depth()),
-}  # fmt: skip
+    "npy": files.npy(files.depth()),
+    "exr": files.exr(files.depth()),
+    "tif": files.encoded(".tif", files.depth()),
+}
 
 
 def _cameras() -> Iterator[Case]:
@@ -110,72 +137,112 @@ def _cameras() -> Iterator[Case]:
         for what, content in files.no_files(good):
             yield _case(f"camera, {what} .{suffix}", "--camera", name, says=name, **{f"c__{suffix}": content})
         for i, data in enumerate(files.damaged(good, 200 + number, 9)):
-            yield _case(f"camera, damaged .{suffix} {i}", "--camera", name, wanted=Wanted.ORDERLY,
-                        **{f"c__{suffix}": data})  # fmt: skip
+            yield _case(
+                f"camera, damaged .{suffix} {i}", "--camera", name, wanted=Wanted.ORDERLY, **{f"c__{suffix}": data}
+            )
         if isinstance(good, str):
             for i, text in enumerate(files.damaged_words(good, 220 + number, 6)):
-                yield _case(f"camera, strange words .{suffix} {i}", "--camera", name, wanted=Wanted.ORDERLY,
-                            **{f"c__{suffix}": text})  # fmt: skip
+                yield _case(
+                    f"camera, strange words .{suffix} {i}",
+                    "--camera",
+                    name,
+                    wanted=Wanted.ORDERLY,
+                    **{f"c__{suffix}": text},
+                )
     for i, text in enumerate(files.damaged_words(files.CALIBRATION, 240, 8)):
         yield _case(f"calibration, strange words {i}", "--camera", "c.toml", wanted=Wanted.ORDERLY, c__toml=text)
     deep = {"toml": "a = " + "[" * 50_000, "yaml": "[" * 50_000, "json": "[" * 50_000, "xml": "<a>" * 50_000}
     for suffix, text in deep.items():
-        yield _case(f"camera, nested deeply .{suffix}", "--camera", f"c.{suffix}", says=f"c.{suffix}",
-                    **{f"c__{suffix}": text})  # fmt: skip
-    laughs = '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">' + "".join(
-        f'<!ENTITY {chr(98 + i)} "{f"&{chr(97 + i)};" * 10}">' for i in range(9)
-    ) + "]><opencv_storage><image_width>&j;</image_width></opencv_storage>"  # fmt: skip
+        yield _case(
+            f"camera, nested deeply .{suffix}", "--camera", f"c.{suffix}", says=f"c.{suffix}", **{f"c__{suffix}": text}
+        )
+    laughs = (
+        '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
+        + "".join(f'<!ENTITY {chr(98 + i)} "{f"&{chr(97 + i)};" * 10}">' for i in range(9))
+        + "]><opencv_storage><image_width>&j;</image_width></opencv_storage>"
+    )
     yield _case("camera, XML that grows when it is read", "--camera", "c.xml", c__xml=laughs, says="c.xml")
 
 
 def _camera_values() -> Iterator[Case]:
     yaml, xml, good = files.OPENCV_YAML, files.OPENCV_XML, files.CAMERA
     spoilt = {
-        "dt: u": yaml.replace("dt: d", "dt: u", 1), "dt: a number": yaml.replace("dt: d", "dt: 5", 1),
-        "dt of several": yaml.replace("dt: d", 'dt: "3d"', 1), "4 rows": yaml.replace("rows: 3", "rows: 4"),
-        "2 columns": yaml.replace("cols: 3", "cols: 2"), "rows as a text": yaml.replace("rows: 3", "rows: three"),
+        "dt: u": yaml.replace("dt: d", "dt: u", 1),
+        "dt: a number": yaml.replace("dt: d", "dt: 5", 1),
+        "dt of several": yaml.replace("dt: d", 'dt: "3d"', 1),
+        "4 rows": yaml.replace("rows: 3", "rows: 4"),
+        "2 columns": yaml.replace("cols: 3", "cols: 2"),
+        "rows as a text": yaml.replace("rows: 3", "rows: three"),
         "9 rows of 1": yaml.replace("rows: 3", "rows: 9").replace("cols: 3", "cols: 1"),
-        "5 coefficients in 4 columns": yaml.replace("cols: 5", "cols: 4"), "no width": yaml.replace("image_width", "w"),
-        "principal point far outside": yaml.replace("31.5", "31500."), "NaN": yaml.replace("31.5", ".nan"),
-        "endless focal length": yaml.replace("60.", ".inf", 1), "width 0": yaml.replace("width: 64", "width: 0"),
-        "width 65500": yaml.replace("width: 64", "width: 65500"), "focal length 0": yaml.replace("60.", "0.", 1),
-        "focal length -60": yaml.replace("60.", "-60.", 1), "an alias": yaml.replace("dt: d", "dt: &a d", 1),
-        "lens that folds": yaml.replace("-0.1,", "-100.,"), "lens of 1e300": yaml.replace("-0.1,", "1e300,"),
+        "5 coefficients in 4 columns": yaml.replace("cols: 5", "cols: 4"),
+        "no width": yaml.replace("image_width", "w"),
+        "principal point far outside": yaml.replace("31.5", "31500."),
+        "NaN": yaml.replace("31.5", ".nan"),
+        "endless focal length": yaml.replace("60.", ".inf", 1),
+        "width 0": yaml.replace("width: 64", "width: 0"),
+        "width 65500": yaml.replace("width: 64", "width: 65500"),
+        "focal length 0": yaml.replace("60.", "0.", 1),
+        "focal length -60": yaml.replace("60.", "-60.", 1),
+        "an alias": yaml.replace("dt: d", "dt: &a d", 1),
+        "lens that folds": yaml.replace("-0.1,", "-100.,"),
+        "lens of 1e300": yaml.replace("-0.1,", "1e300,"),
         "an object of Python": yaml + 'x: !!python/object/apply:os.system ["true"]\n',
-    }  # fmt: skip
+    }
     for name, text in spoilt.items():
         yield _case(f"camera .yaml, {name}", "--camera", "c.yaml", c__yaml=text, says="c.yaml")
     spoilt = {
-        "dt u": xml.replace("<dt>d", "<dt>u", 1), "4 rows": xml.replace("<rows>3", "<rows>4"),
-        "text in a matrix": xml.replace("60. 0.", "sixty 0."), "matrix cut": xml.replace(" 0. 0. 1.<", "<"),
-        "K twice": xml.replace("<opencv_storage>", "<opencv_storage><K>1</K>"), "no K": xml.replace("camera_m", "m"),
-    }  # fmt: skip
+        "dt u": xml.replace("<dt>d", "<dt>u", 1),
+        "4 rows": xml.replace("<rows>3", "<rows>4"),
+        "text in a matrix": xml.replace("60. 0.", "sixty 0."),
+        "matrix cut": xml.replace(" 0. 0. 1.<", "<"),
+        "K twice": xml.replace("<opencv_storage>", "<opencv_storage><K>1</K>"),
+        "no K": xml.replace("camera_m", "m"),
+    }
     for name, text in spoilt.items():
         yield _case(f"camera .xml, {name}", "--camera", "c.xml", c__xml=text, says="c.xml")
     values = {
-        "principal point far outside": good + "cx = 5000.0\n", "principal point far above": good + "cy = -3000.0\n",
-        "principal point endless": good + "cx = inf\n", "focal length tiny": good.replace("fx = 60.0", "fx = 1e-300"),
-        "focal length of 1e5 widths": good.replace("fx = 60.0", "fx = 6.4e6"), "fx 1e-3": good.replace("60.0", "1e-3"),
-        "width 65500": good.replace("64", "65500"), "width 1e30": good.replace("64", "1e30"),
-        "another size": good.replace("64", "32"), "fx true": good.replace("60.0", "true"), "skew": good + "skew = 9e5\n",
-        "unknown key": good + "fov = 60\n", "mask that shows nothing": good + "view_mask = {radius = 1, cx = 9e5}\n",
-        "noise": good + "[sensor]\nnoise_sigma = -1\n", "response": good + '[response]\ntype = "gamma"\ngamma = 0\n',
-        "response unknown": good + '[response]\ntype = "log"\n', "focal lengths apart": good.replace("60.0", "6e5", 1),
-        "distance NaN": good + "[surface]\ndistance_mm = nan\n", "light": good + "[rig]\nlights = []\n",
-    }  # fmt: skip
+        "principal point far outside": good + "cx = 5000.0\n",
+        "principal point far above": good + "cy = -3000.0\n",
+        "principal point endless": good + "cx = inf\n",
+        "focal length tiny": good.replace("fx = 60.0", "fx = 1e-300"),
+        "focal length of 1e5 widths": good.replace("fx = 60.0", "fx = 6.4e6"),
+        "fx 1e-3": good.replace("60.0", "1e-3"),
+        "width 65500": good.replace("64", "65500"),
+        "width 1e30": good.replace("64", "1e30"),
+        "another size": good.replace("64", "32"),
+        "fx true": good.replace("60.0", "true"),
+        "skew": good + "skew = 9e5\n",
+        "unknown key": good + "fov = 60\n",
+        "mask that shows nothing": good + "view_mask = {radius = 1, cx = 9e5}\n",
+        "noise": good + "[sensor]\nnoise_sigma = -1\n",
+        "response": good + '[response]\ntype = "gamma"\ngamma = 0\n',
+        "response unknown": good + '[response]\ntype = "log"\n',
+        "focal lengths apart": good.replace("60.0", "6e5", 1),
+        "distance NaN": good + "[surface]\ndistance_mm = nan\n",
+        "light": good + "[rig]\nlights = []\n",
+    }
     for name, text in values.items():
         yield _case(f"camera .toml, {name}", "--camera", "c.toml", c__toml=text, says="")
     square = [[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]
     fields: dict[str, dict[str, Any]] = {
-        "K of 2 rows": {"K": square[:2]}, "K of 4": {"K": np.eye(4)}, "K of text": {"K": "K"},
-        "K of 9 in a row": {"K": np.ravel(square)}, "K of NaN": {"K": np.full((3, 3), NAN)},
-        "K of complex numbers": {"K": np.array(square) * 1j}, "no size": {"ImageSize": None},
-        "size 0": {"ImageSize": [0, 0]}, "size huge": {"ImageSize": [48, 65500]}, "size of 3": {"ImageSize": [48, 64, 3]},
-        "1 radial coefficient": {"RadialDistortion": [0.1]}, "lens of text": {"RadialDistortion": "none"},
-        "lens of NaN": {"RadialDistortion": [NAN, 0.0]}, "principal point far outside": {
-            "K": [[60.0, 0, 1e5], [0, 60.0, 24], [0, 0, 1]]}, "K of structs": {"K": {"a": 1}},
-        "fisheye": {"MappingCoefficients": [1.0]}, "empty K": {"K": np.empty((0, 0))},
-    }  # fmt: skip
+        "K of 2 rows": {"K": square[:2]},
+        "K of 4": {"K": np.eye(4)},
+        "K of text": {"K": "K"},
+        "K of 9 in a row": {"K": np.ravel(square)},
+        "K of NaN": {"K": np.full((3, 3), NAN)},
+        "K of complex numbers": {"K": np.array(square) * 1j},
+        "no size": {"ImageSize": None},
+        "size 0": {"ImageSize": [0, 0]},
+        "size huge": {"ImageSize": [48, 65500]},
+        "size of 3": {"ImageSize": [48, 64, 3]},
+        "1 radial coefficient": {"RadialDistortion": [0.1]},
+        "lens of text": {"RadialDistortion": "none"},
+        "lens of NaN": {"RadialDistortion": [NAN, 0.0]},
+        "principal point far outside": {"K": [[60.0, 0, 1e5], [0, 60.0, 24], [0, 0, 1]]},
+        "K of structs": {"K": {"a": 1}},
+        "fisheye": {"MappingCoefficients": [1.0]},
+        "empty K": {"K": np.empty((0, 0))},
+    }
     for name, given in fields.items():
         yield _case(f"camera .mat, {name}", "--camera", "c.mat", c__mat=files.matlab(**given), says="c.mat")
 
@@ -187,15 +254,30 @@ def _depths() -> Iterator[Case]:
                 yield _case(f"{option}, {what} .{suffix}", option, f"d.{suffix}", **{f"d__{suffix}": content})
             if option == "--depth":
                 for i, broken in enumerate(files.damaged(data, 300 + number, 8)):
-                    yield _case(f"{option}, damaged .{suffix} {i}", option, f"d.{suffix}", wanted=Wanted.ORDERLY,
-                                **{f"d__{suffix}": broken})  # fmt: skip
+                    yield _case(
+                        f"{option}, damaged .{suffix} {i}",
+                        option,
+                        f"d.{suffix}",
+                        wanted=Wanted.ORDERLY,
+                        **{f"d__{suffix}": broken},
+                    )
     whole = files.depth()
     arrays: dict[str, Any] = {
-        "infinite": whole * INF, "NaN": whole * NAN, "negative": -whole, "zero": whole * 0, "turned": whole.T,
-        "integers": whole.astype(np.int32), "text": np.array([["a"]]), "complex": whole * 1j, "1D": whole[0],
-        "empty": np.empty((0, 0)), "5D": whole[None, None, None], "of 1e300 mm": whole.astype(float) * 1e300,
-        "of 1e-300 mm": whole.astype(float) * 1e-300, "of truths": whole > 0,
-    }  # fmt: skip
+        "infinite": whole * INF,
+        "NaN": whole * NAN,
+        "negative": -whole,
+        "zero": whole * 0,
+        "turned": whole.T,
+        "integers": whole.astype(np.int32),
+        "text": np.array([["a"]]),
+        "complex": whole * 1j,
+        "1D": whole[0],
+        "empty": np.empty((0, 0)),
+        "5D": whole[None, None, None],
+        "of 1e300 mm": whole.astype(float) * 1e300,
+        "of 1e-300 mm": whole.astype(float) * 1e-300,
+        "of truths": whole > 0,
+    }
     for name, values in arrays.items():
         for option in ("--depth", "--reference"):
             yield _case(f"{option}, {name}", option, "d.npy", d__npy=files.npy(values), says="d")
@@ -205,7 +287,7 @@ def _depths() -> Iterator[Case]:
     )
     yield _case("--depth, a header of 324 TB", "--depth", "d.npy", d__npy=header, says="d.npy")
     for value in ("inf", "nan", "-1", "0", "1e300", "1e-300", "1e308", "x", "", "d.txt", "1e999", "0x10", "1_0e9"):
-        yield _case(f"--depth {value}", "--depth", value, says="--depth" if value else "")
+        yield _case(f"--depth {value}", "--depth", value, says="--depth" if value not in ("", "d.txt") else "")
     for value in ("inf", "nan", "-1", "0", "1e300", "1e-300"):
         yield _case(f"--depth-scale {value}", "--depth", "d.npy", "--depth-scale", value, d__npy=files.npy(whole))
 
@@ -215,13 +297,21 @@ def _references() -> Iterator[Case]:
     for what, content in files.no_files(files.POSE):
         yield _case(f"pose, {what}", *given, m__ply=files.ply(), p__toml=content, says="p.toml")
     poses = {
-        "endless": "translation_mm = [inf, 0, 0]\nrotation = [[1,0,0],[0,1,0],[0,0,1]]", "no rotation": "matrix = 5",
-        "2 x 2": "matrix = [[1, 0], [0, 1]]", "mirrored": files.POSE.replace("[[1,", "[[-1,"),
-        "scaled": files.POSE.replace("1", "2"), "text": 'matrix = "identity"', "ragged": "matrix = [[1], [2, 3]]",
-        "unknown key": "position = [0, 0, 0]", "far": files.POSE.replace("40", "1e300"), "empty table": "[matrix]",
-        "zero": "matrix = [[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]", "NaN": files.POSE.replace("40", "nan"),
-        "last row": "matrix = [[1,0,0,0],[0,1,0,0],[0,0,1,40],[0,0,1,1]]", "truth": files.POSE.replace("40", "true"),
-    }  # fmt: skip
+        "endless": "translation_mm = [inf, 0, 0]\nrotation = [[1,0,0],[0,1,0],[0,0,1]]",
+        "no rotation": "matrix = 5",
+        "2 x 2": "matrix = [[1, 0], [0, 1]]",
+        "mirrored": files.POSE.replace("[[1,", "[[-1,"),
+        "scaled": files.POSE.replace("1", "2"),
+        "text": 'matrix = "identity"',
+        "ragged": "matrix = [[1], [2, 3]]",
+        "unknown key": "position = [0, 0, 0]",
+        "far": files.POSE.replace("40", "1e300"),
+        "empty table": "[matrix]",
+        "zero": "matrix = [[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0]]",
+        "NaN": files.POSE.replace("40", "nan"),
+        "last row": "matrix = [[1,0,0,0],[0,1,0,0],[0,0,1,40],[0,0,1,1]]",
+        "truth": files.POSE.replace("40", "true"),
+    }
     for name, text in poses.items():
         yield _case(f"pose, {name}", *given, m__ply=files.ply(), p__toml=text, says="p.toml")
     yield _case("reference without a pose", *given[:2], m__ply=files.ply(), says="--camera-from-model")
@@ -234,16 +324,32 @@ def _options() -> Iterator[Case]:
         yield _case(f"--fov {value}", "--fov", value)
     yield Case("reconstruct: no camera", ("reconstruct", "frame.png", "--out", "out"), {"frame.png": GOOD})
     yield _case("camera twice", "--fov", "60", "--camera", "c.toml", c__toml=files.CAMERA)
-    boxes = ("1,2,3", "0,0,65,48", "-1,0,5,5", "0,0,0,0", "a,b,c,d", "", "1.5,0,4,4", "1,2,3,4,5", "9" * 400 + ",0,1,1",
-             "0,0,inf,1", "0 0 1 1", "0,0,1e1,1", "63,47,2,2", "²,0,1,1")  # fmt: skip
+    boxes = (
+        "1,2,3",
+        "0,0,65,48",
+        "-1,0,5,5",
+        "0,0,0,0",
+        "a,b,c,d",
+        "",
+        "1.5,0,4,4",
+        "1,2,3,4,5",
+        "9" * 400 + ",0,1,1",
+        "0,0,inf,1",
+        "0 0 1 1",
+        "0,0,1e1,1",
+        "63,47,2,2",
+        "²,0,1,1",
+    )
     for box in boxes:
         yield _case(f"--roi {box[:20]}", "--roi", box)
     for value in ("-1", "nan", "inf", "1e9", "x", "51", "1e300"):
         yield _case(f"--smoothing {value}", "--smoothing", value)
     for option, values in {
         "--estimator": ("magic", "", "cone_axis,bisector", "a:b", "../x", "x" * 3000, "simtest.estimators.cone_axis"),
-        "--detector": ("magic", "", "a:b", "os:system"), "--encoding": ("rec709", ""), "--target": ("top", ""),
-    }.items():  # fmt: skip
+        "--detector": ("magic", "", "a:b", "os:system"),
+        "--encoding": ("rec709", ""),
+        "--target": ("top", ""),
+    }.items():
         for value in values:
             yield _case(f"{option} {value[:20] or '(nothing)'}", option, value)
     yield _case("estimator twice", "--estimator", "cone_axis", "--estimator", "cone_axis")

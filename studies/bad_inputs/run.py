@@ -23,6 +23,9 @@ HANG_S = 60.0
 LIMIT_MIB = 1500.0
 KILL_MIB = 4000.0
 LONGEST_LINE = 1000
+BAR = "\u2501"
+"""What a progress bar is drawn with."""
+
 _LOOK_S = 0.05
 _KEPT = frozenset({"PATH", "HOME", "LANG", "PYTHONPATH", "XDG_CACHE_HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"})
 
@@ -186,31 +189,30 @@ def _outcome(own: _Running, code: int, usage: resource.struct_rusage) -> Outcome
 def _faults(
     own: _Running, code: int, stderr: str, stdout: str, used: float, peak: float, left: list[str]
 ) -> Iterator[str]:
-    case = own.case
-    lines = [line for line in stderr.splitlines() if line and not line.startswith("simtest: warning:")]
-    # what no case may do
+    """Yield what is wrong with a case's end; of a killed one only why it was killed."""
     if own.killed:
         yield own.killed
         return
-    if used > LIMIT_S:
-        yield "slow"
-    if peak > LIMIT_MIB:
-        yield "memory"
-    if code < 0:
-        yield "crash"
-    if "internal error" in stderr or "a worker failed" in stderr:
-        yield "internal error"
-    if "Traceback" in stderr + stdout:
-        yield "traceback"
-    # what must be refused
-    if code == 0:
-        if case.wanted is Wanted.REFUSED:
-            yield "accepted"
-        return
-    if case.wanted is Wanted.DONE:
-        yield "refused"
-    if case.wanted is Wanted.REFUSED and left:
-        yield f"left {', '.join(left[:3])}"
+    wrong = {
+        "slow": used > LIMIT_S,
+        "memory": peak > LIMIT_MIB,
+        "crash": code < 0,
+        "internal error": "internal error" in stderr or "a worker failed" in stderr,
+        "traceback": "Traceback" in stderr + stdout,
+        "accepted": code == 0 and own.case.wanted is Wanted.REFUSED,
+        "refused": code != 0 and own.case.wanted is Wanted.DONE,
+        f"left {', '.join(left[:3])}": bool(left) and code != 0 and own.case.wanted is Wanted.REFUSED,
+    }
+    yield from (what for what, so in wrong.items() if so)
+    if code:
+        yield from _unclear(own.case, code, stderr, stdout)
+
+
+def _unclear(case: Case, code: int, stderr: str, stdout: str) -> Iterator[str]:
+    """Yield what is wrong with a refusal's text."""
+    lines = [
+        line for line in stderr.splitlines() if line and not line.startswith("simtest: warning:") and BAR not in line
+    ]
     # A verdict stands in the output.
     verdict = code == 1 and stdout.strip() and case.name.startswith(("mesh check", "dataset verify", "doctor"))
     if len(lines) != 1 and not (verdict and not lines):

@@ -328,7 +328,7 @@ def test_export_writes_what_mitsuba_loads(here, tmp_path):
 
 @pytest.mark.render
 def test_a_scene_out_of_sight(here):
-    code, output, errors = here("render", "sphere", *SET_SMALL, "--set", "camera.cx=1e6", "--out", "x")
+    code, output, errors = here("render", "sphere", *SET_SMALL, "--set", "camera.cx=470", "--out", "x")
     assert (code, output) == (2, "")
     assert errors == ["simtest: scene sphere: no pixel sees the surface; move it, or widen the field of view"]
 

@@ -1,0 +1,178 @@
+"""Two runs on one folder, stops by a signal, and disks that are full: one line each, and nothing lost."""
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from simtest.cli.stopping import Termination
+from simtest.dataset.maker import Maker  # noqa: F401  (the dataset command's imports, before the fork)
+from simtest.errors import InputError
+from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
+from simtest.runtime.machine_errors import machine_problem
+from tests.refusals import refused
+
+MAIN = "from simtest.cli.main import main; main()"
+
+
+def entered(context):
+    with context:
+        pass
+
+
+def test_a_folder_in_use_is_refused_with_its_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/bin/simtest", "validate", "my experiment"])
+    folder = tmp_path / "a" / "out"
+    with exclusive_folder(folder):
+        assert is_held(folder / LOCK)
+        told = f"--out {folder}: is in use by process {os.getpid()} (simtest validate 'my experiment', since 20"
+        refused(lambda: entered(exclusive_folder(folder)), told, "; wait until it ends, or name another")
+        (folder / "results").touch()
+    assert [path.name for path in folder.iterdir()] == ["results"]
+    entered(exclusive_folder(folder))
+
+
+def test_what_stays_empty_is_removed(tmp_path):
+    with pytest.raises(InputError, match="stop"), exclusive_folder(tmp_path / "a" / "b"):
+        raise InputError("stop")
+    assert list(tmp_path.iterdir()) == []
+    # A folder that was there stays.
+    (tmp_path / "c").mkdir()
+    entered(exclusive_folder(tmp_path / "c"))
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+
+
+@pytest.mark.parametrize("held", [b"", b"{", b"[]", json.dumps({"process": 1, "machine": "x"}).encode(), b"\xff" * 9])
+def test_a_lock_left_behind_locks_nothing(tmp_path, held):
+    (tmp_path / LOCK).write_bytes(held)
+    entered(exclusive_folder(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_a_killed_process_is_stale(tmp_path):
+    code = "import sys, time\nfrom pathlib import Path\nfrom simtest.runtime.locks import exclusive_folder\n"
+    code += "with exclusive_folder(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+    child = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "held\n"
+    refused(lambda: entered(exclusive_folder(tmp_path)), f"is in use by process {child.pid} (-c ")
+    child.kill()
+    child.communicate()
+    assert (tmp_path / LOCK).is_file()
+    entered(exclusive_folder(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_another_machine_is_named(tmp_path, monkeypatch):
+    with exclusive_file(tmp_path / "m.ply"):
+        monkeypatch.setattr(socket, "gethostname", lambda: "elsewhere")
+        refused(lambda: entered(exclusive_file(tmp_path / "m.ply")), f"process {os.getpid()} on ", "--out ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / LOCK).symlink_to(tmp_path / "mine.txt")
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+# Signals ----------------------------------------------------------------------------------------------------------
+
+
+def test_termination_is_answered_as_ctrl_c_is():
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    presses = []
+    stop = Termination()
+    try:
+        stop.listen()
+        signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
+        signal.raise_signal(signal.SIGTERM)
+        assert (presses, stop.came) == (["press"], True)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        signal.signal(signal.SIGINT, before[1])
+
+
+def command(folder, *arguments, **options):
+    return subprocess.Popen([sys.executable, "-c", MAIN, *arguments], cwd=folder, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, text=True, **options)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_second_run_is_refused_and_sigterm_ends_the_first(tmp_path):
+    given = ("dataset", "tiny", "--samples", "400", "--set", "samples_per_anatomy=10", "--workers", "2", "--out", "d")
+    first = command(tmp_path, *given)
+    while not list((tmp_path).glob("d/*.part")) and first.poll() is None:
+        time.sleep(0.05)
+    second = command(tmp_path, *given)
+    _, errors = second.communicate(timeout=300)
+    assert second.returncode == 2
+    assert errors.startswith(f"simtest: --out d: is in use by process {first.pid} (")
+    first.send_signal(signal.SIGTERM)
+    _, errors = first.communicate(timeout=300)
+    assert first.returncode == 143
+    assert errors.splitlines()[-1].startswith("simtest: terminated; what is finished is kept")
+    assert not (tmp_path / "d" / LOCK).exists()
+
+
+# Disk and memory --------------------------------------------------------------------------------------------------
+
+
+def test_a_disk_that_is_full_is_named_with_file_and_room(tmp_path):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as error:
+        write_atomically(tmp_path / "results.parquet", full)
+    said = machine_problem(error.value)
+    assert said.startswith(f"{tmp_path / 'results.parquet'}: No space left on device; ")
+    assert f"MB are free on the disk of {tmp_path}" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_writer_that_says_false_has_failed(tmp_path):
+    with pytest.raises(OSError, match="is the disk full"):
+        write_atomically(tmp_path / "x.png", lambda part: part.write_bytes(b"half") < 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_limit_of_the_system_is_named(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large") as error:
+            write_json(tmp_path / "x.json", ["x" * 2000])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert machine_problem(error.value) == (
+        f"{tmp_path / 'x.json'}: File too large; the system limits the size of a file (ulimit -f)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError("Unable to allocate 9 GiB"), "not enough memory (Unable to allocate 9 GiB); smaller frames"),
+        (MemoryError(), "not enough memory; smaller frames"),
+        (RecursionError("maximum recursion depth exceeded"), "a value is nested too deeply"),
+        (RuntimeError("write failed: (os error 28)"), "write failed: (os error 28); "),
+        (OSError(36, "File name too long", "n" * 500), "...: File name too long"),
+        (ZeroDivisionError("division by zero"), None),
+        (OSError("no number"), None),
+    ],
+)
+def test_errors_of_the_machine_are_told_from_faults(error, said):
+    found = machine_problem(error)
+    assert (found is None) == (said is None)
+    assert said is None or said in found
