@@ -44,17 +44,17 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
     # Before any folder is touched.
     planned = plan_run(profile)
     left = "what earlier nights wrote is as it was"
-    with disk_errors_in_one_line(reports.root, "the night could not be written", left):
-        with only_night(reports, profile.name):
-            # Before the work: a damaged baseline must not cost a run.
-            baseline = load_baseline(reports, profile.name)
-            remove_dead(reports)
-            run_id = new_run_id(datetime.now(UTC))
-            with scratch(reports, run_id) as folder:
-                run = measure_run(profile, folder, run_id, options, planned)
-                judged = judge(run, baseline, reports)
-                judged = draw(judged, profile, folder / "tonight", options.variant)
-                return _published(reports, judged, folder / "tonight")
+    disk = disk_errors_in_one_line(reports.root, "the night could not be written", left)
+    with disk, only_night(reports, profile.name):
+        # Before the work: a damaged baseline must not cost a run.
+        baseline = load_baseline(reports, profile.name)
+        remove_dead(reports)
+        run_id = new_run_id(datetime.now(UTC))
+        with scratch(reports, run_id) as folder:
+            run = measure_run(profile, folder, run_id, options, planned)
+            judged = judge(run, baseline, reports)
+            judged = draw(judged, profile, folder / "tonight", options.variant)
+            return _published(reports, judged, folder / "tonight")
 
 
 def _published(reports: Reports, judged: JudgedRun, page: Path) -> Outcome:

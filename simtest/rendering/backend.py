@@ -88,8 +88,8 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
     name = variant or os.environ.get(VARIANT_VARIABLE) or LLVM
     if name not in DEVICES and not VARIANT_NAME.fullmatch(name):
         raise BackendError(
-            f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join(DEVICES)}, or a Mitsuba variant by name, "
-            "such as llvm_ad_rgb"
+            f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join(DEVICES)}, or a Mitsuba variant by "
+            "name, such as llvm_ad_rgb"
         )
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 

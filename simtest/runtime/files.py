@@ -46,8 +46,8 @@ def require_plain(path: Path) -> Path:
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it.
 
-    `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the file, also where
-    the system's own does not (a full disk), or where `write` returns False, as OpenCV does.
+    `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the file, also
+    where the system's own does not (a full disk), or where `write` returns False, as OpenCV does.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:

@@ -68,7 +68,8 @@ def main() -> int:
 def _print(outcome: Outcome, log: Path | None) -> None:
     text = (
         f"{outcome.case.name}: {'; '.join(outcome.faults) or 'sound'} "
-        f"[exit {outcome.code}, {outcome.processor_s:.1f} s, {outcome.peak_mib:.0f} MiB]\n    {outcome.stderr.strip()[-400:]}"
+        f"[exit {outcome.code}, {outcome.processor_s:.1f} s, {outcome.peak_mib:.0f} MiB]\n"
+        f"    {outcome.stderr.strip()[-400:]}"
     )
     print(text, flush=True)
     if log:

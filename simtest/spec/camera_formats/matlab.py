@@ -32,10 +32,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
     where, fields = shown(path), _struct(path)
     if "MappingCoefficients" in fields:
         raise InputError(f"{where}: MappingCoefficients: MATLAB's fisheye model is not known; must be cameraParameters")
-    if "K" in fields:
-        matrix = _matrix(fields, "K", where)
-    else:
-        matrix = _matrix(fields, "IntrinsicMatrix", where).T
+    matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
     # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
