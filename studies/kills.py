@@ -7,7 +7,6 @@ disturbances the command runs undisturbed, and what it has made is compared byte
 import argparse
 import contextlib
 import json
-import os
 import random
 import resource
 import shutil
@@ -34,7 +33,7 @@ TERMINATED = 143
 EXPERIMENT = """realisations = 250
 [[groups]]
 scene = "published"
-sweep = [{ "paper.epsilon_over_d" = [0.0, 0.02, 0.05, 0.1] }]
+sweep = [{ "paper.eps" = [0.0, 0.02, 0.05, 0.1] }]
 [[groups]]
 scene = "plane"
 realisations = 4
@@ -96,10 +95,12 @@ def _night_files(folder: Path) -> dict[str, str]:
 
 
 TARGETS = {
-    "validate": Target(("validate", "x.toml", "--workers", "2", "--out"), _run_files, ("**/.*.part*", "**/.lock", "parts")),
+    "validate": Target(
+        ("validate", "x.toml", "--workers", "2", "--out"), _run_files, ("**/.*.part*", "**/.lock", "parts"),
+    ),
     "dataset": Target(
-        ("dataset", "tiny", "--samples", "24", "--set", "samples_per_anatomy=4", "--set", "shard_mb=0.1", "--workers", "2",
-         "--out"), _all_files, ("*.part*", ".*.part*", ".lock"),
+        ("dataset", "tiny", "--samples", "24", "--set", "samples_per_anatomy=4", "--set", "shard_mb=0.1",
+         "--workers", "2", "--out"), _all_files, ("*.part*", ".*.part*", ".lock"),
     ),
     "nightly": Target(
         ("nightly", "--profile", "p.toml", "--workers", "2", "--reports"), _night_files,
@@ -165,10 +166,10 @@ def _disturbed(target: Target, folder: Path, cwd: Path, kind: str, after_s: floa
     lines = [line for line in errors.splitlines() if line.startswith("simtest: ") and "warning" not in line]
     code = process.returncode
     clear = {"kill": code in (0, -9), "term": code in (0, TERMINATED), "full": code in (0, 1, 2)}[kind]
-    if not clear or (code > 0 and (len(lines) != 1 or "internal error" in lines[0])):
-        # Before main listens, SIGTERM ends a process as it ends any.
-        if not (kind == "term" and code == -signal.SIGTERM):
-            tally.unclear += 1
+    # Before main listens, SIGTERM ends a process as it ends any.
+    early = kind == "term" and code == -signal.SIGTERM
+    if not early and (not clear or (code > 0 and (len(lines) != 1 or "internal error" in lines[0]))):
+        tally.unclear += 1
     return f"exit {code}{f': {lines[-1][:200]}' if lines else ''}"
 
 
@@ -191,9 +192,8 @@ def _disk(path: Path) -> Iterator[tuple[Path, Callable[[float | None], None]]]:
     A small disk in memory where that may be mounted, else a limit of the size of single files.
     """
     path.mkdir()
-    mounted = (
-        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1g", "tmpfs", path], capture_output=True).returncode == 0
-    )
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1g", "tmpfs", str(path)]
+    mounted = subprocess.run(mount, capture_output=True).returncode == 0
 
     def resize(size: float | None) -> None:
         if mounted:

@@ -30,7 +30,7 @@ def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = 
                 files.append(out / f"{made.key}.{suffix}")
                 files[-1].write_bytes(data)
         except OSError as error:
-            raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error) or error})") from error
+            raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files
 
 

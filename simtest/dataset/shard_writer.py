@@ -153,8 +153,8 @@ def _one_line_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"--out {shown(folder)}: cannot be written ({disk_problem(error) or error}); what is written stays valid, "
-            "and the same command goes on from there"
+            f"--out {shown(folder)}: cannot be written ({disk_problem(error, folder) or error}); what is written stays "
+            "valid, and the same command goes on from there"
         ) from error
 
 

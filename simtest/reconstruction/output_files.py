@@ -63,7 +63,7 @@ def write_outputs(
         write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
         write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error) or error})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return [out / name for name in FILES]
 
 

@@ -201,5 +201,5 @@ def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[P
         write_json(files[1], tracks, compact=True)
         write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error) or error})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files

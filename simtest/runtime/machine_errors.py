@@ -16,8 +16,11 @@ _OS_ERROR = re.compile(r"\(os error (\d+)\)")
 """How libraries written in Rust (polars) hand an error of the system on."""
 
 
-def disk_problem(error: BaseException) -> str | None:
-    """Return an error of the disk as text: the file, what is wrong, what is free; None for any other error."""
+def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
+    """Return an error of the disk as text: the file, what is wrong, what is free; None for any other error.
+
+    `near` is a path on the same disk, for errors that name no file.
+    """
     number = error.errno if isinstance(error, OSError) else None
     if number is None and (found := _OS_ERROR.search(str(error))):
         number = int(found[1])
@@ -27,7 +30,7 @@ def disk_problem(error: BaseException) -> str | None:
     what = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
     file = f"{shown(name, 200)}: " if name else ""
     if number in (errno.ENOSPC, errno.EDQUOT):
-        return f"{file}{what}; {_free(name)}"
+        return f"{file}{what}; {_free(name or near)}"
     if number == errno.EFBIG:
         return f"{file}{what}; the system limits the size of a file (ulimit -f)"
     return f"{file}{what}"
@@ -43,7 +46,7 @@ def machine_problem(error: BaseException) -> str | None:
     return disk_problem(error)
 
 
-def _free(name: str | None) -> str:
+def _free(name: str | Path | None) -> str:
     """Return how much of a file's disk is free."""
     path = Path(name or ".").absolute()
     for folder in (path, *path.parents):

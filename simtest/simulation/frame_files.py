@@ -82,7 +82,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
         write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error) or error})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files
 
 
