@@ -104,6 +104,8 @@ def _read_npy(path: Path) -> npt.NDArray[np.generic]:
     except Exception as error:
         # NumPy raises whatever the header, which it evaluates as a literal, runs into.
         told = " ".join(str(error).split())[:120] or type(error).__name__
+        if "pickle" in told or "Python objects" in told:
+            told = "it holds Python objects, which are never loaded"
         raise InputError(f"{shown(path)}: no NPY file, or a damaged one ({told})") from None
     if values.dtype.kind not in "iuf":
         raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be numbers")

@@ -248,7 +248,7 @@ BAD = {
     "no size": ("c.json", swapped('"image_width": 640, ', ""), "image_width: missing; a camera needs the size"),
     "no K": ("c.json", swapped('"K"', '"L"'), "camera_matrix: missing; allowed names: camera_matrix, cameraMatrix"),
     "two K": ("c.json", swapped('"D"', '"cameraMatrix": 1, "D"'), "K: given beside cameraMatrix; only one"),
-    "short K": ("c.json", swapped(", [0, 0, 1]", ""), "K: 6 values; must be 9"),
+    "short K": ("c.json", swapped(", [0, 0, 1]", ""), "K: rows of [3, 3] values; must be 3 rows of 3"),
     "text in K": ("c.json", swapped("319.5", '"319.5"'), "K = [[400, 0, '319.5']"),
     "NaN in K": ("c.json", swapped("319.5", "NaN"), "cx = nan: must be a finite number"),
     "transposed K": (
@@ -306,7 +306,7 @@ HOSTILE = {
     "deep keys": ("? " * 400_000, "line 1: nested too deeply; at most 32 levels are allowed"),
     "deep maps": ("{" * 900_000, "line 1: nested too deeply; at most 32 levels are allowed"),
     "huge row": ("a: [" + "1," * 110_000 + "1]", "line 1: too many values; at most 100000 are allowed"),
-    "huge file": ("a: [" + "1," * 500_000 + "1]", "1000006 bytes; a camera file of at most 1000000 is allowed"),
+    "huge file": ("a: [" + "1," * 500_000 + "1]", "1000006 bytes; at most 1000000 are allowed"),
     "NaN": (ROS_FILE.replace("438.78", ".nan"), "fx = nan: must be a finite number"),
     "infinity": (ROS_FILE.replace("438.78", "-.inf"), "fx = -inf: must be a finite number"),
     "many digits": (ROS_FILE.replace("438.78", "9" * 5000), "fx = inf: must be a finite number"),
