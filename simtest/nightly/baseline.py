@@ -75,6 +75,9 @@ def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
 
 def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
+    # Nothing is made where there never was a night.
+    if not source.parent.is_dir():
+        raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
     reports.make()
     # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
@@ -101,7 +104,9 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
 def _replaced(reports: Reports, profile: str) -> str | None:
     """Return the id of the run that was the baseline, if its record can still be read."""
     try:
-        found = json.loads(require_plain(reports.baseline(profile) / RUN_FILE).read_text(encoding="utf-8"))
+        found = json.loads(
+            require_plain(reports.baseline(profile) / RUN_FILE, "record_bytes").read_text(encoding="utf-8")
+        )
         return str(found["id"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -84,7 +84,7 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
     try:
-        data = json.loads(require_plain(path).read_text(encoding="utf-8"))
+        data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

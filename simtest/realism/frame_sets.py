@@ -111,6 +111,8 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     """
     if not 1 <= count <= limit("generated_frames"):
         raise InputError(f"--count {count}: must be 1 to {limit('generated_frames')}")
+    if not against.strip():
+        raise InputError("--against is empty; must be a dataset's folder, a folder of pictures, or a scene")
     path = Path(against)
     if path.is_dir() and (path / "manifest.json").is_file():
         return _dataset(path, count, surfaces)

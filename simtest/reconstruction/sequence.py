@@ -161,7 +161,7 @@ class _Run:
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        frame = TrackedFrame.from_json(json.loads(require_plain(path).read_text(encoding="utf-8")))
+        frame = TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return frame if frame.name == name else None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.limits import limit
 from simtest.runtime.resources import shown
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -36,10 +37,16 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
 
 
-def require_plain(path: Path) -> Path:
-    """Return a path that is a plain file; raise `OSError` if it is none: a pipe or a device might never end."""
-    if not stat.S_ISREG(path.stat().st_mode):
+def require_plain(path: Path, limited_by: str | None = None) -> Path:
+    """Return a path that is a plain file, and within a limit of `simtest.runtime.limits` where one is named.
+
+    Raises `OSError` if it is none: a pipe or a device might never end.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.ENXIO, "is no plain file", str(path))
+    if limited_by is not None and found.st_size > limit(limited_by):
+        raise OSError(errno.EFBIG, f"{found.st_size} bytes; at most {limit(limited_by)} are allowed", str(path))
     return path
 
 

@@ -21,6 +21,7 @@ DEFAULTS = {
     "film_bytes": 5_000_000_000,
     "mesh_bytes": 400_000_000,  # five million faces, binary or as text
     "manifest_bytes": 100_000_000,
+    "record_bytes": 20_000_000,  # JSON that a run has written
     # pictures and frames, px
     "picture_pixels": 40_000_000,  # 8K has 33 million; every map of a picture takes 8 bytes a pixel
     "picture_side": 16_384,

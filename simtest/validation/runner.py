@@ -371,7 +371,7 @@ def _record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = json.loads(require_plain(folder / "summary.json").read_text(encoding="utf-8"))["run"]
+        record = json.loads(require_plain(folder / "summary.json", "record_bytes").read_text(encoding="utf-8"))["run"]
         return dict(record) if "fingerprint" in record else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

@@ -114,7 +114,7 @@ def picture(width: int = WIDTH, height: int = HEIGHT) -> Any:
     """Return a picture of a highlight, of 8 bits, shape (H, W, 3)."""
     rows, columns = np.mgrid[:height, :width]
     spot = np.exp(-((columns - width / 2) ** 2 + (rows - height / 2) ** 2) / (width * height / 60))
-    return (60 + 190 * spot[..., None] * [1, 1, 1] * np.ones(3)).clip(0, 255).astype(np.uint8)
+    return ([60, 70, 110] + 190 * spot[..., None]).clip(0, 255).astype(np.uint8)
 
 
 def encoded(suffix: str, values: Any = None) -> bytes:

@@ -1,6 +1,7 @@
 """Run cases in forked children of a process that has loaded the commands; judge and repeat what looks wrong."""
 
 import os
+import re
 import resource
 import shutil
 import signal
@@ -23,7 +24,7 @@ HANG_S = 60.0
 LIMIT_MIB = 1500.0
 KILL_MIB = 4000.0
 LONGEST_LINE = 1000
-BAR = "\u2501"
+BAR = re.compile("[\u2501\u2800-\u28ff]")
 """What a progress bar is drawn with."""
 
 _LOOK_S = 0.05
@@ -211,7 +212,9 @@ def _faults(
 def _unclear(case: Case, code: int, stderr: str, stdout: str) -> Iterator[str]:
     """Yield what is wrong with a refusal's text."""
     lines = [
-        line for line in stderr.splitlines() if line and not line.startswith("simtest: warning:") and BAR not in line
+        line
+        for line in stderr.splitlines()
+        if line and not line.startswith("simtest: warning:") and not BAR.search(line)
     ]
     # A verdict stands in the output.
     verdict = code == 1 and stdout.strip() and case.name.startswith(("mesh check", "dataset verify", "doctor"))
