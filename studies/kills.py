@@ -1,6 +1,6 @@
 """Stop `validate`, `dataset` and `nightly` by kill -9, SIGTERM and full disks; the same command must mend everything.
 
-`python -m studies.kills` disturbs each command 30, 10 and 10 times; `--command validate` one of them. After some
+`python -m studies.kills` disturbs each command 30, 10 and 10 times, and kills a worker of it 5 times; `--command validate` one of them. After some
 disturbances the command runs undisturbed, and what it has made is compared byte by byte with an undisturbed run's.
 """
 
@@ -25,7 +25,7 @@ import psutil
 from benchmarks.measuring import Figure, print_figures
 from simtest.runtime.provenance import file_hash
 
-DISTURBANCES = {"kill": 30, "term": 10, "full": 10}
+DISTURBANCES = {"kill": 30, "term": 10, "full": 10, "worker": 5}
 BETWEEN = 4
 """At most so many disturbances come before the command runs undisturbed."""
 
@@ -158,19 +158,33 @@ def _disturbed(target: Target, folder: Path, cwd: Path, kind: str, after_s: floa
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(after_s)
         children = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
-        process.send_signal(signal.SIGKILL if kind == "kill" else signal.SIGTERM)
+        if kind == "worker":
+            # The run goes on without it.
+            workers = [child for child in children if _is_worker(child)]
+            for worker in workers[:1]:
+                worker.kill()
+        else:
+            process.send_signal(signal.SIGKILL if kind == "kill" else signal.SIGTERM)
         _, errors = process.communicate()
         # Workers notice that their parent has gone.
         _, alive = psutil.wait_procs(children, timeout=20)
         tally.orphans += len(alive)
     lines = [line for line in errors.splitlines() if line.startswith("simtest: ") and "warning" not in line]
     code = process.returncode
-    clear = {"kill": code in (0, -9), "term": code in (0, TERMINATED), "full": code in (0, 1, 2)}[kind]
+    clear = {"kill": code in (0, -9), "term": code in (0, TERMINATED), "full": code in (0, 1, 2), "worker": code == 0}[
+        kind
+    ]
     # Before main listens, SIGTERM ends a process as it ends any.
     early = kind == "term" and code == -signal.SIGTERM
     if not early and (not clear or (code > 0 and (len(lines) != 1 or "internal error" in lines[0]))):
         tally.unclear += 1
     return f"exit {code}{f': {lines[-1][:200]}' if lines else ''}"
+
+
+def _is_worker(child: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.Error):
+        return any("spawn_main" in word for word in child.cmdline())
+    return False
 
 
 def _start(target: Target, folder: Path, cwd: Path) -> subprocess.Popen[str]:
