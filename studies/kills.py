@@ -1,7 +1,8 @@
 """Stop `validate`, `dataset` and `nightly` by kill -9, SIGTERM and full disks; the same command must mend everything.
 
-`python -m studies.kills` disturbs each command 30, 10 and 10 times, and kills a worker of it 5 times; `--command validate` one of them. After some
-disturbances the command runs undisturbed, and what it has made is compared byte by byte with an undisturbed run's.
+`python -m studies.kills` disturbs each command 30, 10 and 10 times, and kills a worker of it 5 times; `--command` names
+one of them. After some disturbances the command runs undisturbed, and what it has made is compared byte by byte with an
+undisturbed run's.
 """
 
 import argparse

@@ -19,10 +19,11 @@ def loaded(name):
 
 
 def test_packages_that_could_not_be_looked_up_are_counted():
+    faults = [{"id": "CVE-1", "fix_versions": ["3"]}, {"id": "CVE-2", "fix_versions": []}]
     report = {
         "dependencies": [
             {"name": "a", "version": "1", "vulns": []},
-            {"name": "b", "version": "2", "vulns": [{"id": f"CVE-{i}", "fix_versions": v} for i, v in ((1, ["3"]), (2, []))]},
+            {"name": "b", "version": "2", "vulns": faults},
             {"name": "c", "skip_reason": "not found"},
         ]
     }  # fmt: skip
