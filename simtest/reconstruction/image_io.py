@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image as PillowImage
-from PIL import TiffImagePlugin
 
 from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
@@ -90,6 +89,8 @@ def _check_header(path: Path) -> None:
 
 def _tiff_size(path: Path) -> tuple[int, int]:
     """Return the size that a TIFF file announces whose pixels Pillow does not know; 0, 0 where it is none."""
+    from PIL import TiffImagePlugin
+
     try:
         with path.open("rb") as file:
             tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))

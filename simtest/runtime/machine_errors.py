@@ -54,5 +54,5 @@ def _free(name: str | Path | None) -> str:
             usage = shutil.disk_usage(folder)
         except OSError:
             continue
-        return f"{usage.free / 1e6:.0f} of {usage.total / 1e6:.0f} MB are free on the disk of {shown(folder, 120)}"
+        return f"{usage.free / 1e6:.4g} of {usage.total / 1e6:.4g} MB are free on the disk of {shown(folder, 120)}"
     return "the disk is full"
