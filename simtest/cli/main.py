@@ -72,9 +72,9 @@ def main() -> None:
         sys.exit(APP())
     warnings.showwarning = _warn
     try:
-        stop.listen()
-        # A command's result is its exit code.
-        code = APP(exit_on_error=False, print_error=False, result_action="return_value")
+        with stop:
+            # A command's result is its exit code.
+            code = APP(exit_on_error=False, print_error=False, result_action="return_value")
         # Output may wait in a buffer whose reader has gone.
         sys.stdout.flush()
     except (CycloptsError, InputError) as error:

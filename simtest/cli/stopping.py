@@ -3,6 +3,7 @@
 import signal
 import threading
 from types import FrameType
+from typing import Any
 
 
 class Termination:
@@ -10,11 +11,18 @@ class Termination:
 
     def __init__(self) -> None:
         self.came = False
+        self._before: Any = None
 
-    def listen(self) -> None:
+    def __enter__(self) -> "Termination":
         """Answer SIGTERM from now on; in a thread, which gets no signals, nothing is done."""
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, self._answer)
+            self._before = signal.signal(signal.SIGTERM, self._answer)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave SIGTERM to whoever answered it before."""
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
 
     def _answer(self, number: int, frame: FrameType | None) -> None:
         self.came = True

@@ -12,7 +12,6 @@ import time
 import pytest
 
 from simtest.cli.stopping import Termination
-from simtest.dataset.maker import Maker  # noqa: F401  (the dataset command's imports, before the fork)
 from simtest.errors import InputError
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
@@ -89,17 +88,16 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
 def test_termination_is_answered_as_ctrl_c_is():
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     presses = []
-    stop = Termination()
     try:
-        stop.listen()
-        signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
-        signal.raise_signal(signal.SIGTERM)
-        assert (presses, stop.came) == (["press"], True)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with pytest.raises(KeyboardInterrupt):
+        with Termination() as stop:
+            signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
             signal.raise_signal(signal.SIGTERM)
+            assert (presses, stop.came) == (["press"], True)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) == before[0]
     finally:
-        signal.signal(signal.SIGTERM, before[0])
         signal.signal(signal.SIGINT, before[1])
 
 
