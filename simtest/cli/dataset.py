@@ -127,5 +127,8 @@ def preview(
 ) -> None:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
     from simtest.dataset.preview import write_preview
+    from simtest.runtime.locks import exclusive_file
 
-    print(write_preview(folder, out or Path("preview.html"), samples))
+    page = out or Path("preview.html")
+    with exclusive_file(page):
+        print(write_preview(folder, page, samples))

@@ -11,7 +11,6 @@ from typing import Any
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
 
-
 OWN = "simtest"
 """This package's name, and that of its top module."""
 

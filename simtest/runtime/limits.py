@@ -37,7 +37,6 @@ DEFAULTS = {
     "workers": 256,
     "views": 1000,
     "generated_frames": 10_000,  # that realism takes or fit renders
-    "previewed_samples": 1000,
 }
 
 

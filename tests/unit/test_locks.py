@@ -11,12 +11,16 @@ import time
 
 import pytest
 
+from simtest.cli.main import main
 from simtest.cli.stopping import Termination
 from simtest.errors import InputError
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
 from simtest.runtime.machine_errors import machine_problem
+from studies.bad_inputs import files
 from tests.refusals import refused
+
+pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
 MAIN = "from simtest.cli.main import main; main()"
 
@@ -174,3 +178,62 @@ def test_errors_of_the_machine_are_told_from_faults(error, said):
     found = machine_problem(error)
     assert (found is None) == (said is None)
     assert said is None or said in found
+
+
+# Each command -----------------------------------------------------------------------------------------------------
+
+FOLDERS = {
+    "render": ("render", "plane", "--out", "held"),
+    "export": ("export", "plane", "--out", "held"),
+    "views": ("views", "anatomy", "--count", "1", "--out", "held"),
+    "validate": ("validate", "overview", "--out", "held"),
+    "dataset": ("dataset", "tiny", "--out", "held"),
+    "reconstruct": ("reconstruct", "a.png", "--fov", "60", "--out", "held"),
+    "reconstruct a folder": ("reconstruct", "frames", "--fov", "60", "--out", "held"),
+    "realism": ("realism", "a.png", "--against", "plane", "--out", "held"),
+    "fit's bank": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--bank", "held", "--out", "x.toml"),
+}
+FILES = {
+    "fit": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--out", "held.toml"),
+    "mesh": ("mesh", "colon", "--out", "held.ply"),
+    "view": ("view", "plane", "--screenshot", "held.png"),
+    "preview": ("dataset", "preview", "nothing", "--out", "held.html"),
+    "nightly": ("nightly", "--profile", "quick", "--reports", "."),
+}
+
+
+@pytest.fixture
+def run_here(tmp_path, monkeypatch, capsys):
+    """Run commands in a folder with some pictures; return exit code and lines of the error stream."""
+    (tmp_path / "frames").mkdir()
+    for path in (tmp_path / "a.png", tmp_path / "frames" / "a.png"):
+        path.write_bytes(files.encoded(".png"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["simtest", *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr().err.splitlines()
+
+    return run
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_each_command_is_refused_a_folder_in_use(tmp_path, run_here, name):
+    with exclusive_folder(tmp_path / "held"):
+        code, lines = run_here(*FOLDERS[name])
+    option = "--bank" if "bank" in name else "--out"
+    assert (code, len(lines)) == (2, 1)
+    assert lines[0].startswith(f"simtest: {option} held: is in use by process {os.getpid()} (")
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
+    held = "quick" if name == "nightly" else FILES[name][-1]
+    with exclusive_file(tmp_path / held):
+        code, lines = run_here(*FILES[name])
+    assert (code, len(lines)) == (2, 1)
+    assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
