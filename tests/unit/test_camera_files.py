@@ -242,6 +242,11 @@ BAD = {
     "missing comma": ("c.yml", "a: [1 [2]]\n", "line 1: expected ',' or ']', but got '['"),
     "broken XML": ("c.xml", "<?xml version='1.0'?><opencv_storage><a>", "not valid XML: "),
     "deep YAML": ("c.yaml", "a: " + "[" * 9999 + "]" * 9999, "line 1: nested too deeply"),
+    "entities": (
+        "c.xml",
+        "<!DOCTYPE a [<!ENTITY b 'bb'>]><opencv_storage><a>&b;</a></opencv_storage>",
+        "not valid XML: document types and entities are not allowed",
+    ),
     "deep XML": ("c.xml", "<?xml version='1.0'?>" + "<a>" * 60_000 + "</a>" * 60_000, "nested too deeply"),
     "open XML": ("c.xml", "<?xml version='1.0'?><opencv_storage><a>1</b></opencv_storage>", "not valid XML: mism"),
     "deep JSON": ("c.json", '{"a": ' + "[" * 100_000, "not valid JSON: "),
