@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.measuring import Figure, print_figures
-from studies.bad_inputs import other_cases, reconstruct_cases, spec_cases
+from studies.bad_inputs import files, other_cases, reconstruct_cases, spec_cases
 from studies.bad_inputs.case import Case
 from studies.bad_inputs.run import LIMIT_MIB, LIMIT_S, Outcome, executed, forked, preload, run_all
 
@@ -42,10 +42,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="cases whose name holds this text")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--draw", type=int, default=0, help="which random damage; nothing was mended after draw 1")
     parser.add_argument("--commands", action="store_true", help="start each as a command of its own")
     parser.add_argument("--show", action="store_true", help="print every case's line")
     parser.add_argument("--log", type=Path, help="file to write each case with a fault to, at once")
     given = parser.parse_args()
+    files.Draw.number = given.draw
     cases = [case for case in all_cases() if given.only in case.name]
     preload()
     outcomes: list[Outcome] = []

@@ -286,9 +286,15 @@ def no_files(start: bytes | str) -> Iterator[tuple[str, Any]]:
 # Damage -----------------------------------------------------------------------------------------------------------
 
 
+class Draw:
+    """Which damage is drawn; another number draws other bytes and words from the same files."""
+
+    number = 0
+
+
 def damaged(data: bytes | str, seed: int, count: int) -> Iterator[bytes]:
     """Yield a file's bytes with random damage: bits, bytes and runs that are changed, cut, doubled or added."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng((Draw.number, seed))
     whole = data.encode() if isinstance(data, str) else data
     for number in range(count):
         made = bytearray(whole)
@@ -316,7 +322,7 @@ def damaged(data: bytes | str, seed: int, count: int) -> Iterator[bytes]:
 
 def damaged_words(text: str, seed: int, count: int) -> Iterator[str]:
     """Yield a text in which some words are replaced by others that a parser may trip over."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng((Draw.number, seed))
     strange = ["nan", "-inf", "1e999", "-1", "0", '""', "{}", "[]", "true", "null", "'", '"', "[", "=", "\0", "é"]
     strange += ["1979-05-27", "0x10", "..", "-", "1e-300", "\u202e", "<x>", "&a", "*a"]
     strange += ["9" * 400, "!!python/object:os.system"]

@@ -26,6 +26,7 @@ def cases() -> Iterator[Case]:
     yield from _datasets()
     yield from _reports()
     yield from _frames()
+    yield from _strangers()
     yield from _commands()
 
 
@@ -216,6 +217,30 @@ def _reports() -> Iterator[Case]:
         )
     yield Case("nightly accept: no night", ("nightly", "accept", "--reason", "x", "--reports", "out"))
     yield Case("nightly accept: unknown profile", ("nightly", "accept", "--reason", "x", "--profile", "weekly"))
+
+
+def _strangers() -> Iterator[Case]:
+    """Yield cases of folders in which something else stands where a run's own file should."""
+    for name, line, text, own in (
+        ("validate: summary", READERS["validate"][1], READERS["validate"][0], "out/summary.json"),
+        ("validate: results", READERS["validate"][1], READERS["validate"][0], "out/results.parquet"),
+        ("validate: fingerprint", READERS["validate"][1], READERS["validate"][0], "out/parts/fingerprint.json"),
+        ("validate: lock", READERS["validate"][1], READERS["validate"][0], "out/.lock"),
+        ("dataset: lock", READERS["dataset"][1], READERS["dataset"][0], "out/.lock"),
+        ("reconstruct: run", ("reconstruct", "d", "--fov", "60", "--out", "out"), "", "out/run.json"),
+        ("reconstruct: frame", ("reconstruct", "d", "--fov", "60", "--out", "out"), "", "out/frames/000000.json"),
+    ):
+        for what, content in (("FIFO", files.fifo), ("endless", files.endless), ("6 GB", files.sparse("{")),
+                              ("folder", files.folder), ("nested", "[" * 100_000)):  # fmt: skip
+            made = {"x.toml": text, "d/a.png": files.encoded(".png"), own: content}
+            yield Case(f"{name}, {what}", line, made, Wanted.ORDERLY)
+    header = files.exr(files.depth())
+    at = header.index(b"dataWindow")
+    large = header[: at + 30] + b"\xff\xff\xff\x7f" * 2 + header[at + 38 :]
+    for suffix, content in (("exr", large), ("obj", files.sparse("v 0 0 0\n" * 600, 390_000_000))):
+        line = ("mesh", "check", "m.obj") if suffix == "obj" else (
+            "reconstruct", "d/a.png", "--fov", "60", "--depth", "m.exr", "--out", "out")  # fmt: skip
+        yield Case(f"{line[0]}: large .{suffix}", line, {f"m.{suffix}": content, "d/a.png": files.encoded(".png")})
 
 
 def _frames() -> Iterator[Case]:
