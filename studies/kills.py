@@ -65,6 +65,7 @@ class Tally:
     """What was seen."""
 
     done: Counter[str] = field(default_factory=Counter)
+    hit: Counter[str] = field(default_factory=Counter)
     differing: int = 0
     left: int = 0
     orphans: int = 0
@@ -130,10 +131,14 @@ def disturb(name: str, counts: dict[str, int], log: Callable[[str], None]) -> li
             for _ in range(min(BETWEEN, len(kinds))):
                 kind = kinds.pop()
                 resize(size * rng.uniform(0.02, 1.1) if kind == "full" else None)
-                how = _disturbed(target, folder, cwd, kind, rng.uniform(0.1, 1.0) * took, tally)
+                code, how = _disturbed(target, folder, cwd, kind, rng.uniform(0.1, 1.0) * took, tally)
                 resize(None)
                 tally.done[kind] += 1
+                tally.hit[kind] += code != 0
                 log(f"{name}: {kind}: {how}")
+                # It was done before it was stopped: the next disturbance begins anew.
+                if code == 0:
+                    break
             _finish(target, folder, cwd)
             different = set(wanted.items()) ^ set(target.contents(folder).items())
             left = [str(path.relative_to(folder)) for pattern in target.own_scratch for path in folder.glob(pattern)]
@@ -141,7 +146,7 @@ def disturb(name: str, counts: dict[str, int], log: Callable[[str], None]) -> li
             tally.left += len(left)
             if different or left:
                 log(f"{name}: differing {sorted(different)[:4]}, left {left[:4]}")
-    about = ", ".join(f"{tally.done[kind]} {kind}" for kind in counts)
+    about = ", ".join(f"{tally.done[kind]} {kind} ({tally.hit[kind]} hit)" for kind in counts)
     return [
         Figure(f"{name}: files that differ from an undisturbed run's", tally.differing, 0, unit="", about=about),
         Figure(f"{name}: files left behind", tally.left, 0, unit="", about=about),
@@ -150,8 +155,8 @@ def disturb(name: str, counts: dict[str, int], log: Callable[[str], None]) -> li
     ]
 
 
-def _disturbed(target: Target, folder: Path, cwd: Path, kind: str, after_s: float, tally: Tally) -> str:
-    """Run a command and stop it after a time, or let it meet the full disk; return how it ended."""
+def _disturbed(target: Target, folder: Path, cwd: Path, kind: str, after_s: float, tally: Tally) -> tuple[int, str]:
+    """Run a command and stop it after a time, or let it meet the full disk; return its exit code and how it ended."""
     process = _start(target, folder, cwd)
     if kind == "full":
         _, errors = process.communicate()
@@ -179,7 +184,7 @@ def _disturbed(target: Target, folder: Path, cwd: Path, kind: str, after_s: floa
     early = kind == "term" and code == -signal.SIGTERM
     if not early and (not clear or (code > 0 and (len(lines) != 1 or "internal error" in lines[0]))):
         tally.unclear += 1
-    return f"exit {code}{f': {lines[-1][:200]}' if lines else ''}"
+    return code, f"exit {code}{f': {lines[-1][:200]}' if lines else ''}"
 
 
 def _is_worker(child: psutil.Process) -> bool:
