@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.runtime.lazy_names import lazy_names
 from simtest.runtime.limits import limit
 
@@ -215,14 +215,22 @@ def validate(
     from simtest.report import write_report
     from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
+    from simtest.runtime.machine_errors import disk_problem
+    from simtest.runtime.resources import shown
     from simtest.spec import Experiment, load_experiment
     from simtest.validation.runner import run_experiment
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
     chosen = engine or make_engine(workers=workers)
     with exclusive_folder(Path(out)):
-        run = run_experiment(described, Path(out), command, variant, progress, chosen)
-        return write_report(run.folder, progress)
+        try:
+            run = run_experiment(described, Path(out), command, variant, progress, chosen)
+            return write_report(run.folder, progress)
+        except OSError as error:
+            if (problem := disk_problem(error, Path(out))) is None:
+                raise
+            kept = "what is finished is kept, and the same command goes on from there"
+            raise SimtestError(f"--out {shown(out)}: cannot be written ({problem}); {kept}") from error
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":

@@ -30,7 +30,7 @@ def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
     what = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
     file = f"{shown(name, 200)}: " if name else ""
     if number in (errno.ENOSPC, errno.EDQUOT):
-        return f"{file}{what}; {_free(name or near)}"
+        return f"{file}{what}" + (f"; {_free(name or near)}" if name or near else "")
     if number == errno.EFBIG:
         return f"{file}{what}; the system limits the size of a file (ulimit -f)"
     return f"{file}{what}"
@@ -46,9 +46,9 @@ def machine_problem(error: BaseException) -> str | None:
     return disk_problem(error)
 
 
-def _free(name: str | Path | None) -> str:
+def _free(name: str | Path) -> str:
     """Return how much of a file's disk is free."""
-    path = Path(name or ".").absolute()
+    path = Path(name).absolute()
     for folder in (path, *path.parents):
         try:
             usage = shutil.disk_usage(folder)

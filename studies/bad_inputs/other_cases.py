@@ -236,7 +236,7 @@ def _strangers() -> Iterator[Case]:
             yield Case(f"{name}, {what}", line, made, Wanted.ORDERLY)
     header = files.exr(files.depth())
     at = header.index(b"dataWindow")
-    large = header[: at + 30] + b"\xff\xff\xff\x7f" * 2 + header[at + 38 :]
+    large = header[: at + 29] + b"\xff\xff\xff\x7f" * 2 + header[at + 37 :]
     for suffix, content in (("exr", large), ("obj", files.sparse("v 0 0 0\n" * 600, 390_000_000))):
         line = ("mesh", "check", "m.obj") if suffix == "obj" else (
             "reconstruct", "d/a.png", "--fov", "60", "--depth", "m.exr", "--out", "out")  # fmt: skip

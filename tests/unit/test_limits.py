@@ -12,7 +12,9 @@ from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.vtk_file import read_vtk
+from simtest.validation import runner
 from simtest.validation.cases import check_effort
+from simtest.validation.depth_maps import read_depth
 from studies.bad_inputs import files
 from tests.refusals import refused
 
@@ -159,3 +161,25 @@ def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):
     # FFmpeg would read the list, and whatever it names.
     path.write_text(f"ffconcat version 1.0\nfile {os.devnull}\n")
     refused(lambda: open_source(path), "x.mp4: no video that can be read", "of no known container")
+
+
+def test_a_fingerprint_that_cannot_be_one_is_not_read(tmp_path):
+    record = tmp_path / "parts" / "fingerprint.json"
+    record.parent.mkdir()
+    files.sparse('"digest"')(record)
+    runner._prepare(tmp_path, "digest")
+    assert record.read_text().strip() == '"digest"'
+
+
+@pytest.mark.render
+def test_an_exr_image_whose_channel_is_called_depth_is_read(tmp_path):
+    path = tmp_path / "z.exr"
+    path.write_bytes(files.exr(files.depth()))
+    np.testing.assert_array_equal(read_depth(path), files.depth().astype(float))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"dataWindow") + 29
+    data[at : at + 8] = b"\xff\xff\xff\x7f" * 2
+    path.write_bytes(data)
+    refused(
+        lambda: read_depth(path), "z.exr: 2147483648 x 2147483648 px: ", "px along a side; at most 16384 are allowed"
+    )

@@ -11,12 +11,15 @@ import time
 
 import pytest
 
+import simtest
 from simtest.cli.main import main
 from simtest.cli.stopping import Termination
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
+from simtest.runtime.engines import local
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
 from simtest.runtime.machine_errors import machine_problem
+from simtest.validation import runner
 from studies.bad_inputs import files
 from tests.refusals import refused
 
@@ -168,7 +171,7 @@ def test_a_limit_of_the_system_is_named(tmp_path):
         (MemoryError("Unable to allocate 9 GiB"), "not enough memory (Unable to allocate 9 GiB); smaller frames"),
         (MemoryError(), "not enough memory; smaller frames"),
         (RecursionError("maximum recursion depth exceeded"), "a value is nested too deeply"),
-        (RuntimeError("write failed: (os error 28)"), "write failed: (os error 28); "),
+        (RuntimeError("write failed: (os error 28)"), "write failed: (os error 28)"),
         (OSError(36, "File name too long", "n" * 500), "...: File name too long"),
         (ZeroDivisionError("division by zero"), None),
         (OSError("no number"), None),
@@ -237,3 +240,28 @@ def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
     assert (code, len(lines)) == (2, 1)
     assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+def test_a_full_disk_in_a_worker_names_the_folder(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(runner, "run_experiment", full)
+    with pytest.raises(SimtestError) as error:
+        simtest.validate("overview", tmp_path / "out")
+    said = f"--out {tmp_path / 'out'}: cannot be written (No space left on device; "
+    assert str(error.value).startswith(said)
+    assert "MB are free on the disk of" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("raised", "kind"), [(OSError(28, "No space left on device"), OSError),
+                                              (MemoryError(), SimtestError), (KeyError("x"), SimtestError)])  # fmt: skip
+def test_a_worker_hands_on_errors_of_the_disk(raised, kind):
+    def task(*_):
+        raise raised
+
+    state, error = local._answer(None, task, None)
+    assert state == "error"
+    assert type(error) is kind
+    assert kind is OSError or str(error).startswith(("not enough memory; ", "a worker failed (KeyError"))

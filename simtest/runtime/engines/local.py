@@ -12,7 +12,7 @@ from typing import Any
 
 from simtest.errors import SimtestError
 from simtest.runtime.engines.engine import MAX_DEATHS, OnStep, Task
-from simtest.runtime.machine_errors import machine_problem
+from simtest.runtime.machine_errors import disk_problem, machine_problem
 
 
 @dataclass
@@ -169,6 +169,9 @@ def _answer(pipe: Connection, task: Task, argument: Any) -> tuple[str, Any]:
     except SimtestError as error:
         return "error", error
     except Exception as error:
+        # Whoever knows the folder says which one it is.
+        if isinstance(error, OSError) and disk_problem(error):
+            return "error", error
         told = machine_problem(error) or f"a worker failed ({type(error).__name__}: {error})"
         return "error", SimtestError(told)
 
