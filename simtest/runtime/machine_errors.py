@@ -30,7 +30,7 @@ def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
     what = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
     file = f"{shown(name, 200)}: " if name else ""
     if number in (errno.ENOSPC, errno.EDQUOT):
-        return f"{file}{what}" + (f"; {_free(name or near)}" if name or near else "")
+        return f"{file}{what}" + (f"; {_free(path)}" if (path := name or near) is not None else "")
     if number == errno.EFBIG:
         return f"{file}{what}; the system limits the size of a file (ulimit -f)"
     return f"{file}{what}"

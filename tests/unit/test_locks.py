@@ -255,8 +255,10 @@ def test_a_full_disk_in_a_worker_names_the_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("raised", "kind"), [(OSError(28, "No space left on device"), OSError),
-                                              (MemoryError(), SimtestError), (KeyError("x"), SimtestError)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("raised", "kind"),
+    [(OSError(28, "No space left on device"), OSError), (MemoryError(), SimtestError), (KeyError("x"), SimtestError)],
+)
 def test_a_worker_hands_on_errors_of_the_disk(raised, kind):
     def task(*_):
         raise raised
