@@ -54,5 +54,9 @@ def _free(name: str | Path) -> str:
             usage = shutil.disk_usage(folder)
         except OSError:
             continue
-        return f"{usage.free / 1e6:.4g} of {usage.total / 1e6:.4g} MB are free on the disk of {shown(folder, 120)}"
+        return f"{_mb(usage.free)} of {_mb(usage.total)} MB are free on the disk of {shown(folder, 120)}"
     return "the disk is full"
+
+
+def _mb(size: float) -> str:
+    return f"{size / 1e6:.0f}" if size >= 1e7 else f"{size / 1e6:.2g}"
