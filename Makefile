@@ -5,7 +5,7 @@ WORKERS ?= auto
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo test test-all test-ci bench bench-cycles lint format clean
+.PHONY: help demo test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
@@ -15,6 +15,8 @@ help:
 	@echo "make bench     speeds, as ratios within one run"
 	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
+	@echo "make audit     risky calls and known vulnerabilities (bandit, pip-audit), where these can run"
+	@echo "make hashed-constraints  constraints.txt with the hashes of this platform's files, for a release"
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -69,9 +71,21 @@ lint: $(VENV)/.tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
+# Both tools live in an environment of their own; where they cannot be installed, a line says so and nothing fails.
+$(VENV)-audit/.installed: $(VENV)/.installed
+	$(PYTHON) -m venv $(VENV)-audit
+	-$(VENV)-audit/bin/python -m pip install --quiet --disable-pip-version-check "bandit[toml]>=1.8" "pip-audit>=2.7"
+	@touch $@
+
+audit: $(VENV)-audit/.installed
+	$(VENV)-audit/bin/python .ci/audit.py
+
+hashed-constraints: $(VENV)/.installed
+	$(BIN)/python .ci/hashed_constraints.py
+
 format: $(VENV)/.tests
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
 clean:
-	rm -rf $(VENV) $(VENV)-cycles reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(VENV)-cycles $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.runtime.lazy_names import lazy_names
+from simtest.runtime.limits import limit
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
@@ -36,8 +37,6 @@ __all__ = [
     "sample_views",
     "validate",
 ]
-
-MAX_VIEWS = 1000
 
 TRIES = 10
 """Viewpoints that are tried for each view wanted."""
@@ -108,8 +107,10 @@ def export(
         If the rendering backend cannot be used.
     """
     from simtest.rendering.mitsuba_export import export_scene
+    from simtest.runtime.locks import exclusive_folder
 
-    return export_scene(_scene(scene, settings), Path(out), variant)
+    with exclusive_folder(Path(out)):
+        return export_scene(_scene(scene, settings), Path(out), variant)
 
 
 def sample_views(
@@ -151,19 +152,20 @@ def sample_views(
     BackendError
         If the rendering backend cannot be used.
     """
-    from simtest.runtime.files import make_folder, write_json
+    from simtest.runtime.files import write_json
+    from simtest.runtime.locks import exclusive_folder
     from simtest.simulation.view_files import ViewWriter
     from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
-    if not 1 <= count <= MAX_VIEWS:
-        raise InputError(f"count = {count}: must be 1 to {MAX_VIEWS}")
+    if not 1 <= count <= limit("views"):
+        raise InputError(f"count = {count}: must be 1 to {limit('views')}")
     described = _scene(scene, settings)
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
-    make_folder(Path(out))
-    writer = ViewWriter(Path(out), film=along is not None)
-    sampled = sample_views(described, count, viewpoints, variant, progress, writer.add, along is not None)
-    writer.close()
-    write_json(Path(out) / "views.json", sampled.to_json(viewpoint_key(described)))
+    with exclusive_folder(Path(out)):
+        writer = ViewWriter(Path(out), film=along is not None)
+        sampled = sample_views(described, count, viewpoints, variant, progress, writer.add, along is not None)
+        writer.close()
+        write_json(Path(out) / "views.json", sampled.to_json(viewpoint_key(described)))
     return sampled
 
 
@@ -212,12 +214,23 @@ def validate(
     """
     from simtest.report import write_report
     from simtest.runtime.engines import make_engine
+    from simtest.runtime.locks import exclusive_folder
+    from simtest.runtime.machine_errors import disk_problem
+    from simtest.runtime.resources import shown
     from simtest.spec import Experiment, load_experiment
     from simtest.validation.runner import run_experiment
 
     described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
-    run = run_experiment(described, Path(out), command, variant, progress, engine or make_engine(workers=workers))
-    return write_report(run.folder, progress)
+    chosen = engine or make_engine(workers=workers)
+    with exclusive_folder(Path(out)):
+        try:
+            run = run_experiment(described, Path(out), command, variant, progress, chosen)
+            return write_report(run.folder, progress)
+        except OSError as error:
+            if (problem := disk_problem(error, Path(out))) is None:
+                raise
+            kept = "what is finished is kept, and the same command goes on from there"
+            raise SimtestError(f"--out {shown(out)}: cannot be written ({problem}); {kept}") from error
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":
@@ -271,11 +284,19 @@ def reconstruct_picture(
     InputError
         If the input is malformed or the folder cannot be written.
     """
+    from simtest.runtime.locks import exclusive_folder
+
+    with exclusive_folder(out):
+        return _reconstruct_picture(image, out, options, extras or Extras())
+
+
+def _reconstruct_picture(
+    image: Path, out: Path, options: "Options", extras: Extras
+) -> tuple["PictureRecord", list[Path]]:
     from simtest.reconstruction.image_io import read_picture
     from simtest.reconstruction.output_files import write_outputs
     from simtest.reconstruction.picture import NOTHING, read_calibration, reconstruct_values
 
-    extras = extras or Extras()
     # read
     picture = read_picture(image)
     calibration, cautions = read_calibration(options, picture)

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Address, EngineName, Seed, Workers, replacing, whole_number
+from simtest.cli.options import Address, EngineName, Seed, Workers, named_path, replacing, whole_number
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
 
-Folder = Annotated[Path, Parameter(help="The dataset's folder.")]
+Folder = Annotated[Path, Parameter(help="The dataset's folder.", converter=named_path)]
 Settings = Annotated[list[str] | None, replacing("samples_per_anatomy=5 or sensor.noise_sigma=0")]
 Variant = Annotated[str | None, Parameter(help="llvm (default), cuda on an NVIDIA GPU, or a Mitsuba variant by name.")]
 Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
@@ -20,7 +20,7 @@ def make(
     described: Annotated[str, Parameter(name="DATASET")],
     /,
     *,
-    out: Annotated[Path, Parameter(help="Folder of the dataset; made if need be.")],
+    out: Annotated[Path, Parameter(help="Folder of the dataset; made if need be.", converter=named_path)],
     samples: Samples = None,
     seed: Seed = None,
     settings: Settings = None,
@@ -93,7 +93,9 @@ def sample(
     index: Annotated[int, Parameter(converter=whole_number)],
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder for the files; default sample-INDEX.")] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Folder for the files; default sample-INDEX.", converter=named_path)
+    ] = None,
     variant: Annotated[str | None, Parameter(help="Mitsuba variant; default the dataset's own.")] = None,
 ) -> int:
     """Make one sample of a dataset again, alone; exit 1 if it differs from the stored one.
@@ -118,10 +120,15 @@ def preview(
     folder: Folder,
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Page to write; default preview.html in the current folder.")] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Page to write; default preview.html in the current folder.", converter=named_path)
+    ] = None,
     samples: Annotated[int, Parameter(help="How many samples to show.", converter=whole_number)] = 24,
 ) -> None:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
     from simtest.dataset.preview import write_preview
+    from simtest.runtime.locks import exclusive_file
 
-    print(write_preview(folder, out or Path("preview.html"), samples))
+    page = out or Path("preview.html")
+    with exclusive_file(page):
+        print(write_preview(folder, page, samples))

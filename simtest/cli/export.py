@@ -6,9 +6,7 @@ from simtest.cli.options import Out, SceneName, Settings, Variant
 def export(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> None:
     """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh."""
     from simtest import api
-    from simtest.runtime.files import refuse_file
     from simtest.spec import parse_settings
 
-    refuse_file(out)
     for file in api.export(scene, out, parse_settings(settings or []), variant):
         print(file)

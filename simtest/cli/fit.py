@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Seed, whole_number
+from simtest.cli.options import Seed, named_path, whole_number
 
 if TYPE_CHECKING:
     from simtest.realism.fitting.fit import FittedRecipe
@@ -16,13 +16,18 @@ def fit(
     /,
     *,
     recipe: Annotated[str, Parameter(help="A dataset file, or the name of a shipped one, whose ranges are fitted.")],
-    out: Annotated[Path, Parameter(help="TOML file for the fitted recipe; the report stands beside it.")],
+    out: Annotated[
+        Path, Parameter(help="TOML file for the fitted recipe; the report stands beside it.", converter=named_path)
+    ],
     scene: Annotated[
         str | None, Parameter(help="Base scene of the family that is fitted; needed where there are several.")
     ] = None,
     size: Annotated[int, Parameter(help="Frames that are rendered over the ranges.", converter=whole_number)] = 150,
     bank: Annotated[
-        Path | None, Parameter(help="Folder that keeps them, for other fits too; default OUT with the suffix .bank.")
+        Path | None,
+        Parameter(
+            help="Folder that keeps them, for other fits too; default OUT with the suffix .bank.", converter=named_path
+        ),
     ] = None,
     seed: Seed = None,
 ) -> None:
@@ -35,17 +40,24 @@ def fit(
         so is a folder whose name ends in .film; any other picture is a scene of its own.
     """
     from simtest.cli.progress import progress_bar
+    from simtest.errors import InputError
     from simtest.realism.fitting.fit import fit as fitted_to
     from simtest.realism.fitting.outcome import check_out, write_fit
     from simtest.realism.fitting.parameters import one_family
     from simtest.realism.frame_sets import open_frames
+    from simtest.runtime.limits import limit
+    from simtest.runtime.locks import exclusive_file, exclusive_folder
     from simtest.spec.dataset_recipe import load_dataset
 
     check_out(out)
+    if not 1 <= size <= limit("generated_frames"):
+        raise InputError(f"--size {size}: must be 1 to {limit('generated_frames')}")
     dataset = one_family(load_dataset(recipe), scene)
-    with progress_bar("writing") as progress:
-        found = fitted_to(open_frames(frames), dataset, bank or out.with_suffix(".bank"), size, seed or 0, progress)
-    paths = write_fit(found, out)
+    opened, kept = open_frames(frames), bank or out.with_suffix(".bank")
+    with exclusive_file(out), exclusive_folder(kept, "--bank"):
+        with progress_bar("writing") as progress:
+            found = fitted_to(opened, dataset, kept, size, seed or 0, progress)
+        paths = write_fit(found, out)
     _print_table(found)
     print(*paths, sep="\n")
 

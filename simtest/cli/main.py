@@ -9,7 +9,13 @@ import warnings
 
 from cyclopts import App, CycloptsError
 
+from simtest.cli.stopping import Termination
 from simtest.errors import InputError, SimtestError
+from simtest.runtime.machine_errors import machine_problem
+from simtest.runtime.resources import shown
+
+LONGEST = 900
+"""Characters of a line; a longer one is cut."""
 
 APP = App(
     name="simtest",
@@ -39,6 +45,7 @@ for _name, _help in _COMMANDS.items():
     APP.command(f"simtest.cli.{_name}:{_name}", help=_help)
 
 INTERRUPTED = 130
+TERMINATED = 143
 BAD_USE = 2
 
 
@@ -49,23 +56,25 @@ def _version() -> str:
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"simtest: warning: {message}", file=sys.stderr)
+    print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
 
 
 def main() -> None:
     """Run the command line.
 
-    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C. Of `nightly`, whose 1 is
-    a regression, whatever else went wrong is 2.
+    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C, 143 SIGTERM. Of
+    `nightly`, whose 1 is a regression, whatever else went wrong is 2.
     """
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
+    stop = Termination()
     if "--traceback" in sys.argv:
         sys.argv.remove("--traceback")
         sys.exit(APP())
     warnings.showwarning = _warn
     try:
-        # A command's result is its exit code.
-        code = APP(exit_on_error=False, print_error=False, result_action="return_value")
+        with stop:
+            # A command's result is its exit code.
+            code = APP(exit_on_error=False, print_error=False, result_action="return_value")
         # Output may wait in a buffer whose reader has gone.
         sys.stdout.flush()
     except (CycloptsError, InputError) as error:
@@ -74,17 +83,21 @@ def main() -> None:
         sys.exit(_report(str(error), failed))
     except KeyboardInterrupt as stopped:
         kept = "what is finished is kept, and the same command goes on from there"
-        sys.exit(_report(f"stopped; {str(stopped) or kept}", INTERRUPTED))
+        how = "terminated" if stop.came else "stopped"
+        sys.exit(_report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except Exception as error:
-        what = f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+        what = machine_problem(error) or (
+            f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+        )
         sys.exit(_report(what, failed))
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _report(text: str, code: int) -> int:
     """Print an error as one line and return the exit code."""
-    print(f"simtest: {' '.join(text.split())}", file=sys.stderr)
+    line = " ".join(text.split())
+    print(f"simtest: {shown(line, LONGEST)}", file=sys.stderr)
     return code

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import AsJson, replacing, whole_number
+from simtest.cli.options import AsJson, named_path, replacing, whole_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
@@ -61,10 +61,12 @@ def check(
 class Recipe:
     """The options of an anatomy: its recipe, and where its mesh goes."""
 
-    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.")]
+    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.", converter=named_path)]
     seed: Seed = None
     edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
-    recipe: Annotated[Path | None, Parameter(help="Recipe file (TOML); default the shipped one.")] = None
+    recipe: Annotated[
+        Path | None, Parameter(help="Recipe file (TOML); default the shipped one.", converter=named_path)
+    ] = None
     settings: Annotated[list[str] | None, replacing("length_mm=40")] = None
     curvature: Annotated[
         bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
@@ -85,6 +87,7 @@ def liver(*, options: Recipe) -> None:
 
 def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
     from simtest.errors import InputError
+    from simtest.runtime.locks import exclusive_file
     from simtest.spec import parse_settings
     from simtest.surfaces.factory import make_mesh
     from simtest.surfaces.mesh_file import check_target, write_mesh
@@ -94,6 +97,7 @@ def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
     if given.curvature and given.out.suffix.lower() != ".ply":
         raise InputError(f"--curvature: {given.out.suffix} files hold none; allowed: .ply")
     anatomy = load_anatomy(kind, given.recipe, given.seed, parse_settings(given.settings or []))
-    made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
-    write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
+    with exclusive_file(given.out):
+        made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
+        write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
     print(f"{given.out}: {len(made.vertices)} vertices, {len(made.faces)} faces")

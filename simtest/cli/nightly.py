@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Address, EngineName, Variant, whole_number
+from simtest.cli.options import Address, EngineName, Variant, named_path, whole_number
 
 if TYPE_CHECKING:
     from simtest.nightly.run import Outcome
@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 nightly = App(name="nightly", help="Run the fixed experiments, compare with the baseline, write the page.")
 
 ProfileName = Annotated[str, Parameter(help="A profile file, or the name of a shipped one: quick, full.")]
-ReportsFolder = Annotated[Path, Parameter(name="--reports", help="Folder of history, baselines and pages.")]
+ReportsFolder = Annotated[
+    Path, Parameter(name="--reports", help="Folder of history, baselines and pages.", converter=named_path)
+]
 DEFAULT_REPORTS = Path("reports")
 TABLE_WIDTH = 125
 

@@ -15,6 +15,13 @@ def whole_number(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"{tokens[0].value} is not a whole number") from None
 
 
+def named_path(_: Any, tokens: Sequence[Token]) -> Path:
+    """Convert an option to a path; an empty one would be the current folder, which nobody has named."""
+    if not tokens[0].value.strip():
+        raise ValueError("is empty; must name a file or folder")
+    return Path(tokens[0].value)
+
+
 def replacing(example: str) -> Parameter:
     """Return the option that replaces values of a file, with an example of one in its help."""
     text = f"Replace a value: key=value, such as {example}; may be repeated."
@@ -34,7 +41,7 @@ Variant = Annotated[
 Estimators = Annotated[
     list[str] | None, Parameter(name="--estimator", negative="", help="Estimator by name; may be repeated.")
 ]
-Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.")]
+Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]
 Workers = Annotated[

@@ -40,13 +40,12 @@ def realism(
     from simtest.realism.comparison import compare
     from simtest.realism.frame_sets import open_frames, open_generated
     from simtest.realism.page import write_comparison
-    from simtest.runtime.files import refuse_file
+    from simtest.runtime.locks import exclusive_folder
 
-    refuse_file(out)
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
     command = shlex.join(["simtest", *sys.argv[1:]])
     try:
-        with progress_bar("compared") as progress:
+        with exclusive_folder(out), progress_bar("compared") as progress:
             found = compare(real, generated, progress, seed or 0)
             page = write_comparison(found, out, against, command, progress)
     except KeyboardInterrupt:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Estimators, Out
+from simtest.cli.options import Estimators, Out, named_path
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ TABLE_WIDTH = 125
 
 
 def reconstruct(
-    image: Path,
+    image: Annotated[Path, Parameter(converter=named_path)],
     /,
     *,
     out: Out,

@@ -11,15 +11,15 @@ def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant:
     """
     from simtest import api
     from simtest.cli.progress import progress_bar
-    from simtest.runtime.files import refuse_file
+    from simtest.runtime.locks import exclusive_folder
     from simtest.simulation.frame_files import write_frame
     from simtest.spec import parse_settings
 
-    refuse_file(out)
-    try:
-        with progress_bar("finding the truth") as move:
-            frame = api.render(scene, parse_settings(settings or []), variant, move)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("nothing is written") from None
-    for file in write_frame(frame, out):
-        print(file)
+    with exclusive_folder(out):
+        try:
+            with progress_bar("finding the truth") as move:
+                frame = api.render(scene, parse_settings(settings or []), variant, move)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("nothing is written") from None
+        for file in write_frame(frame, out):
+            print(file)

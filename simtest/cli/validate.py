@@ -7,7 +7,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Address, EngineName, Estimators, Realisations, Seed, Settings, Variant, Workers
+from simtest.cli.options import (
+    Address,
+    EngineName,
+    Estimators,
+    Realisations,
+    Seed,
+    Settings,
+    Variant,
+    Workers,
+    named_path,
+)
 
 DEFAULT_OUT = Path("reports/runs")
 
@@ -16,7 +26,9 @@ def validate(
     experiment: str,
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder of the run; default reports/runs/EXPERIMENT.")] = None,
+    out: Annotated[
+        Path | None, Parameter(help="Folder of the run; default reports/runs/EXPERIMENT.", converter=named_path)
+    ] = None,
     realisations: Realisations = None,
     seed: Seed = None,
     settings: Settings = None,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import SceneName, Settings, Variant
+from simtest.cli.options import SceneName, Settings, Variant, named_path
 
 
 def view(
@@ -13,20 +13,22 @@ def view(
     /,
     *,
     screenshot: Annotated[
-        Path | None, Parameter(help="PNG to draw to, without a display, instead of opening a window.")
+        Path | None,
+        Parameter(help="PNG to draw to, without a display, instead of opening a window.", converter=named_path),
     ] = None,
     settings: Settings = None,
     variant: Variant = None,
 ) -> None:
     """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals."""
     from simtest.report.viewer import check_target, make_content, save_screenshot, show
+    from simtest.runtime.locks import exclusive_file
     from simtest.spec import load_scene, parse_settings
 
     described = load_scene(scene, parse_settings(settings or []))
     check_target(screenshot)
-    content = make_content(described, variant)
     if screenshot is None:
-        show(content)
-    else:
-        save_screenshot(content, screenshot)
-        print(screenshot)
+        show(make_content(described, variant))
+        return
+    with exclusive_file(screenshot, "--screenshot"):
+        save_screenshot(make_content(described, variant), screenshot)
+    print(screenshot)

@@ -27,10 +27,8 @@ def views(
     """
     from simtest import api
     from simtest.cli.progress import progress_bar
-    from simtest.runtime.files import refuse_file
     from simtest.spec import parse_settings
 
-    refuse_file(out)
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
         sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends)

@@ -33,11 +33,11 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         counts[shard.split][1] += 1
     left_out = [*(() if dataset.radiance else ("radiance",)), *(() if plan.has_relief else BASE_FIELDS)]
     left_out += [] if plan.has_instruments else [INSTRUMENT]
-    environment = Environment(
+    # Markdown, not HTML, so what a recipe says is escaped where it stands.
+    environment = Environment(  # nosec B701
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    # Markdown, not HTML, so what a recipe says is escaped where it stands.
     environment.filters.update(escaped=escaped, paragraphs=paragraphs, yaml=yaml_string)
     return environment.get_template("card.md.j2").render(
         dataset=dataset,

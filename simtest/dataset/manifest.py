@@ -13,12 +13,13 @@ from simtest.dataset.plan import Plan, spec_files
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
+from simtest.runtime.limits import limit
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.spec_model import validate
 
 NAME = "manifest.json"
 FORMAT = "simtest dataset, version 1"
-MAX_BYTES = 1_000_000_000
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,200}")
 
 
@@ -82,7 +83,7 @@ class Manifest:
 
     def plan(self) -> Plan:
         """Return the dataset's plan."""
-        return Plan(Dataset.model_validate(self.dataset))
+        return Plan(validate(Dataset, self.dataset, NAME))
 
 
 def new_manifest(plan: Plan, variant: str) -> Manifest:
@@ -103,14 +104,17 @@ def read_manifest(folder: Path) -> Manifest:
     # a JSON object ...
     path = folder / NAME
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ManifestError(f"{NAME}: larger than {MAX_BYTES} bytes")
+        # A pipe or a device might never end.
+        if not path.is_file() and path.exists():
+            raise ManifestError(f"{NAME}: is no plain file")
+        if path.stat().st_size > limit("manifest_bytes"):
+            raise ManifestError(f"{NAME}: larger than {limit('manifest_bytes')} bytes")
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise ManifestError(f"{NAME}: missing") from None
     except OSError as error:
         raise ManifestError(f"{NAME}: cannot be read ({error.strerror})") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ManifestError(f"{NAME}: is no JSON") from None
     # ... of this form, that nobody has changed
     if not isinstance(content, dict) or content.get("format") != FORMAT:

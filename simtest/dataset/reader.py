@@ -10,6 +10,7 @@ from simtest.dataset.sample import Sample
 from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
+from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown
 
 Record = dict[str, Any]
@@ -92,7 +93,7 @@ def _read_shards(
 ) -> Iterator[Sample]:
     for name in names:
         try:
-            with (folder / name).open("rb") as file:
+            with require_plain(folder / name).open("rb") as file:
                 for stored in samples(file, check=False):
                     if indices is not None and stored.meta["index"] not in indices:
                         continue

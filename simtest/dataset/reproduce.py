@@ -7,7 +7,9 @@ from simtest.dataset.reader import open_manifest
 from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
-from simtest.runtime.files import make_folder
+from simtest.runtime.locks import exclusive_folder
+from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.resources import shown
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
@@ -20,15 +22,15 @@ def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = 
     plan = manifest.plan()
     if not 0 <= index < plan.dataset.samples:
         raise InputError(f"INDEX = {index}: must be 0 to {plan.dataset.samples - 1}")
-    made = Maker(plan, variant or manifest.origin["variant"]).make(index)
-    make_folder(out)
     files = []
-    try:
-        for suffix, data in made.encode().items():
-            files.append(out / f"{made.key}.{suffix}")
-            files[-1].write_bytes(data)
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+    with exclusive_folder(out):
+        made = Maker(plan, variant or manifest.origin["variant"]).make(index)
+        try:
+            for suffix, data in made.encode().items():
+                files.append(out / f"{made.key}.{suffix}")
+                files[-1].write_bytes(data)
+        except OSError as error:
+            raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files
 
 

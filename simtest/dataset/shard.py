@@ -4,15 +4,12 @@ A sample is whole if its last member, the metadata, is there and the hashes that
 shard that was stopped in the middle needs no journal: it is cut after its last whole sample.
 """
 
-import fcntl
 import hashlib
 import json
 import os
 import tarfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO
 
 from simtest.dataset.metadata import SampleMeta
@@ -146,20 +143,6 @@ def whole_samples(file: IO[bytes]) -> tuple[list[StoredSample], bool]:
     except BrokenShardError:
         return found, False
     return found, True
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file to append to, created if needed, that no other process writes meanwhile."""
-    while True:
-        path.touch()
-        with path.open("r+b") as file:
-            # A writer whose parent was killed may live for another moment.
-            fcntl.flock(file, fcntl.LOCK_EX)
-            # It may have finished the file and renamed it.
-            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                yield file
-                return
 
 
 def read_member(file: IO[bytes], sample: StoredSample, suffix: str) -> bytes:

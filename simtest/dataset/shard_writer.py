@@ -24,10 +24,12 @@ from simtest.dataset.manifest import (
 )
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample
-from simtest.dataset.shard import PART, finish, locked, whole_samples, write_sample
+from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine, OnStep
-from simtest.runtime.files import make_folder, sync_folder
+from simtest.runtime.files import sync_folder
+from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
+from simtest.runtime.machine_errors import disk_problem
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
@@ -75,7 +77,7 @@ def write_dataset(
         If the dataset cannot be made as described, or the folder holds something else or cannot be written.
     """
     plan = Plan(dataset)
-    with _one_line_errors(folder):
+    with _one_line_errors(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
     return manifest
@@ -135,7 +137,7 @@ def _write_shards(
 def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:
     """Make named files of a dataset anew: shards, tables or card."""
     plan = manifest.plan()
-    with _one_line_errors(folder):
+    with _one_line_errors(folder), exclusive_folder(folder, "DATASET"):
         for name in broken:
             (folder / name).unlink(missing_ok=True)
             manifest.shards.pop(name, None)
@@ -151,14 +153,13 @@ def _one_line_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"--out {shown(folder)}: cannot be written ({error.strerror}); what is written stays valid, and the same "
-            "command goes on from there"
+            f"--out {shown(folder)}: cannot be written ({disk_problem(error, folder) or error}); what is written stays "
+            "valid, and the same command goes on from there"
         ) from error
 
 
 def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
     """Return the manifest of a folder that is empty, or holds the same dataset."""
-    make_folder(folder)
     wanted = new_manifest(plan, variant)
     # A folder without a manifest must be empty, but for parts of a run that never finished a shard.
     try:
@@ -168,7 +169,7 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
             raise InputError(
                 f"--out {shown(folder)}: {error}; must be another folder, or simtest dataset verify"
             ) from None
-        if other := next((path.name for path in folder.iterdir() if not path.name.endswith(PART)), None):
+        if other := next((path.name for path in folder.iterdir() if not path.name.endswith((PART, LOCK))), None):
             raise InputError(
                 f"--out {shown(folder)}: holds {shown(other)} and no dataset; must be empty or not exist"
             ) from None
@@ -205,12 +206,13 @@ def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> F
     path = folder / shard.name
     part = folder / (shard.name + PART)
     # finished, but not in the manifest: the run was killed in between
-    if path.exists() and _is_whole(path, shard):
+    if path.is_file() and _is_whole(path, shard):
         for _ in shard.indices:
             on_step()
         return file_entry(path)
     # begun, or not yet
-    with locked(part) as file:
+    # A writer whose parent was killed may live for another moment.
+    with waiting_for(part) as file:
         count = _keep_whole(file, shard)
         for _ in range(count):
             on_step()

@@ -31,6 +31,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.engines import Engine
+from simtest.runtime.locks import LOCK
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.relief import Relief
 from simtest.validation.runner import Progress
@@ -105,7 +106,7 @@ def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
     for name, entry in {**manifest.shards, **manifest.tables}.items():
         yield from _against(folder / name, entry)
     # files that do not belong
-    known = {NAME, *manifest.shards, *manifest.tables, *planned}
+    known = {NAME, LOCK, *manifest.shards, *manifest.tables, *planned}
     for path in sorted(folder.iterdir()):
         if path.name in known:
             continue

@@ -15,6 +15,9 @@ from simtest.runtime.arrays import Array, Mask
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""
 
+FOV_DEG = (0.05, 179.0)
+"""Fields of view that a pinhole may have."""
+
 FOLD_CIRCLE = 256
 """The same around a view mask."""
 
@@ -186,15 +189,16 @@ class Camera:
 
     @classmethod
     def from_fov(cls, fov_deg: float, width: int, height: int) -> "Camera":
-        """Make a camera with square pixels from its horizontal field of view, deg, in (0, 180).
+        """Make a camera with square pixels from its horizontal field of view, deg, in [0.05, 179].
 
         Raises
         ------
         InputError
             If the angle is out of range.
         """
-        if isinstance(fov_deg, bool) or not isinstance(fov_deg, int | float) or not 0 < fov_deg < 180:
-            raise InputError(f"fov = {fov_deg!r}: must be between 0 and 180 deg")
+        low, high = FOV_DEG
+        if isinstance(fov_deg, bool) or not isinstance(fov_deg, int | float) or not low <= fov_deg <= high:
+            raise InputError(f"fov = {fov_deg!r}: must be {low:g} to {high:g} deg")
         focal = float(width / 2 / np.tan(np.radians(fov_deg) / 2))
         return cls(width, height, focal, focal, width / 2, height / 2)
 

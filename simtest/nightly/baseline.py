@@ -22,6 +22,7 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
+from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
 
@@ -118,6 +119,9 @@ def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
 
 def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
+    # Nothing is made where there never was a night.
+    if not source.parent.is_dir():
+        raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
     reports.make()
     # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
@@ -155,7 +159,9 @@ def _end_line(log: Path) -> None:
 def _replaced(reports: Reports, profile: str) -> str | None:
     """Return the id of the run that was the baseline, if its record can still be read."""
     try:
-        found = json.loads((reports.baseline(profile) / RUN_FILE).read_text(encoding="utf-8"))
+        found = json.loads(
+            require_plain(reports.baseline(profile) / RUN_FILE, "record_bytes").read_text(encoding="utf-8")
+        )
         return str(found["id"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -12,7 +12,7 @@ import polars as pl
 
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, Verdict
-from simtest.runtime.files import sync_folder, write_atomically
+from simtest.runtime.files import require_plain, sync_folder, write_atomically
 from simtest.runtime.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
@@ -139,7 +139,7 @@ def _skipped_note(skipped: list[str]) -> list[str]:
 def _read(file: Path, columns: Sequence[str], quantities: Sequence[str] | None) -> pl.DataFrame | str:
     """Read one run's file; return the reason where it cannot be used."""
     try:
-        held = pl.read_parquet_schema(file)
+        held = pl.read_parquet_schema(require_plain(file))
         if missing := [name for name in _NEEDED if name not in held]:
             return f"no night's figures: no column {missing[0]}"
         wanted = [name for name in columns if name in held]

@@ -1,7 +1,6 @@
 """The folders of the nightly's reports, and changing them so that a kill at any moment leaves them whole."""
 
 import contextlib
-import fcntl
 import os
 import secrets
 import shutil
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.runtime.files import sync_folder
+from simtest.runtime.locks import exclusive_file, is_held, waiting_for
 from simtest.runtime.resources import shown
 
 LOCK = "lock"
@@ -63,19 +63,19 @@ def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
     folder = reports.work / run_id
     with contextlib.ExitStack() as stack:
         # Together with the lock, or another run would take the folder for a dead one's.
-        with _locked(reports.work / _ENTRY):
+        with waiting_for(reports.work / _ENTRY):
             folder.mkdir()
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            stack.enter_context(_locked(folder / LOCK))
+            stack.enter_context(waiting_for(folder / LOCK))
         yield folder
 
 
 def remove_dead(reports: Reports) -> list[str]:
     """Remove the leftovers of killed runs and return their names; living runs hold a lock and are left alone."""
     dead, alive = [], set()
-    with _locked(reports.work / _ENTRY):
+    with waiting_for(reports.work / _ENTRY):
         for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
-            if _is_held(folder / LOCK):
+            if is_held(folder / LOCK):
                 alive.add(folder.name)
             else:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -87,29 +87,18 @@ def remove_dead(reports: Reports) -> list[str]:
     return dead
 
 
-def _is_held(lock: Path) -> bool:
-    try:
-        with lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
-
-
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+def only_night(reports: Reports, profile: str) -> Iterator[None]:
+    """Keep a profile's nights to this process; raise `InputError`, which names the other one, where one is at work."""
+    reports.make()
+    with exclusive_file(reports.root / profile, "--reports"):
         yield
 
 
 @contextlib.contextmanager
 def exclusive_replacement(folder: Path) -> Iterator[None]:
     """Lock the folder for replacement; first roll back an interrupted swap."""
-    with _locked(folder.parent / f".{folder.name}.{LOCK}"):
+    with waiting_for(folder.parent / f".{folder.name}.{LOCK}"):
         old = _old(folder)
         # A kill between the two renames of `replace_folder` left the old folder aside.
         if old.is_dir():

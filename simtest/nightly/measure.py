@@ -45,7 +45,21 @@ class RunOptions:
 DEFAULTS = RunOptions()
 
 
-def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions = DEFAULTS) -> NightlyRun:
+Planned = tuple[list[Experiment], list[list[Case]]]
+"""A profile's experiments, and the cases of each."""
+
+
+def plan_run(profile: Profile) -> Planned:
+    """Return what a profile runs; raise `InputError` for whatever is malformed, before anything is made."""
+    experiments = experiments_of(profile)
+    for experiment in experiments:
+        load_estimators(experiment.estimators)
+    return experiments, [expand(experiment) for experiment in experiments]
+
+
+def measure_run(
+    profile: Profile, folder: Path, run_id: str, options: RunOptions = DEFAULTS, planned: Planned | None = None
+) -> NightlyRun:
     """Run a profile.
 
     Parameters
@@ -58,6 +72,8 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
         For the run's record.
     options : RunOptions
         How.
+    planned : tuple, optional
+        What `plan_run` returned, where it was asked before.
 
     Raises
     ------
@@ -67,11 +83,7 @@ def measure_run(profile: Profile, folder: Path, run_id: str, options: RunOptions
     started, clock = datetime.now(UTC), time.monotonic()
     # Asked at the start: the checkout may have moved on before the run ends.
     origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
-    experiments = experiments_of(profile)
-    cases = [expand(experiment) for experiment in experiments]
-    for experiment in experiments:
-        # Refused before the canaries, not after them.
-        load_estimators(experiment.estimators)
+    experiments, cases = planned or plan_run(profile)
     definitions = {own.name: definition(own, of_own) for own, of_own in zip(experiments, cases, strict=True)}
     steps = _Steps(options.progress, sum(case.realisations for of_own in cases for case in of_own))
     figures: list[pl.DataFrame] = []

@@ -7,8 +7,16 @@ from pathlib import Path
 from simtest.nightly.baseline import load_baseline
 from simtest.nightly.draw import draw
 from simtest.nightly.history import append, history_rows
-from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
-from simtest.nightly.measure import DEFAULTS, RunOptions, measure_run
+from simtest.nightly.layout import (
+    Reports,
+    exclusive_replacement,
+    new_run_id,
+    only_night,
+    remove_dead,
+    replace_folder,
+    scratch,
+)
+from simtest.nightly.measure import DEFAULTS, RunOptions, measure_run, plan_run
 from simtest.nightly.records import JudgedRun
 from simtest.nightly.storage import disk_errors_in_one_line
 from simtest.nightly.verdict import judge
@@ -33,15 +41,17 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
         If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What
         earlier runs wrote is as it was.
     """
+    # Before any folder is touched.
+    planned = plan_run(profile)
     left = "what earlier nights wrote is as it was"
-    with disk_errors_in_one_line(reports.root, "the night could not be written", left):
-        reports.make()
+    disk = disk_errors_in_one_line(reports.root, "the night could not be written", left)
+    with disk, only_night(reports, profile.name):
         # Before the work: a damaged baseline must not cost a run.
         baseline = load_baseline(reports, profile.name)
         remove_dead(reports)
         run_id = new_run_id(datetime.now(UTC))
         with scratch(reports, run_id) as folder:
-            run = measure_run(profile, folder, run_id, options)
+            run = measure_run(profile, folder, run_id, options, planned)
             judged = judge(run, baseline, reports)
             judged = draw(judged, profile, folder / "tonight", options.variant)
             return _published(reports, judged, folder / "tonight")

@@ -10,7 +10,7 @@ import polars as pl
 
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
-from simtest.runtime.files import sync_folder, write_atomically, write_json
+from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import shown
 
@@ -84,10 +84,10 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{shown(path)}: damaged (not JSON: {error})") from error
     try:
         hashes = data.pop("files", None)

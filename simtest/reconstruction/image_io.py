@@ -11,14 +11,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image as PillowImage
-from PIL import UnidentifiedImageError
 
 from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime.arrays import Image
+from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.quiet import quiet_libraries
 from simtest.runtime.resources import shown
 
-MAX_PIXELS = 100_000_000
+PATIENCE_MS = 5000
+"""After so long FFmpeg gives up opening a film, or reading a frame."""
+
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 
@@ -37,50 +40,70 @@ def read_picture(path: Path) -> Image:
 
 
 def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
-    """Read the pixels of a picture file as they are, in OpenCV's order of channels.
+    """Read the pixels of a picture file as they are, in OpenCV's order of channels; of several pages the first.
 
     Raises
     ------
     InputError
-        If the file is missing, no picture, or has more than 100 million pixels: checked before it is decoded.
+        If the file is missing, no plain file, no picture, or beyond a limit (`simtest.runtime.limits`): checked before
+        it is decoded.
     """
-    if path.is_dir():
-        raise InputError(f"{shown(path)}: is a folder; must be {wanted}")
+    check_file(path, "picture_bytes", wanted)
+    _check_header(path)
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    _check_size(path)
     try:
-        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        with quiet_libraries():
+            picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     except cv2.error as error:
         raise InputError(f"{shown(path)}: cannot be decoded ({str(error).splitlines()[0][:120]})") from error
     if picture is None:
         raise InputError(f"{shown(path)}: no picture ({data.size} bytes); must be PNG, JPEG, BMP or TIFF")
-    if picture.shape[0] * picture.shape[1] > MAX_PIXELS:
-        raise InputError(_too_large(path, f"{picture.shape[1]} x {picture.shape[0]} px"))
+    _check_size(path, picture.shape[1], picture.shape[0])
     return np.asarray(picture)
 
 
-def _check_size(path: Path) -> None:
-    """Raise `InputError` where a file's header announces too many pixels."""
+def _check_header(path: Path) -> None:
+    """Raise `InputError` where a file's header announces too many pixels; warn where it holds several pictures."""
     try:
         # Pillow warns of large pictures, and refuses them at twice its own limit.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with PillowImage.open(path) as header:
-                width, height = header.size
+                (width, height), animated = header.size, bool(getattr(header, "is_animated", False))
     except PillowImage.DecompressionBombError as error:
-        raise InputError(_too_large(path, str(error).split(",")[0])) from None
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
-        # OpenCV reads more formats than Pillow, and names what is wrong with the others.
+        # Beyond a limit of its own Pillow tells the size in words alone.
+        pixels = re.search(r"\d+", str(error))
+        check_limit("picture_pixels", int(pixels[0]) if pixels else 2**40, path, "px")
         return
-    if width * height > MAX_PIXELS:
-        raise InputError(_too_large(path, f"{width} x {height} px"))
+    except Exception:
+        # OpenCV reads more than Pillow, whose parsers raise whatever they run into, and says what is wrong with others.
+        width, height = _tiff_size(path)
+        animated = False
+    _check_size(path, width, height)
+    if animated:
+        warnings.warn(f"{shown(path)}: holds several pictures; the first is used", stacklevel=4)
 
 
-def _too_large(path: Path, size: str) -> str:
-    return f"{shown(path)}: {size}; at most {MAX_PIXELS} px are allowed"
+def _tiff_size(path: Path) -> tuple[int, int]:
+    """Return the size that a TIFF file announces whose pixels Pillow does not know; 0, 0 where it is none."""
+    from PIL import TiffImagePlugin
+
+    try:
+        with path.open("rb") as file:
+            tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+            file.seek(tags.next)
+            tags.load(file)
+            return int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH])
+    except Exception:
+        return 0, 0
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
+    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
 
 
 @dataclass(frozen=True)
@@ -118,10 +141,11 @@ class Source:
 
 
 def _video_frames(path: Path) -> Iterator[SequenceFrame]:
-    capture = cv2.VideoCapture(str(path))
+    capture = _capture(path)
 
     def read() -> Image:
-        done, frame = capture.retrieve()
+        with quiet_libraries():
+            done, frame = capture.retrieve()
         if not done or frame is None:
             raise InputError(f"{shown(path)}: a frame cannot be decoded")
         values = frame.astype(np.float32) / np.float32(255)
@@ -131,38 +155,67 @@ def _video_frames(path: Path) -> Iterator[SequenceFrame]:
         rate = float(capture.get(cv2.CAP_PROP_FPS))
         index = 0
         # A frame that is not wanted is skipped without being decoded.
-        while capture.grab():
+        while _grabbed(capture):
             yield SequenceFrame(index, f"{path.name}#{index}", index / rate if rate > 0 else None, read)
             index += 1
     finally:
         capture.release()
 
 
+def _capture(path: Path) -> cv2.VideoCapture:
+    """Open a film; FFmpeg gives up reading after `PATIENCE_MS`."""
+    patience = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, PATIENCE_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, PATIENCE_MS]
+    with quiet_libraries():
+        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, patience)
+
+
+def _grabbed(capture: cv2.VideoCapture) -> bool:
+    with quiet_libraries():
+        return bool(capture.grab())
+
+
 def is_sequence(path: Path) -> bool:
     """Return whether a path is a folder, or a video by its suffix."""
-    return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
+    try:
+        return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
+    except OSError as error:
+        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
 
 
 def open_source(path: Path) -> Source:
     """Open a folder or a video; raise `InputError` if there is none, or it holds no frame."""
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
+        try:
+            files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
+        except OSError as error:
+            raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
         if not files:
             raise InputError(f"{shown(path)}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
         return Source(path, len(files), tuple(sorted(files, key=_natural)))
-    if not path.is_file():
-        raise InputError(f"{shown(path)}: no such file")
-    size = path.stat().st_size
-    capture = cv2.VideoCapture(str(path)) if size else None
+    size = check_file(path, "film_bytes", "a film, a picture or a folder of pictures")
+    # FFmpeg takes whatever it can make sense of, playlists of other files among it.
+    with path.open("rb") as file:
+        if not _is_film(file.read(16)):
+            raise InputError(f"{shown(path)}: no video that can be read ({size} bytes, of no known container)")
+    capture = _capture(path)
     # OpenCV opens some files that hold no frame, so the first is fetched.
-    if capture is None or not capture.isOpened() or not capture.grab():
+    if not capture.isOpened() or not _grabbed(capture):
         raise InputError(f"{shown(path)}: no video that can be read ({size} bytes)")
     keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
     width, height, count = (int(capture.get(key)) for key in keys)
     capture.release()
-    if width * height > MAX_PIXELS:
-        raise InputError(f"{shown(path)}: {width} x {height} px; at most {MAX_PIXELS} px are allowed")
+    _check_size(path, width, height)
     return Source(path, max(count, 1))
+
+
+def _is_film(head: bytes) -> bool:
+    """Return whether a file begins as a film's container: MP4 or QuickTime, AVI, Matroska, ASF, MPEG."""
+    return (
+        head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"skip")
+        or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
+        or head.startswith((b"\x1a\x45\xdf\xa3", b"\x30\x26\xb2\x75", b"\0\0\1\xba", b"\0\0\1\xb3"))
+        or head[:1] == b"G"
+    )
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:

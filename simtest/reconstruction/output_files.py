@@ -19,6 +19,8 @@ from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.resources import shown
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
@@ -61,7 +63,7 @@ def write_outputs(
         write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
         write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return [out / name for name in FILES]
 
 

@@ -13,6 +13,7 @@ from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
+from simtest.runtime.resources import shown
 
 TARGETS = ("fine", "base")
 
@@ -81,7 +82,7 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--roi {text}: must be x,y,w,h, four integers in px") from None
+        raise InputError(f"--roi {shown(text, 60)}: must be x,y,w,h, four integers in px") from None
     return x, y, width, height
 
 

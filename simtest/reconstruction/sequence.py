@@ -12,17 +12,20 @@ from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.description import SpecularityRecord
-from simtest.reconstruction.image_io import SequenceFrame, open_source
+from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
 from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
-from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
+from simtest.runtime.locks import exclusive_folder
+from simtest.runtime.machine_errors import disk_problem
 from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
 
+SETTINGS = "run.json"
 TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 
 
@@ -63,9 +66,16 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
     source = open_source(path)
-    make_folder(out / "frames")
-    _check_settings(out / "run.json", path, options)
-    run = _Run(out / "frames", options)
+    with exclusive_folder(out):
+        return _reconstruct(source, out, options, progress)
+
+
+def _reconstruct(
+    source: Source, out: Path, options: Options, progress: Callable[[int, int, str], None] | None
+) -> SequenceResult:
+    path, settings = source.path, _settings(source.path, options)
+    _check_settings(out / SETTINGS, settings)
+    run = _Run(out, options, settings)
     for frame in source.frames():
         if progress is not None:
             progress(frame.index, max(source.count, frame.index + 1), frame.name)
@@ -90,8 +100,8 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
 class _Run:
     """The frames of a sequence that are done so far, with what carries over from one to the next."""
 
-    def __init__(self, folder: Path, options: Options) -> None:
-        self.folder, self.options = folder, options
+    def __init__(self, out: Path, options: Options, settings: JsonObject) -> None:
+        self.out, self.folder, self.options, self.settings = out, out / "frames", options, settings
         self.frames: list[TrackedFrame] = []
         self.taken = self.failed = 0
         self.first_error = ""
@@ -131,6 +141,10 @@ class _Run:
         self.assumed = record.assumed
         spots = self._tracked(record.specularities, size)
         overlay = draw_overlay(picture, spots)
+        # Not before a frame is there: a run that reads nothing leaves nothing.
+        if not self.folder.is_dir() or not (self.out / SETTINGS).is_file():
+            make_folder(self.folder)
+            write_json(self.out / SETTINGS, self.settings)
         write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
         spots = [replace(spot, drawings={}) for spot in spots]
         entry = {"frame_index": frame.index, "time_s": frame.time_s, "size": size}
@@ -147,18 +161,20 @@ class _Run:
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        frame = TrackedFrame.from_json(json.loads(path.read_text(encoding="utf-8")))
+        frame = TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return frame if frame.name == name else None
 
 
-def _check_settings(path: Path, source: Path, options: Options) -> None:
-    """Write the run's settings, or raise `InputError` where another run's stand."""
-    # Through JSON, so that paths and tuples compare with the text and lists that are read.
-    settings = json.loads(json.dumps({"source": source, **asdict(options)}, default=str))
+def _settings(source: Path, options: Options) -> JsonObject:
+    """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
+    return dict(json.loads(json.dumps({"source": source, **asdict(options)}, default=str)))
+
+
+def _check_settings(path: Path, settings: JsonObject) -> None:
+    """Raise `InputError` where the settings of another run stand."""
     if not path.is_file():
-        write_json(path, settings)
         return
     try:
         before = json.loads(path.read_text(encoding="utf-8"))
@@ -185,5 +201,5 @@ def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[P
         write_json(files[1], tracks, compact=True)
         write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({error.strerror})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files

@@ -20,11 +20,15 @@ from typing import Any
 
 import platformdirs
 
-from simtest.errors import BackendError
+from simtest.errors import BackendError, InputError
 from simtest.runtime.files import Json, write_json
+from simtest.runtime.resources import shown
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
 """What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""
+
+VARIANT_NAME = re.compile(r"(scalar|llvm|cuda)(_ad)?_(mono|rgb|spectral)(_polarized)?(_double)?")
+"""Names that Mitsuba forms its variants' by; which of them it has been built with is known once it is imported."""
 
 DEFAULT_VARIANT = f"{LLVM}_ad_mono"
 COLOUR_VARIANT = f"{LLVM}_ad_rgb"
@@ -79,7 +83,14 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
     A device alone (see `DEVICES`, the default is the processor) is its variant of one channel, or of three where the
     scene is `coloured`.
     """
+    if variant is not None and not variant.strip():
+        raise InputError(f"--variant is empty; must be one of {', '.join(DEVICES)}, or a Mitsuba variant by name")
     name = variant or os.environ.get(VARIANT_VARIABLE) or LLVM
+    if name not in DEVICES and not VARIANT_NAME.fullmatch(name):
+        raise BackendError(
+            f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join(DEVICES)}, or a Mitsuba variant by "
+            "name, such as llvm_ad_rgb"
+        )
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 

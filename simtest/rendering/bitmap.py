@@ -1,5 +1,6 @@
 """Reads and writes OpenEXR files with Mitsuba's own image library."""
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +10,11 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime.arrays import Image
+from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import shown
+
+HEADER_BYTES = 65536
+"""In which the size of an image must stand."""
 
 
 def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
@@ -41,12 +46,35 @@ def read_bitmap(path: Path, variant: str | None = None) -> Image:
     Raises
     ------
     InputError
-        If the file is not an image.
+        If the file is not an image, or of more pixels than allowed.
     """
+    _check_size(path)
     mi = backend.load(variant)
     try:
         with _two_threads():
             bitmap = mi.Bitmap(str(path))
-    except RuntimeError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({shown(str(error).splitlines()[-1], 120)})") from None
-    return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32), dtype=np.float32)
+    except Exception as error:
+        # Mitsuba hands on whatever OpenEXR runs into.
+        raise InputError(f"{shown(path)}: cannot be read ({shown(_last_line(error), 120)})") from None
+    # Converted here: Mitsuba converts no image of one channel that is called Z, as depth is.
+    return np.array(np.array(bitmap), dtype=np.float32)
+
+
+def _last_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
+
+
+def _check_size(path: Path) -> None:
+    """Raise `InputError` where an OpenEXR file's header announces too many pixels; it is asked for memory later."""
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    key = b"dataWindow\0box2i\0\x10\0\0\0"
+    start = head.find(key) + len(key)
+    if start < len(key) or len(head) < start + 16:
+        raise InputError(f"{shown(path)}: no OpenEXR image; its header has no data window")
+    left, top, right, bottom = struct.unpack("<4i", head[start : start + 16])
+    width, height = right - left + 1, bottom - top + 1
+    if width < 1 or height < 1:
+        raise InputError(f"{shown(path)}: {width} x {height} px; must be 1 px or more along each side")
+    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
+    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")

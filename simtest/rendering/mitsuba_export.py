@@ -259,8 +259,8 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
             # Mitsuba does not know the kind of a plugin written in Python.
             node.type = mi.ObjectType.BSDF
     written = mi.parser.write_string(state, add_section_headers=True)
-    # Replace the transforms, add the comment at the head.
-    root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    # Replace the transforms, add the comment at the head. Mitsuba itself has just written this text.
+    root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))  # nosec B314
     _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
     # A mesh is stored in the model frame already.
     if not shape.mesh:

@@ -9,6 +9,10 @@ from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.resources import shown
+
+OWN = "simtest"
+"""This package's name, and that of its top module."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,15 @@ class EntryPointGroup:
         """
         found = self._registered(name)
         if not found:
-            raise InputError(f"{self.kind} {name!r}: not installed; allowed: {', '.join(self.names())}")
+            raise InputError(f"{self.kind} {shown(name, 80)!r}: not installed; allowed: {', '.join(self.names())}")
         if len(found) > 1:
             full = " or ".join(sorted(f"{_package(point)}:{point.name}" for point in found))
             raise InputError(f"{self.kind} {name!r}: registered by {len(found)} packages; name one of them: {full}")
+        # Of two packages of one name the first on the path is seen alone, so it could stand for this one.
+        if _normalised(_package(found[0])) == OWN and found[0].module.partition(".")[0] != OWN:
+            raise InputError(
+                f"{self.kind} {name!r}: another package that is called {OWN} registers {found[0].value}; remove it"
+            )
         try:
             return found[0].load()
         except Exception as error:

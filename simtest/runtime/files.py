@@ -1,12 +1,16 @@
 """Atomic writing of files: a reader never meets half of one."""
 
+import contextlib
+import errno
 import json
 import os
+import stat
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.limits import limit
 from simtest.runtime.resources import shown
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -15,35 +19,58 @@ JsonObject = dict[str, Any]
 """An object as it stands in a JSON file: what records become when they are written, and are made of when read."""
 
 
-def refuse_file(folder: Path) -> None:
-    """Raise `InputError` if the path of a results folder is a file."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
+def refuse_file(folder: Path, option: str = "--out") -> None:
+    """Raise `InputError` if the path of a results folder is a file; `option` is how the user names it."""
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{option} {shown(folder)}: is a file; must be a folder")
+    except OSError as error:
+        raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
 
 
-def make_folder(folder: Path) -> None:
+def make_folder(folder: Path, option: str = "--out") -> None:
     """Make a folder for results; raise `InputError` if that is impossible."""
-    refuse_file(folder)
+    refuse_file(folder, option)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
+        raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
+
+
+def require_plain(path: Path, limited_by: str | None = None) -> Path:
+    """Return a path that is a plain file, and within a limit of `simtest.runtime.limits` where one is named.
+
+    Raises `OSError` if it is none: a pipe or a device might never end.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.ENXIO, "is no plain file", str(path))
+    if limited_by is not None and found.st_size > limit(limited_by):
+        raise OSError(errno.EFBIG, f"{found.st_size} bytes; at most {limit(limited_by)} are allowed", str(path))
+    return path
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it.
 
-    `write` is called with the temporary path, which has the final file's suffix.
+    `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the file, also
+    where the system's own does not (a full disk), or where `write` returns False, as OpenCV does.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        write(part)
+        if write(part) is False:
+            raise OSError(errno.EIO, "cannot be written; is the disk full?", str(path))
         # The content must be on disk before the rename is, or a loss of power leaves an empty file.
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

@@ -9,6 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import TypedDict
 
+from simtest.runtime.files import require_plain
+
 PACKAGES = (
     "mitsuba", "drjit", "numpy", "scipy", "scikit-image", "opencv-python-headless", "trimesh", "libigl", "polars",
 )  # fmt: skip
@@ -92,7 +94,7 @@ def source_hash() -> str:
 
 def file_hash(path: Path) -> str:
     """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
+    with require_plain(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

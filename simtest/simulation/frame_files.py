@@ -15,6 +15,8 @@ from simtest.runtime import provenance
 from simtest.runtime.array_files import write_arrays
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
+from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.resources import shown
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
@@ -80,7 +82,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
         write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
     return files
 
 

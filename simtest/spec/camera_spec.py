@@ -15,6 +15,18 @@ from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 
+SHORTEST, LONGEST = 0.004, 1000.0
+"""Focal lengths over the longer side of the image, for fields of view of 179 and 0.06 deg."""
+
+ASPECT = 20.0
+"""Largest ratio of the focal lengths along x and y."""
+
+OUTSIDE = 4.0
+"""How far outside the image the principal point may lie, in sides of it: a picture may be a part of a larger one."""
+
+SMALL = 64
+"""px; an image that is smaller may be a part of one of this size."""
+
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
@@ -95,6 +107,27 @@ class CameraSpec(Spec):
         None, description="the lens; default none, a pinhole. It must not fold over inside the image or the view mask"
     )
     view_mask: ViewMaskSpec | None = Field(None, description="default: the whole image is seen")
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "CameraSpec":
+        side = max(self.width, self.height)
+        for name, focal in (("fx", self.fx), ("fy", self.fy)):
+            if not SHORTEST * side <= focal <= LONGEST * max(side, SMALL):
+                raise ValueError(
+                    f"{name} = {focal:g}: must be {SHORTEST * side:g} to {LONGEST * max(side, SMALL):g} px, for a "
+                    f"field of view between 0.06 and 179 deg of an image of {self.width} x {self.height} px"
+                )
+        if not 1 / ASPECT <= self.fx / self.fy <= ASPECT:
+            raise ValueError(f"fx = {self.fx:g} and fy = {self.fy:g}: must differ by a factor of {ASPECT:g} at most")
+        if abs(self.skew) > self.fx:
+            raise ValueError(f"skew = {self.skew:g}: must be at most fx = {self.fx:g} in size")
+        for name, size in (("cx", self.width), ("cy", self.height)):
+            centre, reach = getattr(self, name), OUTSIDE * max(size, SMALL)
+            if centre is not None and not -reach <= centre <= size + reach:
+                raise ValueError(
+                    f"{name} = {centre:g}: far outside the image; must be {-reach:g} to {size + reach:g} px"
+                )
+        return self
 
     @model_validator(mode="after")
     def _possible(self) -> "CameraSpec":

@@ -9,6 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.geometry.angular_profile import AngularProfile
+from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.instrument import Instrument
@@ -94,6 +95,15 @@ class Scene(Spec):
     def translucency(self) -> Translucency | None:
         """How diffuse light spreads below the surface; None where it leaves where it entered."""
         return self.reflectance.translucency if isinstance(self.reflectance, TissueReflectance) else None
+
+    @model_validator(mode="after")
+    def _affordable(self) -> "Scene":
+        width, height, samples = self.camera.width, self.camera.height, self.render.samples_per_pixel
+        what = f"camera.width = {width}, camera.height = {height}"
+        check_limit("frame_pixels", width * height, what, "px")
+        what += f", render.samples_per_pixel = {samples}"
+        check_limit("frame_samples", width * height * samples, what, "rays a frame")
+        return self
 
     @model_validator(mode="after")
     def _has_valleys(self) -> "Scene":

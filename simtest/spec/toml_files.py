@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
 
-MAX_TOML_BYTES = 1_000_000
+MAX_DEPTH = 32
+"""Tables and lists within each other, and parts of a key path; the deepest key of a scene has 6."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -25,16 +27,11 @@ def read_toml(path: Path) -> dict[str, Any]:
 def read_text(path: Path, kind: str) -> str:
     """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
 
-    Raises `InputError` if it is missing, too large or not UTF-8.
+    Raises `InputError` if it is missing, no plain file, too large or not UTF-8.
     """
     name = shown(path)
+    check_file(path, "text_bytes", f"a {kind} file")
     try:
-        size = path.stat().st_size
-        # A device or a pipe has no size and might never end.
-        if not path.is_file():
-            raise InputError(f"{name}: is {'a folder' if path.is_dir() else 'no plain file'}; a {kind} file is needed")
-        if size > MAX_TOML_BYTES:
-            raise InputError(f"{name}: {size} bytes; a {kind} file of at most {MAX_TOML_BYTES} is allowed")
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{name}: cannot be read ({error.strerror})") from error
@@ -43,9 +40,9 @@ def read_text(path: Path, kind: str) -> str:
 
 
 def _loads(text: str) -> dict[str, Any]:
-    """Parse TOML; limits of the parser (nesting, digits) raise `TOMLDecodeError` too."""
+    """Parse TOML; limits (nesting, digits) raise `TOMLDecodeError` too."""
     try:
-        return tomllib.loads(text)
+        parsed = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         raise
     except RecursionError:
@@ -53,6 +50,14 @@ def _loads(text: str) -> dict[str, Any]:
     except ValueError:
         # Python refuses to read integers of more than 4300 digits.
         raise tomllib.TOMLDecodeError("a number has too many digits") from None
+    # Tables deeper than Python's own stack cannot be copied, shown or validated.
+    level: list[Any] = [parsed]
+    for _ in range(MAX_DEPTH):
+        inner = [value for item in level for value in (item.values() if isinstance(item, dict) else item)]
+        level = [value for value in inner if isinstance(value, dict | list)]
+        if not level:
+            return parsed
+    raise tomllib.TOMLDecodeError(f"nested too deeply; at most {MAX_DEPTH} levels are allowed")
 
 
 # Settings by key path ------------------------------------------------------------------------------------------------
@@ -89,6 +94,8 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
     result = copy.deepcopy(dict(data))
     for path, value in settings.items():
         parts = path.split(".")
+        if len(parts) > MAX_DEPTH:
+            raise InputError(f"{where}: {shown(path, 60)}: {len(parts)} parts; a key path has {MAX_DEPTH} at most")
         last, parents = parts[-1], parts[:-1]
         node: Any = result
         # Down to the table or list that holds the value ...

@@ -12,19 +12,18 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
+from simtest.runtime.limits import check_file, check_limit
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
+from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.repair import Repairs, repair
+from simtest.surfaces.vtk_file import read_vtk
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
 
 MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
-
-MAX_FACES = 5_000_000
-MAX_BYTES = {".ply": 1_000_000_000, ".obj": 500_000_000, ".stl": 1_500_000_000, ".vtk": 1_000_000_000}
-"""About the size of `MAX_FACES` faces as text; reading takes some ten times as much memory."""
 
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
@@ -55,16 +54,23 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{path}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
-    _check_file(path, suffix)
+        raise InputError(f"{shown(path)}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
+    announced = _check_file(path, suffix)
     try:
         with _quiet():
-            vertices, faces = _load_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
+            vertices, faces = read_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
     except InputError:
         raise
     except Exception as error:
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
-        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_first_line(error)})") from error
+        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_told(error)})") from error
+    # Its reader says nothing of lines that are missing.
+    held = (len(vertices), len(faces))
+    if held[0] < announced[0] or held[1] < announced[1]:
+        raise InputError(
+            f"{shown(path)}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
+            f"{announced[1]}: it is cut short, or a line is malformed"
+        )
     _check_arrays(path, vertices, faces)
     count = len(faces)
     with _quiet():
@@ -88,29 +94,41 @@ def other_unit(extent: float) -> str:
     return ""
 
 
-def _check_file(path: Path, suffix: str) -> None:
-    """Check what can be checked without parsing the file: size, and number of faces where the header holds it."""
-    if not path.is_file():
-        raise InputError(f"{path}: {'is a folder; a file is needed' if path.is_dir() else 'no such file'}")
+def _check_file(path: Path, suffix: str) -> tuple[int, int]:
+    """Check what can be checked without reading the file: kind, size, and what its header announces.
+
+    Returns the vertices and faces that the file must hold at least.
+    """
+    announced = (0, 0)
+    size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
+    if size == 0:
+        raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
     try:
-        size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(4096)
+        if suffix == ".ply":
+            announced = check_ply(path, size)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    # size of the file
-    if size == 0:
-        raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    if size > MAX_BYTES[suffix]:
-        raise InputError(f"{path}: {size} bytes; at most {MAX_BYTES[suffix]} are allowed: decimate the mesh")
-    # faces that the header declares
-    declared = 0
-    if suffix == ".ply" and (match := re.search(rb"element face (\d{1,18})\b", head)):
-        declared = int(match[1])
-    elif suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
-        declared = count
-    if declared > MAX_FACES:  # before any memory is asked for
-        raise InputError(f"{path}: {declared} faces; at most {MAX_FACES} are allowed: decimate the mesh")
+        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    if suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
+        check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
+    # OBJ is text, which its reader would make a hundred million words of before it finds nothing in them.
+    if suffix == ".obj" and b"\0" in head:
+        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+    if suffix == ".vtk":
+        _check_vtk(path, head, size)
+    return announced
+
+
+def _check_vtk(path: Path, head: bytes, size: int) -> None:
+    """Raise `InputError` where a VTK file is none, or announces more points or cells than it has bytes."""
+    if not head.startswith((b"# vtk DataFile", b"<?xml", b"<VTKFile")):
+        raise InputError(f"{shown(path)}: no VTK file; its first line must be # vtk DataFile Version ...")
+    for name, count in re.findall(rb"^(POINTS|POLYGONS|CELLS|TRIANGLE_STRIPS)\s+(-?\d{1,18})\b", head, re.MULTILINE):
+        if not 0 <= int(count) <= size:
+            raise InputError(
+                f"{shown(path)}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them"
+            )
 
 
 @contextmanager
@@ -142,31 +160,6 @@ def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
     return vertices, np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
 
 
-def _load_vtk(path: Path) -> tuple[Array, IntArray]:
-    import pyvista  # slow to import
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
-
-    displayed, verbosity = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    vtkObject.GlobalWarningDisplayOff()
-    try:
-        data = pyvista.read(path)
-        if isinstance(data, pyvista.UnstructuredGrid):
-            _check_indices(path, np.asarray(data.cell_connectivity), data.n_points)
-            data = data.extract_surface(algorithm="dataset_surface")
-        if not isinstance(data, pyvista.PolyData):
-            raise InputError(f"{path}: a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
-        # VTK's filters trust the indices, so they are checked first.
-        for cells in (data.GetPolys(), data.GetStrips()):
-            _check_indices(path, pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
-        data = data.triangulate()
-        faces = np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
-        return np.array(data.points, dtype=np.float64), faces
-    finally:
-        vtkObject.SetGlobalWarningDisplay(displayed)
-        vtkLogger.SetStderrVerbosity(verbosity)
-
-
 def _check_indices(path: Path, indices: IntArray, count: int) -> None:
     if len(indices) and not (indices.min() >= 0 and indices.max() < count):
         wrong = indices.max() if indices.max() >= count else indices.min()
@@ -181,8 +174,9 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         raise InputError(f"{path}: {len(vertices)} points and no faces; at least {MIN_FACES} triangles are needed")
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"{path}: faces of {faces.shape[-1]} corners; triangles are needed")
-    if not MIN_FACES <= len(faces) <= MAX_FACES:
-        raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; allowed: {MIN_FACES} to {MAX_FACES}")
+    if len(faces) < MIN_FACES:
+        raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; at least {MIN_FACES} are needed")
+    check_limit("mesh_faces", len(faces), path, "faces", "decimate the mesh")
     # values
     _check_indices(path, faces.ravel(), len(vertices))
     if not np.isfinite(vertices).all():
@@ -198,9 +192,12 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def _first_line(error: Exception) -> str:
+def _told(error: Exception) -> str:
+    """Return what a reader ran into; a fault of its own, such as an index out of range, says nothing to a user."""
     lines = str(error).strip().splitlines()
-    return (lines[0] if lines else type(error).__name__)[:160]
+    if isinstance(error, IndexError | KeyError | TypeError | AttributeError | AssertionError) or not lines:
+        return "its elements do not fit what its header announces, or a line is cut short"
+    return lines[0][:160]
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
@@ -210,10 +207,13 @@ def check_target(path: Path) -> None:
     """Raise `InputError` if a mesh cannot be written to a path; called before any work is done."""
     if path.suffix.lower() not in WRITTEN_SUFFIXES:
         raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
-    if path.is_dir():
-        raise InputError(f"--out {shown(path)}: is a folder; must be a file")
-    if not path.parent.is_dir():
-        raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
+    try:
+        if path.is_dir():
+            raise InputError(f"--out {shown(path)}: is a folder; must be a file")
+        if not path.parent.is_dir():
+            raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
+    except OSError as error:
+        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
+from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find, shown
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
@@ -154,6 +155,7 @@ def expand(experiment: Experiment) -> list[Case]:
         If a scene is missing or malformed, a swept value or an end of a drawn range does not fit, or two settings
         share a name: found before anything is rendered.
     """
+    check_effort(experiment)
     cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
     names: set[str] = set()
     recipes: set[str] = set()
@@ -166,6 +168,23 @@ def expand(experiment: Experiment) -> list[Case]:
         names.add(case.name)
         _check(case, experiment, recipes)
     return cases
+
+
+def check_effort(experiment: Experiment) -> None:
+    """Raise `InputError` where an experiment has more settings or realisations than are allowed."""
+    settings = realisations = 0
+    for number, group in enumerate(experiment.groups):
+        where = f"experiment {experiment.name}: groups.{number}"
+        count = 1
+        for kind, tables in (("sweep", group.sweep), ("pool", group.pool)):
+            for table in tables:
+                key, values = next(iter(table.items()))
+                check_limit("sweep_values", len(values), f"{where}.{kind}: {shown(key, 60)}", "values")
+                count *= len(values)
+        settings += count
+        realisations += count * (experiment.realisations if group.realisations is None else group.realisations)
+        check_limit("settings", settings, f"{where}", "settings, up to this group")
+        check_limit("realisations", realisations, f"{where}", "realisations, up to this group")
 
 
 def _check(case: Case, experiment: Experiment, recipes: set[str]) -> None:

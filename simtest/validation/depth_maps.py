@@ -12,11 +12,15 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.image_io import MAX_PIXELS, read_raw
+from simtest.reconstruction.image_io import read_raw
 from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.limits import check_file, check_limit
 from simtest.runtime.resources import shown
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+
+NEAREST_MM, FARTHEST_MM = 1e-3, 1e6
+"""Depths that are plausible: those of scenes."""
 
 RADIUS_PX = 2
 """Half the side of the window whose points a normal's plane goes through."""
@@ -60,8 +64,8 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         raise InputError(f"{shown(path)}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
-    if scale_mm is not None and not (math.isfinite(scale_mm) and scale_mm > 0):
-        raise InputError(f"--depth-scale {scale_mm:g}: must be a positive number of mm")
+    if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
+        raise InputError(f"--depth-scale {scale_mm:g}: must be 1e-9 to {FARTHEST_MM:g} mm")
     if suffix == ".npy":
         values = _read_npy(path)
     elif suffix == ".exr":
@@ -82,16 +86,30 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
     if np.isnan(depth).all():
         raise InputError(f"{shown(path)}: holds no positive depth")
+    _check_range(float(np.nanmin(depth)), float(np.nanmax(depth)), path)
     return depth
 
 
+def _check_range(low: float, high: float, where: object) -> None:
+    if not (low >= NEAREST_MM and high <= FARTHEST_MM):
+        raise InputError(
+            f"{shown(where)}: depths from {low:.3g} to {high:.3g} mm; must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm"
+        )
+
+
 def _read_npy(path: Path) -> npt.NDArray[np.generic]:
+    check_file(path, "picture_bytes", "a depth map")
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{shown(path)}: cannot be read ({str(error).splitlines()[0][:120]})") from None
-    if values.dtype.kind not in "iuf" or values.size > MAX_PIXELS:
-        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be up to {MAX_PIXELS} numbers")
+    except Exception as error:
+        # NumPy raises whatever the header, which it evaluates as a literal, runs into.
+        told = " ".join(str(error).split())[:120] or type(error).__name__
+        if "pickle" in told or "Python objects" in told:
+            told = "it holds Python objects, which are never loaded"
+        raise InputError(f"{shown(path)}: no NPY file, or a damaged one ({told})") from None
+    if values.dtype.kind not in "iuf":
+        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be numbers")
+    check_limit("picture_pixels", values.size, path, "values")
     return np.array(values)
 
 
@@ -99,8 +117,7 @@ def _read_exr(path: Path) -> npt.NDArray[np.generic]:
     # Imported here: the renderer's library reads EXR, and is slow to load.
     from simtest.rendering.bitmap import read_bitmap
 
-    if not path.is_file():
-        raise InputError(f"{shown(path)}: no such file")
+    check_file(path, "picture_bytes", "a depth map")
     return read_bitmap(path)
 
 
@@ -207,12 +224,14 @@ def depths_at(
     try:
         depth = float(option)
     except ValueError:
+        if not Path(option).suffix:
+            raise InputError(f"--depth {shown(option)}: must be a number of mm, or a depth map") from None
         values = read_depth(Path(option), scale_mm)
         if values.shape != (size[1], size[0]):
             raise InputError(
                 f"--depth {shown(option)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
             ) from None
         return [float(interpolate(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
-    if not (math.isfinite(depth) and depth > 0):
-        raise InputError(f"--depth {option}: must be a positive number of mm, or a depth map")
+    if not NEAREST_MM <= depth <= FARTHEST_MM:
+        raise InputError(f"--depth {shown(option)}: must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm, or a depth map")
     return [depth] * len(points_px)

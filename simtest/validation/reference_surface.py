@@ -25,6 +25,7 @@ from simtest.runtime.resources import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
+    FARTHEST_MM,
     depth_normals,
     depth_points,
     depth_problems,
@@ -169,6 +170,8 @@ def read_pose(path: Path) -> Array:
     else:
         pose[:3, :3] = _numbers(data, "rotation", ((3, 3),), where)
         pose[:3, 3] = _numbers(data, "translation_mm", ((3,),), where)
+    if (far := float(np.abs(pose[:3, 3]).max())) > FARTHEST_MM:
+        raise InputError(f"{where}: the pose moves the mesh by {far:.3g} mm; at most {FARTHEST_MM:g} mm are allowed")
     R = pose[:3, :3]
     # A pose must be rigid: no scale, no shear, no mirror image.
     off = float(np.abs(R.T @ R - np.eye(3)).max())
@@ -181,11 +184,17 @@ def read_pose(path: Path) -> Array:
     return pose
 
 
+def _holds_bool(value: Any) -> bool:
+    return any(map(_holds_bool, value)) if isinstance(value, list) else isinstance(value, bool)
+
+
 def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]], where: str) -> Array:
     if key not in data:
         raise InputError(f"{where}: {key}: missing; a pose has matrix, or rotation and translation_mm")
     try:
-        values = np.array(data[key], dtype=float)
+        raw = np.array(data[key])
+        # Truth values and text are no numbers, though NumPy takes them for such.
+        values = raw.astype(float) if raw.dtype.kind in "iuf" and not _holds_bool(data[key]) else np.empty(0)
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape not in shapes or not np.isfinite(values).all():

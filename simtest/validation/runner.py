@@ -21,7 +21,8 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
-from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.runtime.files import Json, require_plain, write_atomically, write_json
+from simtest.runtime.locks import LOCK
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 GALLERY_ITEMS = 18
 RESULTS = "results.parquet"
+MOST_DIGEST_BYTES = 1000
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
 
@@ -370,9 +372,9 @@ def _record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["run"]
+        record = json.loads(require_plain(folder / "summary.json", "record_bytes").read_text(encoding="utf-8"))["run"]
         return dict(record) if "fingerprint" in record else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
@@ -381,7 +383,7 @@ def _prepare(folder: Path, digest: str) -> None:
     parts = folder / PARTS
     record = parts / "fingerprint.json"
     try:
-        if not (record.is_file() and record.read_text(encoding="utf-8", errors="replace").strip() == f'"{digest}"'):
+        if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
             # Results of an earlier run stay until the new ones replace them.
             _remove(parts)
             _remove(folder / "gallery")
@@ -390,6 +392,10 @@ def _prepare(folder: Path, digest: str) -> None:
         write_json(record, digest)
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
+
+
+def _told_digest(record: Path) -> str:
+    return record.read_text(encoding="utf-8", errors="replace").strip().strip('"')
 
 
 def _check_folder(folder: Path) -> None:
@@ -406,6 +412,7 @@ def _check_folder(folder: Path) -> None:
     except OSError as error:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     # What is no part of a run.
+    held.pop(LOCK, None)
     strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:

@@ -402,7 +402,7 @@ def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
         write_sample(file, key, members)
 
     monkeypatch.setattr("simtest.dataset.shard_writer.write_sample", full)
-    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); what is written stays valid"):
+    with pytest.raises(InputError, match=r"\(No space left on device; .* are free .*\); what is written stays valid"):
         write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
     monkeypatch.undo()
     write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
@@ -648,7 +648,7 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
     assert dict(make_engine(workers=2).run(dies_once, arguments, lambda: None)) == {i: i for i in range(3)}
     with pytest.raises(SimtestError, match=r"no such number: [12]"):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
-    with pytest.raises(SimtestError, match=r"a worker failed \(OSError: .*No space left on device"):
+    with pytest.raises(OSError, match="No space left on device"):
         list(make_engine(workers=2).run(meets_a_full_disk, [1, 2], lambda: None))
 
 

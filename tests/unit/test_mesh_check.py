@@ -136,7 +136,7 @@ def test_another_unit_than_mm_is_guessed(tmp_path, scale, unit):
 
 def test_huge_meshes_are_refused_by_their_size_alone(tmp_path, monkeypatch):
     path = save(tmp_path / "ball.obj", *ball())
-    monkeypatch.setitem(__import__("simtest.surfaces.mesh_file", fromlist=["x"]).MAX_BYTES, ".obj", 1000)
+    monkeypatch.setenv("SIMTEST_LIMITS", "mesh_bytes=1000")
     with pytest.raises(InputError, match="bytes; at most 1000 are allowed: decimate"):
         read_mesh(path)
 

@@ -78,10 +78,15 @@ def check_whole(reports):
     }
 
 
-def test_two_nights_at_once_do_each_other_no_harm(tmp_path, profile):
+def test_of_two_nights_at_once_the_second_is_refused(tmp_path, profile):
     reports = Reports(tmp_path / "reports")
-    for process in [night(profile, reports) for _ in range(2)]:
-        finish(process)
+    first = night(profile, reports)
+    while not list(reports.root.glob("work/2*")) and first.poll() is None:
+        time.sleep(0.01)
+    errors = finish(night(profile, reports), 2)
+    assert errors.startswith(f"simtest: --reports {reports.root / 'tiny'}: is in use by process {first.pid} (")
+    finish(first)
+    finish(night(profile, reports))
     assert len(kept(reports)) == 2
     check_whole(reports)
     assert not [path for path in reports.work.iterdir() if path.is_dir()]

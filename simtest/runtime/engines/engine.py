@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from simtest.errors import InputError
+from simtest.runtime.limits import limit
 
 OnStep = Callable[[], None]
 """Called by a task after each step; an exception from it stops the task."""
@@ -12,8 +13,6 @@ Task = Callable[[Any, OnStep], Any]
 """A function at the top level of a module, of its argument and the callback for each step."""
 
 ENGINES = ("local", "ray")
-
-MAX_WORKERS = 256
 
 MAX_DEATHS = 8
 """After this many processes died during the same task the run fails: the fault is the task's."""
@@ -48,8 +47,8 @@ class Engine(Protocol):
 
 def check_workers(workers: int) -> None:
     """Raise `InputError` if a number of workers is out of range."""
-    if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
-        raise InputError(f"workers = {workers!r}: must be 1 to {MAX_WORKERS}")
+    if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= limit("workers"):
+        raise InputError(f"workers = {workers!r}: must be 1 to {limit('workers')}")
 
 
 def make_engine(

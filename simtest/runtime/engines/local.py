@@ -12,6 +12,7 @@ from typing import Any
 
 from simtest.errors import SimtestError
 from simtest.runtime.engines.engine import MAX_DEATHS, OnStep, Task
+from simtest.runtime.machine_errors import disk_problem, machine_problem
 
 
 @dataclass
@@ -144,8 +145,9 @@ class _Pool:
 
 def _work(pipe: Connection, task: Task, threads: int) -> None:
     """Run tasks until the pipe closes."""
-    # Ctrl-C reaches all processes of a terminal; the parent answers it.
+    # Ctrl-C reaches all processes of a terminal, SIGTERM those of a job; the parent answers them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     # Read by NumPy and the renderer when they load.
     os.environ["OPENBLAS_NUM_THREADS"] = str(threads)
@@ -167,7 +169,11 @@ def _answer(pipe: Connection, task: Task, argument: Any) -> tuple[str, Any]:
     except SimtestError as error:
         return "error", error
     except Exception as error:
-        return "error", SimtestError(f"a worker failed ({type(error).__name__}: {error})")
+        # Whoever knows the folder says which one it is.
+        if isinstance(error, OSError) and disk_problem(error):
+            return "error", error
+        told = machine_problem(error) or f"a worker failed ({type(error).__name__}: {error})"
+        return "error", SimtestError(told)
 
 
 def _die_with_parent() -> None:

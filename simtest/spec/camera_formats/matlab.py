@@ -12,9 +12,9 @@ import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
+from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
 
-MAX_BYTES = 50_000_000
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 
 
@@ -32,10 +32,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
     where, fields = shown(path), _struct(path)
     if "MappingCoefficients" in fields:
         raise InputError(f"{where}: MappingCoefficients: MATLAB's fisheye model is not known; must be cameraParameters")
-    if "K" in fields:
-        matrix = _array(fields, "K", 9, where).reshape(3, 3)
-    else:
-        matrix = _array(fields, "IntrinsicMatrix", 9, where).reshape(3, 3).T
+    matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
     # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
@@ -60,10 +57,7 @@ def _struct(path: Path) -> Mapping[str, Any]:
 
     where = shown(path)
     try:
-        if not path.is_file():
-            raise InputError(f"{where}: no such file; a .mat file is needed")
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{where}: {path.stat().st_size} bytes; at most {MAX_BYTES} are allowed")
+        check_file(path, "matlab_bytes", "a .mat file")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about variables that are no calibration
             data = loadmat(str(path), simplify_cells=True)
@@ -75,7 +69,12 @@ def _struct(path: Path) -> Mapping[str, Any]:
         raise InputError(f"{where}: cannot be read ({error.strerror or error})") from error
     except Exception as error:
         # SciPy raises whatever its parser runs into.
-        raise InputError(f"{where}: no MATLAB file, or a damaged one ({type(error).__name__})") from error
+        told = shown(error, 80) if str(error).strip() else type(error).__name__
+        head = _head(path)
+        kind = (
+            "a damaged MATLAB file" if head.startswith(b"MATLAB") else f"no MATLAB file (it begins with {head[:8]!r})"
+        )
+        raise InputError(f"{where}: {kind}: {told}; {HOW}") from error
     # The variables themselves may be the fields of the struct.
     found = {name: value for name, value in {"": data, **data}.items() if _is_calibration(value)}
     if len(found) == 1:
@@ -88,8 +87,21 @@ def _struct(path: Path) -> Mapping[str, Any]:
     raise InputError(f"{where}: holds no struct with IntrinsicMatrix or K (but {shown(names, 80)}); {HOW}")
 
 
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(16)
+
+
 def _is_calibration(value: Any) -> bool:
     return isinstance(value, Mapping) and bool({"IntrinsicMatrix", "K", "MappingCoefficients"} & set(value))
+
+
+def _matrix(fields: Mapping[str, Any], name: str, where: str) -> Any:
+    """Return a field of 3 x 3 numbers."""
+    values = _array(fields, name, 9, where)
+    if np.shape(fields[name]) != (3, 3):
+        raise InputError(f"{where}: {name}: has shape {np.shape(fields[name])}; must be (3, 3)")
+    return values.reshape(3, 3)
 
 
 def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], where: str) -> Any:

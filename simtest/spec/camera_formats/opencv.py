@@ -34,6 +34,9 @@ MODELS = {
 }  # fmt: skip
 """Names of lens models, and whether each is a fisheye."""
 
+NUMBER_TYPES = ("d", "f", "i")
+"""Of a FileStorage matrix: double, float, integers of 32 bits."""
+
 BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 """Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor, which simtest lacks."""
@@ -53,7 +56,7 @@ def read_opencv(path: Path) -> dict[str, Any]:
     name, given = _one_of(data, MATRIX_NAMES, where)
     if name is None:
         raise InputError(f"{where}: camera_matrix: missing; allowed names: {', '.join(MATRIX_NAMES)}")
-    matrix = np.array(_numbers(given, where, name, (9,))).reshape(3, 3)
+    matrix = np.array(_numbers(given, where, name, (9,), (3, 3))).reshape(3, 3)
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: {name} = {matrix.tolist()}: must be upper triangular with 1 in its last corner")
     _check_whole(data, where)
@@ -91,7 +94,10 @@ def _parse_json(text: str) -> Any:
 
 def _parse_xml(text: str) -> Any:
     """Read OpenCV's XML; its own parser never returns from some malformed files."""
-    return _plain_xml(ElementTree.fromstring(text))
+    # Entities, which a document type declares, can grow without end; no calibration has any.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("document types and entities are not allowed")
+    return _plain_xml(ElementTree.fromstring(text))  # nosec B314: without entities nothing grows or is fetched
 
 
 def _plain_xml(element: ElementTree.Element) -> Any:
@@ -115,10 +121,20 @@ def _one_of(data: Mapping[str, Any], names: Sequence[str], where: str) -> tuple[
     return (found[0], data[found[0]]) if found else (None, None)
 
 
-def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[float]:
-    """Return a matrix or list as numbers in row order; `counts` are the allowed numbers of values."""
+def _numbers(
+    value: Any, where: str, name: str, counts: Sequence[int], shape: tuple[int, int] | None = None
+) -> list[float]:
+    """Return a matrix or list as numbers in row order.
+
+    `counts` are the allowed numbers of values; `shape` is that of a matrix, by default one row or one column.
+    """
     if isinstance(value, Mapping):
+        _check_matrix(value, where, name, shape)
         value = value.get("data")
+    elif isinstance(value, list) and shape is not None and any(isinstance(row, list) for row in value):
+        lengths = [len(row) if isinstance(row, list) else 1 for row in value]
+        if lengths != [shape[1]] * shape[0]:
+            raise InputError(f"{where}: {name}: rows of {lengths} values; must be {shape[0]} rows of {shape[1]}")
     # A FileStorage matrix holds its numbers flat, plain JSON and YAML row by row.
     flat: list[Any] = []
     for item in value if isinstance(value, list) else [value]:
@@ -130,6 +146,22 @@ def _numbers(value: Any, where: str, name: str, counts: Sequence[int]) -> list[f
         allowed = " or ".join(str(count) for count in counts)
         raise InputError(f"{where}: {name}: {len(flat)} values; must be {allowed}")
     return [float(item) for item in flat]
+
+
+def _check_matrix(matrix: Mapping[str, Any], where: str, name: str, shape: tuple[int, int] | None) -> None:
+    """Check what a matrix says of itself: its rows and columns, and the type of its numbers."""
+    said = [matrix.get(key) for key in ("rows", "cols")]
+    if said != [None, None]:
+        sizes = [int(n) for n in said if isinstance(n, int | float) and not isinstance(n, bool) and n == n // 1]
+        if len(sizes) < 2 or not (sizes == list(shape) if shape is not None else min(sizes) in (0, 1)):
+            wanted = "one row or one column" if shape is None else f"{shape[0]} x {shape[1]}"
+            raise InputError(f"{where}: {name}: {said[0]!r} rows and {said[1]!r} cols; must be {wanted}")
+        held = matrix.get("data")
+        if isinstance(held, list) and len(held) != sizes[0] * sizes[1]:
+            raise InputError(f"{where}: {name}: {len(held)} values; must be {sizes[0]} x {sizes[1]}")
+    # Integers of 8 bits hold no focal length, and several channels no matrix.
+    if (kind := matrix.get("dt")) not in (None, *NUMBER_TYPES):
+        raise InputError(f"{where}: {name}: dt = {shown(kind, 40)}: must be one of {', '.join(NUMBER_TYPES)}")
 
 
 def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:

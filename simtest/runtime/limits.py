@@ -1,0 +1,126 @@
+"""Limits of inputs, in one place: beyond them an input is refused before time or memory is spent on it.
+
+The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,settings=50000"``.
+The ranges of single values (a width, an exponent) stand in the schemas and are fixed.
+"""
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from simtest.errors import InputError
+from simtest.runtime.resources import shown
+
+VARIABLE = "SIMTEST_LIMITS"
+
+DEFAULTS = {
+    # files, bytes
+    "text_bytes": 1_000_000,  # TOML, YAML, XML, JSON
+    "matlab_bytes": 50_000_000,
+    "picture_bytes": 250_000_000,
+    "film_bytes": 5_000_000_000,
+    "mesh_bytes": 400_000_000,  # five million faces, binary or as text
+    "manifest_bytes": 100_000_000,
+    "record_bytes": 20_000_000,  # JSON that a run has written
+    # pictures and frames, px
+    "picture_pixels": 40_000_000,  # 8K has 33 million; every map of a picture takes 8 bytes a pixel
+    "picture_side": 16_384,
+    "frame_pixels": 20_000_000,
+    "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples
+    # meshes
+    "mesh_faces": 5_000_000,
+    # experiments
+    "sweep_values": 20_000,  # of one list of a sweep or pool
+    "settings": 10_000,  # of one experiment, pooled ones counted singly
+    "realisations": 10_000_000,  # of one experiment, over all settings
+    # work
+    "workers": 256,
+    "views": 1000,
+    "generated_frames": 10_000,  # that realism takes or fit renders
+}
+
+
+def limit(name: str) -> int:
+    """Return a limit by name, as SIMTEST_LIMITS replaces it or the default; raise `InputError` if that is malformed."""
+    return _limits(os.environ.get(VARIABLE, ""))[name]
+
+
+def check_limit(name: str, value: float, where: object, unit: str, hint: str = "") -> None:
+    """Raise `InputError` where a value exceeds a limit.
+
+    Parameters
+    ----------
+    name : str
+        Of the limit.
+    value : float
+        To be compared.
+    where : object
+        File, key or option, for the message.
+    unit : str
+        What is counted.
+    hint : str
+        What can be done instead.
+    """
+    most = limit(name)
+    if value > most:
+        raise InputError(
+            f"{shown(where)}: {_number(value)} {unit}; at most {_number(most)} are allowed"
+            f"{hint and f': {hint}'} ({VARIABLE}={name}=N sets another limit)"
+        )
+
+
+def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
+    """Check that a path is a plain file within a limit, without opening it, and return its size in bytes.
+
+    Parameters
+    ----------
+    path : Path
+        To be read next. A pipe or a device has no size and might never end.
+    name : str
+        Of the limit, bytes.
+    wanted : str
+        What the file should be, for messages, such as "a picture".
+    hint : str
+        What can be done with a file that is too large.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is a folder, a pipe or a device, or it is larger.
+    """
+    where = shown(path)
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            kind = "a folder" if path.is_dir() else "no plain file"
+            raise InputError(f"{where}: is {kind}; must be {wanted}")
+    except FileNotFoundError:
+        raise InputError(f"{where}: no such file; must be {wanted}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{where}: cannot be read ({reason})") from error
+    check_limit(name, size, path, "bytes", hint)
+    return size
+
+
+@lru_cache(maxsize=4)
+def _limits(text: str) -> dict[str, int]:
+    """Return all limits, those that a text replaces among them."""
+    found = dict(DEFAULTS)
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        if name not in DEFAULTS:
+            raise InputError(f"{VARIABLE}: {shown(name)}: unknown limit; allowed: {', '.join(DEFAULTS)}")
+        try:
+            number = float(value)
+        except ValueError:
+            number = 0.0
+        if not 1 <= number < 2**63:
+            raise InputError(f"{VARIABLE}: {name} = {shown(value)}: must be a number from 1 on")
+        found[name] = int(number)
+    return found
+
+
+def _number(value: float) -> str:
+    """Return a number in digits, or with an exponent where it is beyond counting."""
+    return f"{value:.0f}" if value < 1e15 else f"{value:.3g}"

@@ -1,0 +1,176 @@
+"""Locks between processes: one run writes to a folder, and whoever comes second is told who is there.
+
+A lock is held by the operating system for an open file (flock), so it ends with the process that holds it, however that
+ends. What the file holds is for messages alone: a file that a killed process has left behind locks nothing.
+"""
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shlex
+import socket
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from simtest.errors import InputError
+from simtest.runtime.files import make_folder, refuse_file
+from simtest.runtime.resources import shown
+
+LOCK = ".lock"
+"""Name of the lock file in a folder, and end of the name of one beside a file."""
+
+_MOST_BYTES = 4096
+_WITHOUT_LOCKS = {errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS}
+
+
+@contextlib.contextmanager
+def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
+    """Keep a folder for results to this run; it is made if need be, and removed again if it stays empty.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    option : str
+        How the user names it, for messages.
+
+    Raises
+    ------
+    InputError
+        If another run is at work in the folder: the message names its process. If the folder cannot be made.
+    """
+    made = _missing(folder)
+    make_folder(folder, option)
+    try:
+        with _exclusive(folder / LOCK, f"{option} {shown(folder)}"):
+            yield
+    finally:
+        # What was refused leaves nothing behind.
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+
+@contextlib.contextmanager
+def exclusive_file(path: Path, option: str = "--out") -> Iterator[None]:
+    """Keep a file for results to this run, by a lock beside it; raise `InputError` as `exclusive_folder` does."""
+    if path.parent.is_dir():
+        with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), f"{option} {shown(path)}"):
+            yield
+    else:
+        # Nobody can write there; whoever writes says so.
+        yield
+
+
+@contextlib.contextmanager
+def _exclusive(lock: Path, what: str) -> Iterator[None]:
+    try:
+        file = _open(lock)
+    except OSError as error:
+        # Where nothing can be written nobody writes; a finished run can still be looked at.
+        if error.errno not in _WITHOUT_LOCKS:
+            raise InputError(f"{what}: cannot be written ({error.strerror})") from error
+        yield
+        return
+    with file:
+        if not _taken(lock, file):
+            raise InputError(f"{what}: is in use by {_holder(lock)}; wait until it ends, or name another")
+        try:
+            with contextlib.suppress(OSError):
+                file.truncate(0)
+                file.write(json.dumps(_own()).encode())
+                file.flush()
+            yield
+        finally:
+            # While it is held: whoever waits for the file finds that it is no longer the one of this name.
+            lock.unlink(missing_ok=True)
+
+
+def _open(lock: Path) -> IO[bytes]:
+    # Not followed where it is a link, and never waited for where it is a pipe.
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    return os.fdopen(os.open(lock, flags, 0o644), "r+b")
+
+
+def _taken(lock: Path, file: IO[bytes]) -> bool:
+    """Lock an open file without waiting; return whether that worked and it still is the file of its name."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return is_same(lock, file)
+
+
+def is_same(path: Path, file: IO[bytes]) -> bool:
+    """Return whether an open file is the one that a path names now."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
+
+
+def is_held(lock: Path) -> bool:
+    """Return whether a living process holds a lock."""
+    try:
+        with lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+@contextlib.contextmanager
+def waiting_for(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file to append to, made if need be, once no other process holds it.
+
+    The holder may meanwhile have renamed or removed the file: then the one that has its name now is taken.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        path.touch()
+        with path.open("r+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if is_same(path, file):
+                yield file
+                return
+
+
+def _own() -> dict[str, str | int]:
+    command = shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]])[:500]
+    started = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"process": os.getpid(), "machine": socket.gethostname(), "command": command, "started": started}
+
+
+def _holder(lock: Path) -> str:
+    """Return who holds a lock, as far as its file tells."""
+    try:
+        with lock.open("rb") as file:
+            told = json.loads(file.read(_MOST_BYTES))
+        own = "" if told["machine"] == socket.gethostname() else f" on {shown(told['machine'], 60)}"
+        return (
+            f"process {int(told['process'])}{own} ({shown(told['command'], 120)}, since {shown(told['started'], 40)})"
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        # Just taken, or just given back.
+        return "another process"
+
+
+def _missing(folder: Path) -> list[Path]:
+    """Return the folders that must be made for a folder to be there, the innermost first."""
+    refuse_file(folder)
+    missing = []
+    for path in (folder, *folder.parents):
+        try:
+            if path.exists():
+                break
+        except OSError:
+            break
+        missing.append(path)
+    return missing

@@ -1,0 +1,62 @@
+"""Errors of the machine, of disk and memory, as one line that names what ran out and what can be done."""
+
+import errno
+import re
+import shutil
+from pathlib import Path
+
+from simtest.runtime.resources import shown
+
+_OF_THE_DISK = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
+    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ENOENT, errno.ELOOP, errno.ENOTEMPTY, errno.EMFILE,
+    errno.ENFILE, errno.EBUSY, errno.ESTALE, errno.EINVAL, errno.ENXIO,
+}  # fmt: skip
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+"""How libraries written in Rust (polars) hand an error of the system on."""
+
+
+def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
+    """Return an error of the disk as text: the file, what is wrong, what is free; None for any other error.
+
+    `near` is a path on the same disk, for errors that name no file.
+    """
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None and (found := _OS_ERROR.search(str(error))):
+        number = int(found[1])
+    if number not in _OF_THE_DISK:
+        return None
+    name = getattr(error, "filename", None)
+    what = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
+    file = f"{shown(name, 200)}: " if name else ""
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return f"{file}{what}" + (f"; {_free(path)}" if (path := name or near) is not None else "")
+    if number == errno.EFBIG:
+        return f"{file}{what}; the system limits the size of a file (ulimit -f)"
+    return f"{file}{what}"
+
+
+def machine_problem(error: BaseException) -> str | None:
+    """Return an error of disk, memory or the depth of nesting as text; None for any other, which is a fault of ours."""
+    if isinstance(error, MemoryError):
+        told = " ".join(str(error).split())
+        return f"not enough memory{f' ({shown(told, 150)})' if told else ''}; smaller frames or fewer workers need less"
+    if isinstance(error, RecursionError):
+        return "a value is nested too deeply"
+    return disk_problem(error)
+
+
+def _free(name: str | Path) -> str:
+    """Return how much of a file's disk is free."""
+    path = Path(name).absolute()
+    for folder in (path, *path.parents):
+        try:
+            usage = shutil.disk_usage(folder)
+        except OSError:
+            continue
+        return f"{_mb(usage.free)} of {_mb(usage.total)} MB are free on the disk of {shown(folder, 120)}"
+    return "the disk is full"
+
+
+def _mb(size: float) -> str:
+    return f"{size / 1e6:.0f}" if size >= 1e7 else f"{size / 1e6:.2g}"

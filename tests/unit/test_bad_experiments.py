@@ -1,0 +1,206 @@
+"""Malformed experiments, run folders, recipes and meshes: refused in one line, before anything is rendered."""
+
+from pathlib import Path
+
+import pytest
+
+from simtest.estimators import load_estimators
+from simtest.spec import load_experiment, load_scene
+from simtest.spec.surface import AnatomySurface
+from simtest.surfaces import make_surface
+from simtest.validation import realisation, runner
+from simtest.validation.cases import expand
+from tests.refusals import refused
+
+# Experiments -----------------------------------------------------------------------------------------------------
+
+PLANE = '[surface]\ntype = "plane"\n'
+GROUP = '[[groups]]\nscene = "plane"\n'
+EXPERIMENTS = {
+    "no groups": ("realisations = 3", "groups: missing"),
+    "empty groups": ("groups = []", "groups = []: must have at least 1 item"),
+    "group without scene": ("[[groups]]", "groups.0.scene: missing"),
+    "unknown key": ("repeats = 3\n" + GROUP, "repeats = 3: unknown key; allowed: realisations, name"),
+    "unknown key of a group": (GROUP + "swep = []", "groups.0.swep = []: unknown key; allowed: sweep, scene"),
+    "unequal lengths": (
+        GROUP + 'sweep = [{ "surface.tilt_deg" = [1, 2], "surface.azimuth_deg" = [1] }]',
+        "lists of one sweep must be equally long and not empty, got lengths {'surface.tilt_deg': 2, 'surface.azimu",
+    ),
+    "empty sweep": (GROUP + 'sweep = [{ "surface.tilt_deg" = [] }]', "not empty, got lengths {'surface.tilt_deg': 0}"),
+    "sweep of nothing": (GROUP + "sweep = [{}]", "not empty, got lengths {}"),
+    "sweep of a plain value": (GROUP + 'sweep = [{ "surface.tilt_deg" = 3 }]', "tilt_deg = 3: must be a list"),
+    "empty pool": (GROUP + 'pool = [{ "surface.tilt_deg" = [] }]', "not empty"),
+    "unknown estimator": ('estimators = ["magic"]\n' + GROUP, "estimator 'magic': not installed; allowed: "),
+    "estimator twice": ('estimators = ["cone_axis", "cone_axis"]\n' + GROUP, "estimator 'cone_axis': given twice"),
+    "no estimators": ("estimators = []\n" + GROUP, "estimators = []: must have at least 1 item"),
+    "unknown scene": (GROUP.replace("plane", "plain"), "plain: no such file; shipped by name: anatomy, cylinder"),
+    "no realisations": ("realisations = 0\n" + GROUP, "realisations = 0: must be greater than or equal to 1"),
+    "realisations in quotes": ('realisations = "3"\n' + GROUP, "realisations = '3': must be a number"),
+    "seed negative": ("seed = -1\n" + GROUP, "seed = -1: must be greater than or equal to 0"),
+    "seed huge": ("seed = 9223372036854775808\n" + GROUP, "seed = 9223372036854775808: must be less than"),
+    "bad name": ('name = "../up"\n' + GROUP, "name = '../up': must match the pattern"),
+    "set out of range": (GROUP + 'set = { "surface.tilt_deg" = 95 }', "surface.tilt_deg = 95: must be less than 90"),
+    "swept out of range": (
+        GROUP + 'sweep = [{ "surface.tilt_deg" = [0, 45, 95] }]',
+        "plane.toml: surface.tilt_deg = 95: must be less than 90",
+    ),
+    "swept text": (GROUP + 'sweep = [{ "camera.fx" = [90, "x"] }]', "camera.fx = 'x': must be a number"),
+    "unknown swept key": (GROUP + 'sweep = [{ "surface.tilt" = [0] }]', "surface.tilt = 0: unknown key; allowed: "),
+    "swept index": (GROUP + 'sweep = [{ "rig.lights.2.power" = [1] }]', "index 2 is not allowed; the first item is 0"),
+    "swept type": (GROUP + 'sweep = [{ "surface.type" = ["plane", "cone"] }]', "surface.type = 'cone': unknown"),
+    "swept recipe": (
+        '[[groups]]\nscene = "anatomy"\nsweep = [{ "surface.path" = ["colon", "kidney"] }]',
+        "kidney: no such file; shipped by name: colon, liver",
+    ),
+    "swept twice": (
+        GROUP + 'sweep = [{ "surface.tilt_deg" = [0] }, { "surface.tilt_deg" = [1] }]',
+        "surface.tilt_deg: varied twice; a key may be in one table of sweep, pool and random",
+    ),
+    "swept and drawn": (
+        GROUP + 'sweep = [{ "surface.tilt_deg" = [0] }]\nrandom = { "surface.tilt_deg" = { low = 0, high = 1 } }',
+        "surface.tilt_deg: varied twice",
+    ),
+    "value twice": (GROUP + 'sweep = [{ "surface.tilt_deg" = [1, 1] }]', "two settings are called 'plane, tilt_deg=1'"),
+    "group twice": (GROUP * 2, "two settings are called 'plane'; give the groups different labels"),
+    "range turned round": (GROUP + 'random = { "surface.tilt_deg" = { low = 2, high = 1 } }', "low = 2 must not"),
+    "range without an end": (GROUP + 'random = { "surface.tilt_deg" = { low = 2 } }', "high: missing"),
+    "range of NaN": (GROUP + 'random = { "surface.tilt_deg" = { low = nan, high = 1 } }', "low = nan: must be"),
+    "drawn out of range": (
+        GROUP + 'random = { "surface.tilt_deg" = { low = 0, high = 91 } }',
+        "surface.tilt_deg = 90.9",
+        "must be less than 90",
+    ),
+    "drawn too low": (
+        GROUP + 'random = { "surface.distance_mm" = { low = -1e-9, high = 1e6 } }',
+        "surface.distance_mm = -1e-09: must be greater than",
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture
+def no_rendering(monkeypatch):
+    def touched(*_):
+        pytest.fail("the renderer was used")
+
+    monkeypatch.setattr(realisation, "Session", touched)
+    monkeypatch.setattr(runner.backend, "load", touched)
+
+
+@pytest.mark.usefixtures("no_rendering")
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiments_are_refused_before_anything_is_rendered(tmp_path, name):
+    text, *fragments = EXPERIMENTS[name]
+    path, out = tmp_path / "my.toml", tmp_path / "out"
+    path.write_text(text)
+    refused(lambda: runner.run_experiment(load_experiment(path), out), *fragments)
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_a_swept_recipe_is_read_before_anything_is_rendered(tmp_path):
+    recipe = tmp_path / "bad.toml"
+    recipe.write_text('type = "colon"\nradius_mm = 1\n')
+    described = load_experiment("anatomy", {"surface.path": str(recipe)})
+    refused(
+        lambda: runner.run_experiment(described, tmp_path / "out"), f"{recipe}: radius_mm = 1: must be greater than"
+    )
+
+
+def test_a_range_may_end_at_an_excluded_bound(tmp_path):
+    path = tmp_path / "my experiment (new).toml"
+    path.write_text(GROUP + 'random = { "surface.tilt_deg" = { low = 0, high = 90 } }')
+    described = load_experiment(path)
+    assert len(expand(described)) == 1
+    # A file's name may hold what an experiment's may not.
+    assert described.name == "my-experiment-new-"
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_settings_of_an_experiment():
+    refused(lambda: load_experiment("overview", {"realisations": 0}), "realisations = 0: must be greater than")
+    refused(lambda: load_experiment("overview", {"seed": "x"}), "seed = 'x': must be a number")
+    refused(
+        lambda: load_experiment("overview", {"estimators": "cone_axis"}), "estimators = 'cone_axis': must be a list"
+    )
+    refused(lambda: expand(load_experiment("overview", {"surface.foo": 1})), "surface.foo = 1: unknown key")
+    refused(lambda: load_estimators(["cone_axis", "magic"]), "estimator 'magic'")
+
+
+# Folders of a run ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_rendering")
+@pytest.mark.parametrize("held", ["notes.txt", "figures/mine.png", "gallery/mine.png", "index.html", ".hidden"])
+def test_a_folder_of_something_else_is_left_alone(tmp_path, held):
+    file = tmp_path / "out" / held
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    described = load_experiment("overview")
+    name = Path(held).parts[0]
+    refused(lambda: runner.run_experiment(described, tmp_path / "out"), f"holds {name}, which is no part of a run")
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [file]
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_folders_that_cannot_be_written(tmp_path):
+    described = load_experiment("overview")
+    plain = tmp_path / "plain"
+    plain.write_text("mine")
+    refused(lambda: runner.run_experiment(described, plain), f"--out {plain}: is a file; must be a folder")
+    refused(
+        lambda: runner.run_experiment(described, plain / "x"), f"--out {plain / 'x'}: cannot be", "(Not a directory)"
+    )
+    refused(lambda: runner.run_experiment(described, tmp_path / ("n" * 300)), "(File name too long)")
+    refused(lambda: runner.run_experiment(described, plain / "a\nb"), r"/a\nb")
+
+
+# Recipes and meshes through a scene ------------------------------------------------------------------------------
+
+RECIPES = {
+    "unknown type": ('type = "kidney"', "type = 'kidney'; allowed: colon, liver"),
+    "no type": ("length_mm = 100", "type: missing; allowed: colon, liver"),
+    "unknown key": ('type = "colon"\nlength = 100', "length = 100: unknown key; allowed: length_mm"),
+    "NaN": ('type = "colon"\nradius_mm = nan', "radius_mm = nan: must be a finite number"),
+    "text": ('type = "colon"\nradius_mm = "22"', "radius_mm = '22': must be a number"),
+    "radius 0": ('type = "colon"\nradius_mm = 0', "radius_mm = 0: must be greater than or equal to 5"),
+    "folds close the lumen": ('type = "colon"\nfold_depth_mm = 30', "at most 0.8 radius_mm = 17.6 mm is allowed"),
+    "no lobes": ('type = "liver"\nlobes = []', "lobes = []: must have at least 1 item"),
+    "lobe of two axes": (
+        'type = "liver"\nlobes = [{ centre_mm = [0, 0, 0], semi_axes_mm = [50, 50] }]',
+        "lobes.0.semi_axes_mm.2: missing",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipes(tmp_path, name):
+    text, fragment = RECIPES[name]
+    path = tmp_path / "my.toml"
+    path.write_text(text)
+    refused(lambda: make_surface(AnatomySurface(path=str(path))), f"{path}: ", fragment)
+
+
+MESHES = {
+    "none.toml": (None, "no such file; shipped by name: colon, liver"),
+    "none.ply": (None, "no such file"),
+    "mesh.xyz": ("0 0 0\n", "unknown suffix .xyz; allowed: .toml, .ply, .obj, .stl, .vtk"),
+    "empty.ply": ("", "0 bytes"),
+    "text.obj": ("this is no mesh\n", "no faces"),
+    "cloud.obj": ("v 0 0 0\nv 9 0 0\nv 0 9 0\n", "3 points and no faces"),
+    "scene.toml": (PLANE, "type: missing; allowed: colon, liver"),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_meshes_through_a_scene(tmp_path, name):
+    text, fragment = MESHES[name]
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    scene = load_scene("anatomy", {"surface.path": str(path)})
+    refused(lambda: make_surface(scene.surface), name, fragment)
+
+
+def test_a_folder_is_no_anatomy(tmp_path):
+    refused(lambda: make_surface(AnatomySurface(path=str(tmp_path))), "is a folder")
+    refused(lambda: make_surface(AnatomySurface(path="kidney")), "kidney: no such file; shipped by name: colon, liver")

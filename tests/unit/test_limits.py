@@ -1,0 +1,185 @@
+"""Limits of inputs: refused at once, with what is allowed and how to allow more."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from simtest.reconstruction.image_io import read_picture
+from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, limit
+from simtest.spec import load_experiment, load_scene
+from simtest.spec.toml_files import apply_settings, parse_settings
+from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.vtk_file import read_vtk
+from simtest.validation import runner
+from simtest.validation.cases import check_effort
+from simtest.validation.depth_maps import read_depth
+from studies.bad_inputs import files
+from tests.refusals import refused
+
+
+@pytest.fixture(autouse=True)
+def no_limits_of_ones_own(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+
+
+def test_the_variable_replaces_limits_by_name(monkeypatch):
+    assert limit("settings") == DEFAULTS["settings"]
+    monkeypatch.setenv(VARIABLE, " settings = 2e4, picture_pixels=1e9 ,")
+    assert (limit("settings"), limit("picture_pixels"), limit("views")) == (20_000, 10**9, DEFAULTS["views"])
+    check_limit("settings", 20_000, "x", "settings")
+    refused(lambda: check_limit("settings", 20_001, "x", "settings"), "x: 20001 settings; at most 20000 are allowed (")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("speed=3", "speed: unknown limit; allowed: text_bytes, "),
+        ("settings", "settings = '': must be a number from 1 on"),
+        ("settings=nan", "settings = nan: must be a number"),
+        ("settings=-1", "settings = -1: must be a number"),
+        ("settings=1e300", "settings = 1e300: must be a number"),
+        ("settings=many", "settings = many: must be a number"),
+    ],
+)
+def test_a_malformed_variable_is_refused(monkeypatch, text, said):
+    monkeypatch.setenv(VARIABLE, text)
+    refused(lambda: limit("views"), f"{VARIABLE}: {said}")
+
+
+def test_what_is_no_plain_file_is_refused_without_opening_it(tmp_path):
+    for name, make, said in (
+        ("pipe", files.fifo, "is no plain file"), ("device", files.endless, "is no plain file"),
+        ("folder", files.folder, "is a folder"), ("loop", files.loop, "symbolic links"),
+        ("nothing", files.dangling, "no such file"), ("sparse", files.sparse(), "bytes; at most 1000000 are allowed"),
+    ):  # fmt: skip
+        make(tmp_path / name)
+        refused(
+            lambda path=tmp_path / name: check_file(path, "text_bytes", "a TOML file"), f"{tmp_path / name}: ", said
+        )
+    refused(lambda: check_file(tmp_path / ("n" * 300), "text_bytes", "a TOML file"), "File name too long")
+
+
+@pytest.mark.parametrize(("width", "height"), [(10_000, 9_999), (65_500, 1), (1, 65_500)])
+def test_large_pictures_are_refused_by_their_header(tmp_path, width, height):
+    path = tmp_path / "x.png"
+    path.write_bytes(files.png(width, height, b""))
+    refused(lambda: read_picture(path), f"x.png: {width} x {height} px: ", " are allowed (SIMTEST_LIMITS=picture_")
+
+
+def test_tiff_of_pixels_that_pillow_does_not_know_is_refused_by_its_header(tmp_path, monkeypatch):
+    path = tmp_path / "x.tif"
+    # Three channels of floats: OpenCV reads them, Pillow does not.
+    path.write_bytes(files.encoded(".tif", np.zeros((48, 64, 3), np.float32)))
+    monkeypatch.setenv(VARIABLE, "picture_pixels=3000")
+    refused(lambda: read_picture(path), "x.tif: 64 x 48 px: 3072 px; at most 3000 are allowed")
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("PNG", "png"), ("WEBP", "webp"), ("TIFF", "tif"), ("GIF", "gif")])
+def test_of_several_pictures_the_first_is_used_and_it_is_said(tmp_path, kind, suffix):
+    path = tmp_path / f"x.{suffix}"
+    path.write_bytes(files.animated(kind))
+    with pytest.warns(UserWarning, match=rf"x\.{suffix}: holds several pictures; the first is used"):
+        read = read_picture(path)
+    # The second and third are shifted by 5 and 10 px; coding and a palette change values a little.
+    assert np.abs(read * 255 - files.picture()).mean() < 3
+    assert np.abs(read * 255 - np.roll(files.picture(), 5, axis=1)).mean() > 5
+
+
+def test_experiments_of_too_many_settings_are_refused_before_they_are_expanded(tmp_path):
+    numbers = ", ".join(map(str, range(1, 434)))
+    path = tmp_path / "x.toml"
+    keys = ("surface.tilt_deg", "surface.distance_mm", "reflectance.exponent")
+    tables = ", ".join(f'{{ "{key}" = [{numbers}] }}' for key in keys)
+    path.write_text(f'[[groups]]\nscene = "plane"\nsweep = [{tables}]\n')
+    begun = time.process_time()
+    refused(lambda: check_effort(load_experiment(path)), "groups.0: 81182737 settings", "at most 10000 are allowed")
+    assert time.process_time() - begun < 2
+    path.write_text(
+        f'[[groups]]\nscene = "plane"\nsweep = [{{ "surface.tilt_deg" = [{", ".join(["1"] * 90_000)}] }}]\n'
+    )
+    refused(lambda: check_effort(load_experiment(path)), "groups.0.sweep: surface.tilt_deg: 90000 values")
+    path.write_text("realisations = 1000000\n" + '[[groups]]\nscene = "plane"\n' * 11)
+    refused(lambda: check_effort(load_experiment(path)), "groups.10: 11000000 realisations, up to this group")
+
+
+def test_frames_of_too_many_pixels_or_rays_are_refused():
+    large = {"camera.width": 16_384, "camera.height": 16_384, "camera.fx": 9000.0, "camera.fy": 9000.0}
+    refused(lambda: load_scene("plane", large), "camera.height = 16384: 268435456 px; at most 20000000 are allowed")
+    long = {"camera.width": 4000, "camera.height": 4000, "camera.fx": 4000.0, "camera.fy": 4000.0,
+            "render.samples_per_pixel": 4096}  # fmt: skip
+    refused(lambda: load_scene("plane", long), "65536000000 rays a frame; at most 4000000000 are allowed")
+
+
+def test_what_is_nested_deeply_is_refused():
+    deep = ".".join("a" * 33)
+    refused(lambda: apply_settings({}, {deep: 1}, "x.toml"), "x.toml: a.a.a", "33 parts; a key path has 32 at most")
+    # As a value it is no TOML that is read, and stays text.
+    assert isinstance(parse_settings(["x=" + "{a=" * 40 + "1" + "}" * 40])["x"], str)
+
+
+PLY = files.ply()
+MESHES = {
+    "9e9 faces": (PLY.replace("face 4", "face 9000000000"), "9000000000 faces; at most 5000000 are allowed: decimate"),
+    "faces missing": (PLY[:-20], "holds 4 vertices and 1 faces, but its header announces 4 and 4: it is cut short"),
+    "cut short": (
+        PLY.replace("face 4", "face 400"),
+        "bytes follow the header; 4 vertex elements and 400 face elements",
+    ),
+    "no header's end": (PLY.replace("end_header", ""), "no PLY file; it must begin with ply"),
+    "no x": (PLY.replace("float x", "float q"), "its vertices have no property x"),
+    "no list": (PLY.replace("property list uchar int vertex_indices", "property int a"), "have no list of vertices"),
+    "unknown type": (PLY.replace("float x", "text x"), "header line 'property text x'"),
+    "no format": (PLY.replace("format ascii 1.0\n", ""), "format ''"),
+    "words": (PLY.replace("element vertex 4", "element vertex four"), "must be element NAME COUNT"),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_ply_files_are_checked_by_their_header(tmp_path, name):
+    text, said = MESHES[name]
+    path = tmp_path / "m.ply"
+    path.write_text(text)
+    refused(lambda: read_mesh(path), f"{path}: ", said)
+
+
+def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
+    path = tmp_path / "m.vtk"
+    path.write_text(files.vtk())
+    assert read_vtk(path)[1].shape == (4, 3)
+    path.write_text(files.vtk().replace("\n3 0 2 1", "\n999999999 0 2 1"))
+    refused(lambda: read_mesh(path), f"{path}: damaged: VTK breaks down")
+    path.write_text(files.vtk().replace("POINTS 4", "POINTS 9000000000"))
+    refused(lambda: read_mesh(path), "POINTS 9000000000: the file has", "too few for them")
+
+
+def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):
+    from simtest.reconstruction.image_io import open_source
+
+    path = tmp_path / "x.mp4"
+    # FFmpeg would read the list, and whatever it names.
+    path.write_text(f"ffconcat version 1.0\nfile {os.devnull}\n")
+    refused(lambda: open_source(path), "x.mp4: no video that can be read", "of no known container")
+
+
+def test_a_fingerprint_that_cannot_be_one_is_not_read(tmp_path):
+    record = tmp_path / "parts" / "fingerprint.json"
+    record.parent.mkdir()
+    files.sparse('"digest"')(record)
+    runner._prepare(tmp_path, "digest")
+    assert record.read_text().strip() == '"digest"'
+
+
+@pytest.mark.render
+def test_an_exr_image_whose_channel_is_called_depth_is_read(tmp_path):
+    path = tmp_path / "z.exr"
+    path.write_bytes(files.exr(files.depth()))
+    np.testing.assert_array_equal(read_depth(path), files.depth().astype(float))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"dataWindow") + 29
+    data[at : at + 8] = b"\xff\xff\xff\x7f" * 2
+    path.write_bytes(data)
+    refused(
+        lambda: read_depth(path), "z.exr: 2147483648 x 2147483648 px: ", "px along a side; at most 16384 are allowed"
+    )

@@ -1,0 +1,269 @@
+"""Two runs on one folder, stops by a signal, and disks that are full: one line each, and nothing lost."""
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+import simtest
+from simtest.cli.main import main
+from simtest.cli.stopping import Termination
+from simtest.errors import InputError, SimtestError
+from simtest.runtime.engines import local
+from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
+from simtest.runtime.machine_errors import machine_problem
+from simtest.validation import runner
+from studies.bad_inputs import files
+from tests.refusals import refused
+
+pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+
+MAIN = "from simtest.cli.main import main; main()"
+
+
+def entered(context):
+    with context:
+        pass
+
+
+def test_a_folder_in_use_is_refused_with_its_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/bin/simtest", "validate", "my experiment"])
+    folder = tmp_path / "a" / "out"
+    with exclusive_folder(folder):
+        assert is_held(folder / LOCK)
+        told = f"--out {folder}: is in use by process {os.getpid()} (simtest validate 'my experiment', since 20"
+        refused(lambda: entered(exclusive_folder(folder)), told, "; wait until it ends, or name another")
+        (folder / "results").touch()
+    assert [path.name for path in folder.iterdir()] == ["results"]
+    entered(exclusive_folder(folder))
+
+
+def test_what_stays_empty_is_removed(tmp_path):
+    with pytest.raises(InputError, match="stop"), exclusive_folder(tmp_path / "a" / "b"):
+        raise InputError("stop")
+    assert list(tmp_path.iterdir()) == []
+    # A folder that was there stays.
+    (tmp_path / "c").mkdir()
+    entered(exclusive_folder(tmp_path / "c"))
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+
+
+@pytest.mark.parametrize("held", [b"", b"{", b"[]", json.dumps({"process": 1, "machine": "x"}).encode(), b"\xff" * 9])
+def test_a_lock_left_behind_locks_nothing(tmp_path, held):
+    (tmp_path / LOCK).write_bytes(held)
+    entered(exclusive_folder(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_a_killed_process_is_stale(tmp_path):
+    code = "import sys, time\nfrom pathlib import Path\nfrom simtest.runtime.locks import exclusive_folder\n"
+    code += "with exclusive_folder(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+    child = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "held\n"
+    refused(lambda: entered(exclusive_folder(tmp_path)), f"is in use by process {child.pid} (-c ")
+    child.kill()
+    child.communicate()
+    assert (tmp_path / LOCK).is_file()
+    entered(exclusive_folder(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_another_machine_is_named(tmp_path, monkeypatch):
+    with exclusive_file(tmp_path / "m.ply"):
+        monkeypatch.setattr(socket, "gethostname", lambda: "elsewhere")
+        refused(lambda: entered(exclusive_file(tmp_path / "m.ply")), f"process {os.getpid()} on ", "--out ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / LOCK).symlink_to(tmp_path / "mine.txt")
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+# Signals ----------------------------------------------------------------------------------------------------------
+
+
+def test_termination_is_answered_as_ctrl_c_is():
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    presses = []
+    try:
+        with Termination() as stop:
+            signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
+            signal.raise_signal(signal.SIGTERM)
+            assert (presses, stop.came) == (["press"], True)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) == before[0]
+    finally:
+        signal.signal(signal.SIGINT, before[1])
+
+
+def command(folder, *arguments, **options):
+    return subprocess.Popen([sys.executable, "-c", MAIN, *arguments], cwd=folder, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, text=True, **options)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_second_run_is_refused_and_sigterm_ends_the_first(tmp_path):
+    given = ("dataset", "tiny", "--samples", "400", "--set", "samples_per_anatomy=10", "--workers", "2", "--out", "d")
+    first = command(tmp_path, *given)
+    while not list((tmp_path).glob("d/*.part")) and first.poll() is None:
+        time.sleep(0.05)
+    second = command(tmp_path, *given)
+    _, errors = second.communicate(timeout=300)
+    assert second.returncode == 2
+    assert errors.startswith(f"simtest: --out d: is in use by process {first.pid} (")
+    first.send_signal(signal.SIGTERM)
+    _, errors = first.communicate(timeout=300)
+    assert first.returncode == 143
+    assert errors.splitlines()[-1].startswith("simtest: terminated; what is finished is kept")
+    assert not (tmp_path / "d" / LOCK).exists()
+
+
+# Disk and memory --------------------------------------------------------------------------------------------------
+
+
+def test_a_disk_that_is_full_is_named_with_file_and_room(tmp_path):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left") as error:
+        write_atomically(tmp_path / "results.parquet", full)
+    said = machine_problem(error.value)
+    assert said.startswith(f"{tmp_path / 'results.parquet'}: No space left on device; ")
+    assert f"MB are free on the disk of {tmp_path}" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_writer_that_says_false_has_failed(tmp_path):
+    with pytest.raises(OSError, match="is the disk full"):
+        write_atomically(tmp_path / "x.png", lambda part: part.write_bytes(b"half") < 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_limit_of_the_system_is_named(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large") as error:
+            write_json(tmp_path / "x.json", ["x" * 2000])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert machine_problem(error.value) == (
+        f"{tmp_path / 'x.json'}: File too large; the system limits the size of a file (ulimit -f)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError("Unable to allocate 9 GiB"), "not enough memory (Unable to allocate 9 GiB); smaller frames"),
+        (MemoryError(), "not enough memory; smaller frames"),
+        (RecursionError("maximum recursion depth exceeded"), "a value is nested too deeply"),
+        (RuntimeError("write failed: (os error 28)"), "write failed: (os error 28)"),
+        (OSError(36, "File name too long", "n" * 500), "...: File name too long"),
+        (ZeroDivisionError("division by zero"), None),
+        (OSError("no number"), None),
+    ],
+)
+def test_errors_of_the_machine_are_told_from_faults(error, said):
+    found = machine_problem(error)
+    assert (found is None) == (said is None)
+    assert said is None or said in found
+
+
+# Each command -----------------------------------------------------------------------------------------------------
+
+FOLDERS = {
+    "render": ("render", "plane", "--out", "held"),
+    "export": ("export", "plane", "--out", "held"),
+    "views": ("views", "anatomy", "--count", "1", "--out", "held"),
+    "validate": ("validate", "overview", "--out", "held"),
+    "dataset": ("dataset", "tiny", "--out", "held"),
+    "reconstruct": ("reconstruct", "a.png", "--fov", "60", "--out", "held"),
+    "reconstruct a folder": ("reconstruct", "frames", "--fov", "60", "--out", "held"),
+    "realism": ("realism", "a.png", "--against", "plane", "--out", "held"),
+    "fit's bank": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--bank", "held", "--out", "x.toml"),
+}
+FILES = {
+    "fit": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--out", "held.toml"),
+    "mesh": ("mesh", "colon", "--out", "held.ply"),
+    "view": ("view", "plane", "--screenshot", "held.png"),
+    "preview": ("dataset", "preview", "nothing", "--out", "held.html"),
+    "nightly": ("nightly", "--profile", "quick", "--reports", "."),
+}
+
+
+@pytest.fixture
+def run_here(tmp_path, monkeypatch, capsys):
+    """Run commands in a folder with some pictures; return exit code and lines of the error stream."""
+    (tmp_path / "frames").mkdir()
+    for path in (tmp_path / "a.png", tmp_path / "frames" / "a.png"):
+        path.write_bytes(files.encoded(".png"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["simtest", *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr().err.splitlines()
+
+    return run
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_each_command_is_refused_a_folder_in_use(tmp_path, run_here, name):
+    with exclusive_folder(tmp_path / "held"):
+        code, lines = run_here(*FOLDERS[name])
+    option = "--bank" if "bank" in name else "--out"
+    assert (code, len(lines)) == (2, 1)
+    assert lines[0].startswith(f"simtest: {option} held: is in use by process {os.getpid()} (")
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
+    held = "quick" if name == "nightly" else FILES[name][-1]
+    with exclusive_file(tmp_path / held):
+        code, lines = run_here(*FILES[name])
+    assert (code, len(lines)) == (2, 1)
+    assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+def test_a_full_disk_in_a_worker_names_the_folder(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(runner, "run_experiment", full)
+    with pytest.raises(SimtestError) as error:
+        simtest.validate("overview", tmp_path / "out")
+    said = f"--out {tmp_path / 'out'}: cannot be written (No space left on device; "
+    assert str(error.value).startswith(said)
+    assert "MB are free on the disk of" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind"),
+    [(OSError(28, "No space left on device"), OSError), (MemoryError(), SimtestError), (KeyError("x"), SimtestError)],
+)
+def test_a_worker_hands_on_errors_of_the_disk(raised, kind):
+    def task(*_):
+        raise raised
+
+    state, error = local._answer(None, task, None)
+    assert state == "error"
+    assert type(error) is kind
+    assert kind is OSError or str(error).startswith(("not enough memory; ", "a worker failed (KeyError"))
