@@ -18,8 +18,8 @@ from simtest.geometry.circle_from_cone import _ordered
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.patch import Patch
 from simtest.rendering import exact_points as exact
+from simtest.rendering.built_scene import BuiltScene
 from simtest.rendering.direct import DirectLight
-from simtest.rendering.session import Session
 from simtest.simulation.rendered_view import RenderedView
 from simtest.spec.scene import Scene
 from simtest.surfaces import analytic
@@ -132,7 +132,7 @@ FAULTS: dict[str, tuple[Mutation, ...]] = {
     "normals in the world frame": (Mutation(exact.in_camera, "normal=exact.normal @ rotation", "normal=exact.normal"),),
     "light moved 1 mm": (
         Mutation(
-            Session._place_lights, "self.scene.rig.true_mm()", "(self.scene.rig.true_mm() + np.array([1.0, 0.0, 0.0]))"
+            BuiltScene.place_lights, "rig.true_mm()", "(rig.true_mm() + np.array([1.0, 0.0, 0.0]))"
         ),
     ),
     "ellipse fit unscaled": (
