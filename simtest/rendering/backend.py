@@ -27,8 +27,8 @@ from simtest.runtime.resources import shown
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
 """What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""
 
-VARIANT_NAME = re.compile(r"(scalar|llvm|cuda)(_ad)?_(mono|rgb|spectral)(_polarized)?(_double)?")
-"""Names that Mitsuba forms its variants' by; which of them it has been built with is known once it is imported."""
+VARIANTS = tuple(f"{device}_ad_{channels}" for device in DEVICES for channels in ("mono", "rgb"))
+"""Mitsuba's variants that can be used; which of them it has been built with is known once it is imported."""
 
 DEFAULT_VARIANT = f"{LLVM}_ad_mono"
 COLOUR_VARIANT = f"{LLVM}_ad_rgb"
@@ -84,13 +84,10 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
     scene is `coloured`.
     """
     if variant is not None and not variant.strip():
-        raise InputError(f"--variant is empty; must be one of {', '.join(DEVICES)}, or a Mitsuba variant by name")
+        raise InputError(f"--variant is empty; must be one of {', '.join((*DEVICES, *VARIANTS))}")
     name = variant or os.environ.get(VARIANT_VARIABLE) or LLVM
-    if name not in DEVICES and not VARIANT_NAME.fullmatch(name):
-        raise BackendError(
-            f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join(DEVICES)}, or a Mitsuba variant by "
-            "name, such as llvm_ad_rgb"
-        )
+    if name not in (*DEVICES, *VARIANTS):
+        raise BackendError(f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join((*DEVICES, *VARIANTS))}")
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 
@@ -242,7 +239,7 @@ def load(variant: str | None = None) -> Any:
     import mitsuba
 
     # Variant.
-    usable = [v for v in mitsuba.variants() if re.fullmatch(f"({'|'.join(DEVICES)})_ad_(mono|rgb)", v)]
+    usable = [v for v in mitsuba.variants() if v in VARIANTS]
     if name not in usable:
         raise BackendError(f"variant {name!r}: cannot be used; allowed: {', '.join((*DEVICES, *usable))}")
     if mitsuba.variant() != name:
@@ -369,8 +366,11 @@ class BackendReport:
 
 def library_report(variant: str | None = None) -> BackendReport:
     """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
-    name = requested_variant(variant)
-    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
     versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
+    try:
+        name = requested_variant(variant)
+    except BackendError as error:
+        return BackendReport(variant or os.environ[VARIANT_VARIABLE], None, [], versions, str(error))
+    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
     problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
     return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)

@@ -558,7 +558,7 @@ def test_bad_use_exits_2(here, line, said):
 
 
 def test_ctrl_c_says_what_is_kept(here, monkeypatch, tmp_path):
-    def stopped(profile, folder, run_id, options):
+    def stopped(profile, folder, run_id, options, planned):
         options.progress(0, 5, "first")
         os.kill(os.getpid(), signal.SIGINT)
         options.progress(1, 5, "first")

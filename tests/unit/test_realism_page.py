@@ -178,7 +178,7 @@ def test_a_film_that_ends_early_is_measured_as_far_as_it_goes(tmp_path):
     ("against", "more", "words"),
     [
         ("plane", {"surfaces": ["colon"]}, "--surface colon: only of a dataset, and plane is none"),
-        ("plane", {"count": 0}, "--count 0: must be at least 1"),
+        ("plane", {"count": 0}, "--count 0: must be 1 to 10000"),
     ],
 )
 def test_bad_options_are_one_line(tmp_path, against, more, words):
