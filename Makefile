@@ -74,8 +74,7 @@ lint: $(VENV)/.tests
 # Both tools live in an environment of their own; where they cannot be installed, a line says so and nothing fails.
 $(VENV)-audit/.installed: $(VENV)/.installed
 	$(PYTHON) -m venv $(VENV)-audit
-	-$(VENV)-audit/bin/python -m pip install --quiet --disable-pip-version-check "bandit[toml]>=1.8" "pip-audit>=2.7"
-	@touch $@
+	-$(VENV)-audit/bin/python -m pip install --quiet --disable-pip-version-check "bandit[toml]>=1.8" "pip-audit>=2.7" && touch $@
 
 audit: $(VENV)-audit/.installed
 	$(VENV)-audit/bin/python .ci/audit.py

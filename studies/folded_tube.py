@@ -98,6 +98,8 @@ def main() -> None:
     """Print a row for each estimator and exponent."""
     first, count = (int(v) for v in (*sys.argv[1:3], *("1000", "60")[len(sys.argv[1:3]) :]))
     folder = Path(sys.argv[3]) if len(sys.argv) > 3 else None
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     print(f"viewpoints {first} to {first + count - 1}; deg")
     rows = [("exponent", "estimator", "highlights", "answered", "median", "RMS", "p95", "in the 95 % region, %")]
     for exponent in EXPONENTS:

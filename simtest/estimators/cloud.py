@@ -78,7 +78,8 @@ class CloudCentre:
         Each estimate has ``target`` base and a `cloud`. Flags: ``anisotropic_or_curved`` where the cloud is longer than
         wide, which a curved base and an anisotropic relief do alike; ``cut`` where a part of it is out of view;
         ``wide`` where it is longer than `MOST_EXTENT`; ``base_doubted`` where the diffuse light says that the base is
-        likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell.
+        likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell;
+        ``clouds_refused`` where another cloud of the frame gets no answer.
         The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
         cloud has spots enough in view, or the base has no single highlight point at any one's centre (`cloud_base`).
         """
@@ -101,6 +102,8 @@ class CloudCentre:
                     estimates.append(made)
         if not estimates:
             return refused[0] if refused else self._none_whole(mixture, owner)
+        if refused:
+            estimates = [replace(each, flags=(*each.flags, "clouds_refused")) for each in estimates]
         return sorted(estimates, key=lambda estimate: -len(_shape(estimate).points_px))
 
     def _too_few(self, count: int) -> Failure:
@@ -159,6 +162,8 @@ def _estimate(
         return doubt
     bends = np.zeros((2, 2)) if priors.plane else _bends(cloud, camera.unproject(points_px), evidence)
     cloud, parts = _with_light(cloud, sampling * small_sample(independent), bends, evidence, _turns(priors))
+    if not _is_in_view(cloud, camera, light.frame):
+        return _unstated(len(points_px), "the diffuse light says that its centre lies out of view")
     normal = -cloud.centre
     lobe = LOBE_RAD2 if priors.lobe_curvature is None else exactly(1 / priors.lobe_curvature.mean)
     slope = slope_of(cloud.covariance, independent, lobe)
@@ -189,6 +194,10 @@ def _refusal(cloud: Cloud, evidence: BaseEvidence, spots: int) -> Failure | None
         why = f"its extent is {extent:.0f} deg, over {most:.0f}: the base has several highlight points there or none"
     else:
         return None
+    return _unstated(spots, why)
+
+
+def _unstated(spots: int, why: str) -> Failure:
     return Failure(Reason.NO_ESTIMATE, f"a cloud of {spots} spots states no normal: {why}")
 
 

@@ -360,7 +360,7 @@ def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
     Its region is one pixel, or the box around a cloud's highlights.
     """
     height, width = frame.encoded.shape[:2]
-    x, y = min(int(estimate.look_px[0]), width - 1), min(int(estimate.look_px[1]), height - 1)
+    x, y = (min(max(int(v), 0), size - 1) for v, size in zip(estimate.look_px, (width, height), strict=True))
     if estimate.cloud is None:
         no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
         return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})

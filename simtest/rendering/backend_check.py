@@ -19,7 +19,8 @@ def examine(variant: str | None = None) -> backend.BackendReport:
 def _try_rendering(variant: str) -> str | None:
     """Render a plane in a child process; return the problem, or None."""
     # A child: a bad libLLVM may end the process.
-    command = [sys.executable, "-m", "simtest.rendering.backend_check", variant]
+    # -P: no file of the current folder may stand in for a package.
+    command = [sys.executable, "-P", "-m", "simtest.rendering.backend_check", variant]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S)
     except subprocess.TimeoutExpired:

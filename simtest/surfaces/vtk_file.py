@@ -35,7 +35,8 @@ def read_vtk(path: Path) -> tuple[Array, IntArray]:
     """
     with tempfile.TemporaryDirectory() as scratch:
         made = Path(scratch) / "mesh.npz"
-        command = [sys.executable, "-m", "simtest.surfaces.vtk_file", str(path.absolute()), str(made)]
+        # -P: no file of the current folder may stand in for a package.
+        command = [sys.executable, "-P", "-m", "simtest.surfaces.vtk_file", str(path.absolute()), str(made)]
         try:
             child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
         except subprocess.TimeoutExpired:

@@ -47,7 +47,7 @@ def _where(rows: pl.DataFrame, condition: pl.Expr, **values: pl.Expr) -> pl.Data
 def _unanswered(rows: pl.DataFrame, condition: pl.Expr, status: str) -> pl.DataFrame:
     """Return rows whose answers are taken away where a condition holds."""
     gone = {name: pl.lit(None) for name in OF_ANSWERS}
-    return _where(rows, OK & condition, status=pl.lit(status), **gone)
+    return _where(rows, OK & condition, status=pl.lit(status), flags=pl.lit(""), **gone)
 
 
 def _settings(rows: pl.DataFrame, count: int, rng: np.random.Generator) -> pl.Expr:

@@ -7,7 +7,9 @@ import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, exactly
 from simtest.errors import Failure
+from simtest.estimators import cloud as cloud_module
 from simtest.estimators.cloud import cloud
+from simtest.estimators.cloud_base import BaseEvidence
 from simtest.estimators.cloud_shading import DiffuseLight
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, basis_across
@@ -117,6 +119,17 @@ def test_a_cloud_where_the_base_is_turned_away_gets_no_answer():
     assert "diffuse light says that the base is turned by" in made.detail
 
 
+def test_a_refused_cloud_leaves_a_flag_on_the_others():
+    points = np.concatenate(
+        [points_around(direction(0.0), extent_px=10.0), points_around(direction(20.0), extent_px=10.0)]
+    )
+    (found,) = estimates(frame_of(light_of_sphere(direction(0.0)), points))
+    assert angle_deg(found.normal, -direction(0.0)) < 3.0
+    assert "clouds_refused" in found.flags
+    (alone,) = estimates(frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0), extent_px=10.0)))
+    assert "clouds_refused" not in alone.flags
+
+
 def test_the_light_moves_a_centre_that_few_spots_tell():
     """Spots 2 deg beside the highlight point: the estimate lies between, and its region is smaller than theirs."""
     facing = direction(0.0)
@@ -178,3 +191,11 @@ def test_bends_are_what_the_spots_show_beyond_chance():
         shapes.append(float(np.trace(found.budget["shape"])))
     assert shapes[0] < 0.2 * shapes[1]
     assert math.degrees(math.sqrt(shapes[1])) > 0.8
+
+
+def test_a_centre_that_the_light_moves_out_of_view_is_no_answer(monkeypatch):
+    far = BaseEvidence(True, told=True, information=1e9 * np.eye(2), shift=np.array([1.2, 0.0]))
+    monkeypatch.setattr(cloud_module, "evidence_of", lambda *_: far)
+    made = estimates(frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0))))
+    assert isinstance(made, Failure)
+    assert "its centre lies out of view" in made.detail

@@ -3,11 +3,13 @@
 import dataclasses
 import re
 
+import polars as pl
 import pytest
 
 from simtest.nightly.gate.checks import RULES
 from simtest.nightly.gate.judged import COLUMNS, SUMMARY, Judged
 from simtest.nightly.gate.limits import Limits
+from simtest.nightly.gate.pairing import with_all_frames
 from simtest.nightly.gate.quantities import HARMS, quantities
 from simtest.nightly.gate.single_results import STEPS
 from simtest.validation.results_table import SCHEMA
@@ -36,3 +38,17 @@ def test_what_is_named_as_judging_exists(table):
 
 def test_every_quantity_has_a_value_of_rows():
     assert set(quantities(Limits())) - {"false"} == set(HARMS)
+
+
+def test_frames_are_counted_on_only_where_realisations_are_a_count():
+    """Realisations 0, 2 and 4 of three frames name no frame that is missing."""
+    frames = pl.DataFrame({"cell": [0, 1], "frames": [3, 3]})
+
+    def values(cell, *realisations):
+        return pl.DataFrame({"cell": cell, "quantity": "false", "realisation": realisations, "value": 1.0})
+
+    chosen, counted = values(0, 0, 2, 4), values(1, 0, 2)
+    both = pl.concat([chosen, counted])
+    made = with_all_frames(both, frames, both)
+    assert made.filter(pl.col("cell") == 0).height == 3
+    assert made.filter(pl.col("cell") == 1, pl.col("value") == 0)["realisation"].to_list() == [1]

@@ -227,3 +227,13 @@ def test_reference_meshes_are_told_apart():
         mesh = trimesh.Trimesh(model.shape().mesh.vertices, model.shape().mesh.faces, process=False)
         assert mesh.is_watertight
         assert (mesh.volume > 0) == (model is liver)  # the lumen's winding is turned inward
+
+
+def test_no_file_of_the_current_folder_runs(tmp_path, monkeypatch):
+    """VTK files are read in a child; a module beside the mesh must not stand in for a package there."""
+    (tmp_path / "pyvista.py").write_text("from pathlib import Path; Path('ran').touch()")
+    (tmp_path / "m.vtk").write_text(VTK + "POLYDATA\nPOINTS 3 float\n0 0 0 9 0 0 0 9 0\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="3 points and no faces"):
+        surface(Path("m.vtk"))
+    assert not (tmp_path / "ran").exists()

@@ -255,8 +255,11 @@ def test_a_worst_case_shows_what_was_before(tmp_path, night):
     row = {
         "experiment": "overview", "setting": "s", "realisation": 2, "estimator": "circle_pose", "true_id": 0,
         "status": "ok", "error_deg": 0.25, "normal_x": 0.0, "normal_y": 0.0, "normal_z": -1.0,
+        "seed": 7, "truth_x": 0.1, "truth_y": 0.0, "truth_z": -0.9,
     }  # fmt: skip
-    before = pl.DataFrame([row, {**row, "realisation": 3, "error_deg": 7.0}])
+    before = pl.DataFrame([row, {**row, "realisation": 3, "error_deg": 7.0}]).cast({"truth_x": pl.Float32})
+    tonight = pl.DataFrame([{**row, "error_deg": 0.5}])
+    night = replace(night, rows=pl.concat([night.rows, tonight], how="diagonal_relaxed"))
     case = WorstCase("overview", "s", 2, "circle_pose", "why")
     judged = JudgedRun(
         night, verdict_of(night), pl.DataFrame(), (tmp_path / "worst-00.npz",), cases=(case,), before=before
@@ -264,6 +267,9 @@ def test_a_worst_case_shows_what_was_before(tmp_path, night):
     told = Page(write_nightly_page(tmp_path / "page", judged).read_text(encoding="utf-8")).text
     assert "In the baseline: highlight 0: 0.25°" in told
     assert "circle_pose (baseline)" in told
+    # Another seed makes another frame.
+    other = replace(judged, before=before.with_columns(seed=pl.lit(8)))
+    assert "In the baseline" not in Page(write_nightly_page(tmp_path / "b", other).read_text(encoding="utf-8")).text
     # A baseline of an older version has no normals.
     older = write_nightly_page(tmp_path / "older", replace(judged, before=before.drop("normal_x")))
     assert "In the baseline" not in Page(older.read_text(encoding="utf-8")).text

@@ -92,6 +92,11 @@ def with_all_frames(values: pl.DataFrame, frames: pl.DataFrame, *rows: pl.DataFr
         `harms` that hold all frames with rows.
     """
     held = values.filter(_FALSE).select("cell").unique()
+    # Realisations of a choice (0, 2, 4) are no count: which frames have no row is then not known.
+    for table in rows:
+        last = table.group_by("cell").agg(last=pl.col("realisation").max())
+        beyond = frames.join(last, on="cell").filter(pl.col("last") >= pl.col("frames"))
+        frames = frames.join(beyond, on="cell", how="anti", maintain_order="left")
     numbered = frames.join(held, on="cell", how="semi").select("cell", realisation=pl.int_ranges("frames"))
     numbered = numbered.explode("realisation").drop_nulls().cast({"realisation": values.schema["realisation"]})
     for table in rows:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 MOST_CASES = 12
 
 _NORMAL = ("normal_x", "normal_y", "normal_z")
+_SAME = ("seed", "truth_x", "truth_y", "truth_z")
 _NEEDED = ("experiment", "setting", "realisation", "estimator", "true_id", "status", "error_deg", *_NORMAL)
 
 
@@ -35,15 +36,15 @@ def read_cases(judged: JudgedRun) -> tuple[list[GalleryItem], list[str]]:
         except InputError as error:
             lines.append(str(error))
             continue
-        items.append(item if case is None else _with_baseline(item, case, judged.before))
+        items.append(item if case is None else _with_baseline(item, case, judged))
     return items, lines
 
 
-def _with_baseline(item: GalleryItem, case: "WorstCase", before: pl.DataFrame) -> GalleryItem:
+def _with_baseline(item: GalleryItem, case: "WorstCase", judged: JudgedRun) -> GalleryItem:
     """Return an item with the baseline's answers at the true highlights of its frame."""
-    if not set(_NEEDED) <= set(before.columns):
+    if not {*_NEEDED, *_SAME} <= set(judged.before.columns):
         return item
-    was = tuple(_answers(case, before))
+    was = tuple(_answers(case, judged.before, judged.run.rows))
     if not was:
         return item
     told = "; ".join(f"highlight {one.true_id}: {one.result}" for one in was)
@@ -52,12 +53,19 @@ def _with_baseline(item: GalleryItem, case: "WorstCase", before: pl.DataFrame) -
     return replace(item, meta=meta.model_copy(update={"estimates": (*meta.estimates, *was), "why": why}))
 
 
-def _answers(case: "WorstCase", before: pl.DataFrame) -> Iterator[KeptEstimate]:
-    own = before.filter(
+def _answers(case: "WorstCase", before: pl.DataFrame, tonight: pl.DataFrame) -> Iterator[KeptEstimate]:
+    shown = (
         pl.col("experiment") == case.experiment, pl.col("setting") == case.setting,
         pl.col("realisation") == case.realisation, pl.col("estimator") == case.estimator,
         pl.col("true_id").is_not_null(),
     )  # fmt: skip
+    # Only of the same frame: with another seed or definition the true normals differ.
+    # Baselines hold numbers in single precision.
+    was, now = (
+        rows.filter(shown).with_columns(pl.col(*_SAME, "true_id").cast(pl.Float32).name.prefix("same_"))
+        for rows in (before, tonight)
+    )
+    own = was.join(now, on=[f"same_{name}" for name in (*_SAME, "true_id")], how="semi", maintain_order="left")
     for row in own.select(_NEEDED).iter_rows(named=True):
         normal = tuple(row[name] for name in _NORMAL)
         yield KeptEstimate(

@@ -85,7 +85,8 @@ def show(content: Content) -> None:
 
 def _draw(arguments: list[str], environment: dict[str, str], timeout: float | None) -> tuple[bool, str]:
     """Run the drawing process; returns whether it ended well, and the last line that it wrote."""
-    command = [sys.executable, "-m", "simtest.report.viewer.window", *arguments]
+    # -P: no file of the current folder may stand in for a package.
+    command = [sys.executable, "-P", "-m", "simtest.report.viewer.window", *arguments]
     # The child finds the same simtest as this process, wherever that was started.
     here = str(Path(__file__).resolve().parents[3])
     path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
