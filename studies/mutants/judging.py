@@ -92,7 +92,7 @@ def code_hash() -> str:
 
 def stamp(profile: str) -> dict[str, str]:
     """Return what each line states beside its answer: the code, and the profile of nights (canaries have none)."""
-    path = Path(profile)
+    path = Path(profile).expanduser()
     # Of a profile in a file the content counts.
     key = f"{path.stem} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else profile
     return {"source": code_hash(), "profile": key}
