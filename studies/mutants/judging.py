@@ -1,9 +1,12 @@
 """Ask canaries, and then the gate, about each mutant; a line of JSON for each answer, from which a later call goes on.
 
+Each line states the code and the profile that it holds for. Lines of other code, or of another profile, are left out.
+
 A few mutants at a time share a process, one after the other, with the package's caches emptied between them. Unchanged
 code must raise no alarm after them; else each of them is asked again in a process of its own, as the gate's nights are.
 """
 
+import hashlib
 import json
 import os
 import subprocess
@@ -11,9 +14,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import simtest
+from simtest.runtime.provenance import source_hash, versions
+from simtest.runtime.resources import data_root
 from studies.mutants.catalogue import BY_NAME, UNCHANGED
 from studies.mutants.kinds import QUANTITIES, naming
 from studies.mutants.mutant import Mutant
@@ -42,14 +49,17 @@ class Judged:
         Other canaries that failed.
     worse : list of str or None
         Quantities that the gate calls worse and that name it; None where the gate was not asked.
+    alarms : list of str
+        All quantities that the gate calls worse, whatever they name.
     stopped : str
-        Why the canaries could not be asked; empty where they were.
+        Why the canaries, or the gate, could not be asked; empty where they were.
     """
 
     mutant: Mutant
     naming: list[str]
     others: list[str]
     worse: list[str] | None
+    alarms: list[str]
     stopped: str
 
     @property
@@ -60,26 +70,56 @@ class Judged:
     @property
     def is_seen(self) -> bool:
         """Whether anybody raised an alarm."""
-        return bool(self.naming or self.others or self.worse or self.stopped)
+        return bool(self.naming or self.others or self.alarms or self.stopped)
+
+    @property
+    def as_wanted(self) -> bool:
+        """Whether a fault was named, or unchanged code raised no alarm of any kind."""
+        return not self.is_seen if self.mutant is UNCHANGED else self.by_name
 
 
-def read(file: Path) -> Answers:
-    """Read the answers of earlier calls; a line that a kill cut short is left out."""
+@cache
+def code_hash() -> str:
+    """Return a hash of what answers hang on: simtest, its scenes, package versions, the mutants and who names them."""
+    mutants = Path(__file__).parent
+    files = [*mutants.glob("*.py"), mutants.parent / "gate" / "faults.py"]
+    files += [*Path(simtest.__file__).parent.rglob("*.json"), *data_root("scenes").rglob("*.toml")]
+    digest = hashlib.sha256((source_hash() + json.dumps(versions())).encode())
+    for path in sorted(files):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def stamp(profile: str) -> dict[str, str]:
+    """Return what each line states beside its answer: the code, and the profile of nights (canaries have none)."""
+    path = Path(profile).expanduser()
+    # Of a profile in a file the content counts.
+    key = f"{path.stem} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else profile
+    return {"source": code_hash(), "profile": key}
+
+
+def read(file: Path, profile: str = "") -> Answers:
+    """Read the answers of earlier calls about today's code: those of canaries, and those by nights of a profile.
+
+    A line that a kill cut short is left out.
+    """
     found: Answers = {}
+    source, profiles = code_hash(), ("", stamp(profile)["profile"])
     for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
         try:
             answer = json.loads(line)
         except json.JSONDecodeError:
             continue
-        found[answer["name"], answer["stage"]] = answer
+        if answer.get("source") == source and answer.get("profile") in profiles:
+            found[answer["name"], answer["stage"]] = answer
     return found
 
 
 def ask(
     names: Iterable[str], stage: str, file: Path, workers: int, told: Callable[[str], None], profile: str = ""
 ) -> Answers:
-    """Ask about all mutants that the file has no answer of, and add the answers to it; return all of the file."""
-    known = read(file)
+    """Ask about all mutants that the file has no answer of, and add the answers to it; return all that hold today."""
+    known = read(file, profile)
     open_ = [name for name in names if (name, stage) not in known]
     size = BATCH if stage == "canaries" else 1
     batches = [open_[first : first + size] for first in range(0, len(open_), size)]
@@ -89,16 +129,18 @@ def ask(
         if out.tell() and not file.read_text(encoding="utf-8").endswith("\n"):
             out.write("\n")
         for answers in threads.map(lambda batch: _asked(batch, stage, file, profile), batches):
-            out.writelines(json.dumps(answer) + "\n" for answer in answers)
+            out.writelines(json.dumps({**answer, **stamp(profile)}) + "\n" for answer in answers)
             out.flush()
             done += len(answers)
             told(f"{stage} {done}/{len(open_)}")
-    return read(file)
+    return read(file, profile)
 
 
-def night_folder(file: Path) -> Path:
-    """Return the folder of the unchanged night, beside the answers."""
-    return file.with_suffix(".night")
+def night_folder(file: Path, profile: str) -> Path:
+    """Return the folder of the unchanged night, beside the answers; other code or another profile has another."""
+    own = stamp(profile)
+    digest = hashlib.sha256(json.dumps(own).encode()).hexdigest()[:16]
+    return file.with_suffix(f".{Path(own['profile']).name or 'canaries'}.{digest}.night")
 
 
 def _asked(names: list[str], stage: str, file: Path, profile: str) -> list[dict[str, Any]]:
@@ -106,7 +148,7 @@ def _asked(names: list[str], stage: str, file: Path, profile: str) -> list[dict[
 
     Where it ends early, or unchanged code fails a canary after them, each is asked again in a process of its own.
     """
-    command = [sys.executable, "-m", "studies.mutants.child", stage, str(night_folder(file)), profile, *names]
+    command = [sys.executable, "-m", "studies.mutants.child", stage, str(night_folder(file, profile)), profile, *names]
     environment = {**os.environ}
     if any(BY_NAME[name].spoils_kept_arrays for name in names):
         # What is kept for later processes must not hold the fault, nor hide it.
@@ -134,14 +176,16 @@ def judged(answers: Answers, names: Iterable[str]) -> Iterator[Judged]:
         failed = [canary for canary, *_ in found.get("failed", ())]
         named = naming(mutant.kind, failed)
         others = [canary for canary in dict.fromkeys(failed) if canary not in named]
-        worse = None
+        worse, alarms, stopped = None, [], found.get("stopped", "")
         if night is not None:
             told = QUANTITIES.get(mutant.kind, ())
             pairs = night.get("worse", ())
             worse = [
                 f"{where} {what}" for where, what in pairs if what in told or where in naming(mutant.kind, [where])
             ]
-        yield Judged(mutant, named, others, worse, found.get("stopped", ""))
+            alarms = [f"{where} {what}" for where, what in pairs]
+            stopped = stopped or night.get("stopped", "")
+        yield Judged(mutant, named, others, worse, alarms, stopped)
 
 
 def run(

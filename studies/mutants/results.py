@@ -117,6 +117,8 @@ COVARIANCE: tuple[Mutant, ...] = (
            "stiffness / (1 + np.sqrt(1 + c * stiffness))", "np.sqrt(stiffness / c)"),
     mutant("bisector moves the peak away from the light", "estimators", "simtest.estimators.bisector:_normals",
            "sightlines = sightline - slope", "sightlines = sightline + slope"),
+    mutant("falloff's shift not undone", "estimators", "simtest.estimators.bisector:_normals",
+           "sightlines = sightline - slope", "sightlines = sightline - 0.0 * slope"),
 )  # fmt: skip
 
 DATASET: tuple[Mutant, ...] = (

@@ -14,6 +14,7 @@ from simtest.spec import Experiment
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 from studies.mutants.catalogue import MUTANTS
 from studies.mutants.kinds import KINDS, MEASURES, measures_of
+from studies.mutants.mutant import Change
 
 DETECTORS = {
     "sign flip of an axis": ("circle_pose", "normal_off"),
@@ -67,6 +68,15 @@ def test_a_planted_fault_kills_its_canary(fault):
     # And is gone afterwards.
     with pytest.raises(LookupError):
         Mutation(FAULTS[fault][0].function, FAULTS[fault][0].new + "nowhere", "").code()
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("share", ["0.0", "2.0"])
+def test_the_falloffs_shift_is_undone_once(share):
+    change = Change("simtest.estimators.bisector:_normals", "sightline - slope", f"sightline - {share} * slope")
+    with planted(change.mutation()):
+        assert ("bisector", "plane_off") in failed(measures()["told_light"]())
+    assert not failed(measures()["told_light"]())
 
 
 WITHOUT_RENDERING = (

@@ -88,6 +88,7 @@ def test_the_gate_is_asked_about_what_canaries_do_not_name(asked, tmp_path):
 def test_a_later_call_goes_on(asked, tmp_path):
     file = tmp_path / "answers.jsonl"
     known = {"name": "median is the mean", "stage": "canaries", "failed": [["statistics", "median_off", 1.0]]}
+    known |= judging.stamp("")
     # The last line is what a kill left of one.
     file.write_text(json.dumps(known) + "\n" + '{"name": "mean is', encoding="utf-8")
     names = ["median is the mean", "mean is the median"]
@@ -96,6 +97,98 @@ def test_a_later_call_goes_on(asked, tmp_path):
     assert [each.by_name for each in found] == [False, True, True]
     judging.run(names, file, 1, lambda line: None, None)
     assert len(asked) == 2
+
+
+def test_answers_about_other_code_are_not_told(asked, tmp_path, monkeypatch):
+    file, names = tmp_path / "answers.jsonl", ["mean is the median"]
+    judging.run(names, file, 1, lambda line: None, None)
+    before, folder = len(asked), judging.night_folder(file, "quick")
+    monkeypatch.setattr(judging, "source_hash", lambda: "of other code")
+    judging.code_hash.cache_clear()
+    try:
+        assert judging.read(file) == {}
+        assert judging.night_folder(file, "quick") != folder
+        judging.run(names, file, 1, lambda line: None, None)
+        assert len(asked) == 2 * before
+    finally:
+        judging.code_hash.cache_clear()
+
+
+def test_nights_of_another_profile_are_not_told(asked, tmp_path):
+    file, mine = tmp_path / "answers.jsonl", tmp_path / "mine.toml"
+    mine.write_text("costs = false", encoding="utf-8")
+    night = ("k4 of a fisheye lost", "night")
+    judging.run([night[0]], file, 1, lambda line: None, str(mine))
+    assert night in judging.read(file, str(mine))
+    assert night not in judging.read(file, "quick")
+    # What canaries told holds for every profile.
+    assert (night[0], "canaries") in judging.read(file, "quick")
+    folder = judging.night_folder(file, str(mine))
+    mine.write_text("costs = true", encoding="utf-8")
+    assert night not in judging.read(file, str(mine))
+    assert len({folder, judging.night_folder(file, str(mine)), judging.night_folder(file, "quick")}) == 3
+    judging.run([night[0]], file, 1, lambda line: None, "quick")
+    assert asked.count(night) == 2
+    assert asked.count((night[0], "canaries")) == 1
+
+
+def _answers(monkeypatch, canaries=None, night=None):
+    """Let the canaries, and the night, answer alike about unchanged code; a planted fault is named by its canary."""
+
+    def answer(name, stage):
+        if name != UNCHANGED.name:
+            return {"name": name, "stage": stage, "failed": [["statistics", "mean_off", 1.0]]}
+        return {"name": name, "stage": stage, **((canaries if stage == "canaries" else night) or {})}
+
+    monkeypatch.setattr(judging, "_asked", lambda some, stage, *rest: [answer(name, stage) for name in some])
+
+
+def _called(tmp_path, *more):
+    return main(["--out", str(tmp_path / "answers.jsonl"), "--only", "mean is the median", *more])
+
+
+def test_a_canary_that_fails_on_unchanged_code_is_an_alarm(monkeypatch, tmp_path, capsys):
+    _answers(monkeypatch, canaries={"failed": [["photometry", "residual", 1.0]]})
+    assert _called(tmp_path, "--canaries") == 1
+    assert "alarms on unchanged code: 1 canaries, the gate not asked (photometry)." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("canaries", [{}, {"stopped": "exit 1: no renderer"}])
+def test_unchanged_code_must_be_quiet(monkeypatch, tmp_path, canaries):
+    _answers(monkeypatch, canaries=canaries)
+    assert _called(tmp_path, "--canaries") == (1 if canaries else 0)
+
+
+@pytest.mark.parametrize("night", [{"worse": []}, {"worse": [["grid", "mean_deg"]]}, {"stopped": "exit 1: killed"}])
+def test_the_gates_alarm_on_unchanged_code_is_one(monkeypatch, tmp_path, capsys, night):
+    _answers(monkeypatch, night=night)
+    # Nobody names this one but the gate, by a quantity of its kind: so the unchanged night is asked for.
+    answer = judging._asked
+
+    def answers(some, stage, *rest):
+        if some == ["only answers are counted"]:
+            worse = [["grid", "n"], ["grid", "mean_deg"]] if stage == "night" else []
+            return [{"name": some[0], "stage": stage, "worse": worse}]
+        return answer(some, stage, *rest)
+
+    monkeypatch.setattr(judging, "_asked", answers)
+    monkeypatch.setattr(judging, "BATCH", 1)
+    quiet = night == {"worse": []}
+    assert _called(tmp_path, "only answers are counted") == (0 if quiet else 1)
+    text = capsys.readouterr().out
+    assert "| only answers are counted | counts | gate: grid n | gate: grid mean_deg |" in text
+    assert quiet or "grid mean_deg)." in text or "exit 1: killed)." in text
+
+
+def test_the_gates_alarm_under_another_name_is_seen():
+    answers = {
+        ("k4 of a fisheye lost", "canaries"): {"failed": []},
+        ("k4 of a fisheye lost", "night"): {"worse": [["grid", "mean_deg"]]},
+    }
+    (found,) = judging.judged(answers, ["k4 of a fisheye lost"])
+    assert found.is_seen
+    assert not found.by_name
+    assert "0 of 1 named, 1 seen" in table([found])
 
 
 def test_an_unknown_mutant_is_refused(capsys):
