@@ -3,6 +3,7 @@
 Sub-commands are imported when they are called, so that `simtest --help` answers at once.
 """
 
+import io
 import os
 import sys
 import warnings
@@ -13,6 +14,9 @@ from simtest.cli.stopping import Termination
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.machine_errors import machine_problem
 from simtest.runtime.resources import shown
+
+NARROWEST = 20
+"""Columns of a terminal; tables and help cannot be laid out in fewer."""
 
 LONGEST = 900
 """Characters of a line; a longer one is cut."""
@@ -66,6 +70,7 @@ def main() -> None:
     `nightly`, whose 1 is a regression, whatever else went wrong is 2.
     """
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
+    _mend_terminal()
     stop = Termination()
     if "--traceback" in sys.argv:
         sys.argv.remove("--traceback")
@@ -76,7 +81,8 @@ def main() -> None:
             # A command's result is its exit code.
             code = APP(exit_on_error=False, print_error=False, result_action="return_value")
         # Output may wait in a buffer whose reader has gone.
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except (CycloptsError, InputError) as error:
         sys.exit(_report(str(error), BAD_USE))
     except SimtestError as error:
@@ -94,6 +100,16 @@ def main() -> None:
         )
         sys.exit(_report(what, failed))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _mend_terminal() -> None:
+    """Let output never fail: characters that a terminal lacks are replaced, and one of no width gets the usual one."""
+    for stream in (sys.stdout, sys.stderr):
+        # None where it is closed.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < NARROWEST:
+        del os.environ["COLUMNS"]
 
 
 def _report(text: str, code: int) -> int:

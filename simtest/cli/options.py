@@ -19,6 +19,11 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     """Convert an option to a path; an empty one would be the current folder, which nobody has named."""
     if not tokens[0].value.strip():
         raise ValueError("is empty; must name a file or folder")
+    try:
+        tokens[0].value.encode()
+    except UnicodeEncodeError:
+        # Such names cannot be printed, nor stand in JSON, and libraries that write pictures break down over them.
+        raise ValueError(f"is no UTF-8 name: {tokens[0].value!a}; must be one (and LC_ALL a UTF-8 locale)") from None
     return Path(tokens[0].value)
 
 

@@ -156,7 +156,7 @@ def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
 def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
     """Return the robust spread of specular light over the tissue's, where the tissue's colour varies by itself."""
     # By all light: the tissue's part is filled in from around where a pixel has no colour, as a dark background has.
-    sound = ~clipped & (specular + tissue > TEXTURE_LIGHT)
+    sound = ~clipped & (specular + tissue > TEXTURE_LIGHT) & (tissue > 0)
     if seen is not None:
         sound &= seen
     values = specular[::2, ::2][sound[::2, ::2]] / tissue[::2, ::2][sound[::2, ::2]]

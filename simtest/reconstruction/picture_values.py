@@ -41,12 +41,19 @@ def check_encoded(values: Image) -> None:
         raise InputError(f"frame holds values from {low:g} to {high:g}: encoded real values must lie in [0, 1]")
 
 
+CODED_GREY, COLOURED_SHARE = 2.5 / 255, 0.005
+"""Where no larger share of the pixels has channels that differ by more, a picture is grey behind a coder."""
+
+
 def is_coloured(picture: Image) -> bool:
-    """Return whether a picture has colours: three channels that are not all the same."""
+    """Return whether a picture, values in [0, 1], has colours: channels that differ by more than a coder makes of grey."""
     if picture.ndim != 3 or picture.shape[2] != 3:
         return False
     red, green, blue = cv2.split(picture)
-    return bool(np.any(red != green) or np.any(green != blue))
+    if not (np.any(red != green) or np.any(green != blue)):
+        return False
+    spread = cv2.max(cv2.max(red, green), blue) - cv2.min(cv2.min(red, green), blue)
+    return bool(np.count_nonzero(spread > CODED_GREY) > COLOURED_SHARE * spread.size)
 
 
 def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = None) -> tuple[Image, bool]:

@@ -18,11 +18,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
 from simtest.errors import BackendError, InputError
 from simtest.runtime.files import Json, write_json
 from simtest.runtime.resources import shown
+from simtest.runtime.user_cache import user_cache
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
 """What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""
@@ -182,7 +181,10 @@ def _run_probe(path: str) -> str:
 
 
 def _cache_file() -> Path:
-    return Path(platformdirs.user_cache_dir("simtest")) / "libllvm.json"
+    kept = user_cache()
+    if kept is None:
+        raise FileNotFoundError("this user has no home")
+    return kept / "libllvm.json"
 
 
 def _read_cache() -> dict[str, str]:

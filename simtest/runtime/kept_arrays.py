@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import platformdirs
 
 from simtest.runtime import provenance
 from simtest.runtime.files import write_atomically
+from simtest.runtime.user_cache import user_cache
 
 FOLDER_VARIABLE = "SIMTEST_CACHE"
 """Environment variable: the folder in which arrays are kept, or "off"."""
@@ -95,7 +95,10 @@ def cache_folder() -> Path | None:
     chosen = os.environ.get(FOLDER_VARIABLE, "")
     if chosen.lower() == OFF:
         return None
-    return Path(chosen).expanduser() if chosen else Path(platformdirs.user_cache_dir("simtest")) / "arrays"
+    if chosen:
+        return Path(chosen).expanduser()
+    kept = user_cache()
+    return None if kept is None else kept / "arrays"
 
 
 @cache

@@ -21,7 +21,7 @@ from simtest.geometry import Camera
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.falloff import CosineProfile, Profile
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
-from simtest.spec.spec_model import Coordinate, Millimetres, Spec
+from simtest.spec.spec_model import Millimetres, Spec
 
 Bound = Annotated[float, Field(ge=0, le=1e6)]
 Interval = tuple[Bound, Bound]
@@ -60,10 +60,14 @@ class SensorCalibration(Spec):
         return self
 
 
+LightCoordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+"""mm; lights of an endoscope, or of a bench, are no farther from its camera."""
+
+
 class RigCalibration(Spec):
     """What is known of the lights and of the working distance."""
 
-    lights_mm: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(
+    lights_mm: tuple[tuple[LightCoordinate, LightCoordinate, LightCoordinate], ...] = Field(
         (), max_length=32, description="positions of the lights, camera frame, mm; default not known"
     )
     distance_mm: Millimetres | None = Field(

@@ -32,7 +32,8 @@ def read_text(path: Path, kind: str) -> str:
     name = shown(path)
     check_file(path, "text_bytes", f"a {kind} file")
     try:
-        return path.read_text(encoding="utf-8")
+        # Editors on Windows begin a file with a mark of its encoding.
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"{name}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -25,6 +25,9 @@ WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
 MIN_FACES = 4
 """A tetrahedron is the smallest surface with an inside."""
 
+LEAST_SOUND = 0.5
+"""A file of whose faces a smaller share has an area was not written so."""
+
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
 
@@ -77,6 +80,8 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
         vertices, faces, repairs = repair(vertices, faces, soup=suffix == ".stl")
     if len(faces) < MIN_FACES:
         raise InputError(f"{path}: {len(faces)} of {count} faces have an area; at least {MIN_FACES} needed")
+    if len(faces) < LEAST_SOUND * count:
+        raise InputError(f"{path}: {len(faces)} of {count} faces have an area: it is damaged or cut short")
     return vertices, faces, repairs
 
 
