@@ -1,5 +1,7 @@
 """Two runs on one folder, stops by a signal, and disks that are full: one line each, and nothing lost."""
 
+import errno
+import fcntl
 import json
 import os
 import resource
@@ -87,6 +89,59 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     (tmp_path / LOCK).symlink_to(tmp_path / "mine.txt")
     refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written")
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def permission_denied(monkeypatch, denied):
+    """Let `os.open` deny what a function of its flags says: the superuser is denied nothing."""
+    opened = os.open
+
+    def checked(path, flags, *mode, **options):
+        if str(path).endswith(LOCK) and denied(flags):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, flags, *mode, **options)
+
+    monkeypatch.setattr(os, "open", checked)
+
+
+def test_a_lock_of_another_user_holds(tmp_path, monkeypatch):
+    with exclusive_folder(tmp_path):
+        permission_denied(monkeypatch, lambda flags: flags & os.O_RDWR)
+        refused(lambda: entered(exclusive_folder(tmp_path)), f"is in use by process {os.getpid()} (")
+        monkeypatch.undo()
+    # One that was left behind is taken: it keeps others out, and its own text stays.
+    (tmp_path / LOCK).write_bytes(b"left behind")
+    permission_denied(monkeypatch, lambda flags: flags & os.O_RDWR)
+    with exclusive_folder(tmp_path):
+        assert is_held(tmp_path / LOCK)
+        assert (tmp_path / LOCK).read_bytes() == b"left behind"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_another_user_that_cannot_be_read_is_refused(tmp_path, monkeypatch):
+    (tmp_path / LOCK).touch()
+    permission_denied(monkeypatch, lambda flags: True)
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (.lock is another user's", "remove it")
+    # Where nothing can be written nobody writes.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    entered(exclusive_folder(tmp_path))
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks_refuses_nobody(tmp_path, monkeypatch, number):
+    def without(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    entered(exclusive_folder(tmp_path / "a"))
+    entered(exclusive_file(tmp_path / "m.ply"))
+    assert list(tmp_path.iterdir()) == []
+    number = errno.EIO
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (Input/output error)")
+
+
+def test_a_file_in_place_of_a_folder_is_refused_with_its_option(tmp_path):
+    (tmp_path / "bank").touch()
+    refused(lambda: entered(exclusive_folder(tmp_path / "bank", "--bank")), f"--bank {tmp_path / 'bank'}: is a file")
 
 
 # Signals ----------------------------------------------------------------------------------------------------------
