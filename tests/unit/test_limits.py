@@ -11,6 +11,7 @@ from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, 
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
 from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.vtk_file import read_vtk
 from simtest.validation import runner
 from simtest.validation.cases import check_effort
@@ -142,6 +143,16 @@ def test_ply_files_are_checked_by_their_header(tmp_path, name):
     path = tmp_path / "m.ply"
     path.write_text(text)
     refused(lambda: read_mesh(path), f"{path}: ", said)
+
+
+def test_lines_of_a_ply_header_end_at_line_feeds_alone(tmp_path):
+    path = tmp_path / "m.ply"
+    odd = "comment by \u00c5sa\x0b,\x0c,\x1c,\x1d,\x1e,\x85, \u2028\nelement vertex"
+    path.write_bytes(PLY.replace("element vertex", odd, 1).encode())
+    assert read_mesh(path)[1].shape == (4, 3)
+    # Lines of Windows end with a carriage return too.
+    path.write_bytes(PLY.replace("\n", "\r\n").encode())
+    assert check_ply(path, path.stat().st_size) == (4, 4)
 
 
 def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
