@@ -20,7 +20,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import local
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
-from simtest.runtime.machine_errors import machine_problem
+from simtest.runtime.machine_errors import machine_problem, write_error
 from simtest.validation import runner
 from studies.bad_inputs import files
 from tests.refusals import refused
@@ -295,6 +295,38 @@ def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
     assert (code, len(lines)) == (2, 1)
     assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES])
+def test_full_disks_end_every_command_alike(tmp_path, number):
+    error = OSError(number, os.strerror(number), str(tmp_path / "out" / "x.png"))
+    raised = write_error(error, tmp_path / "out", "what is written stays")
+    # Another folder would do where a permission is missing; the exit codes are 2 and 1.
+    assert type(raised) is (InputError if number == errno.EACCES else SimtestError)
+    assert str(raised).startswith(f"--out {tmp_path / 'out'}: cannot be written ({tmp_path / 'out' / 'x.png'}: ")
+    assert str(raised).endswith("; what is written stays")
+
+
+def test_errors_of_files_elsewhere_do_not_blame_the_folder(tmp_path, monkeypatch):
+    def missing(*_):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "some-core")
+
+    monkeypatch.setattr(runner, "run_experiment", missing)
+    with pytest.raises(SimtestError) as error:
+        simtest.validate("overview", tmp_path / "out")
+    assert str(error.value).startswith("some-core: No such file or directory; ")
+    assert "--out" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore:no calibration")
+def test_a_full_disk_is_exit_1(tmp_path, run_here, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("simtest.reconstruction.output_files.write_json", full)
+    code, lines = run_here("reconstruct", "a.png", "--fov", "60", "--out", "out")
+    assert code == 1
+    assert lines[-1].startswith("simtest: --out out: cannot be written (No space left on device; ")
 
 
 def test_a_full_disk_in_a_worker_names_the_folder(tmp_path, monkeypatch):
