@@ -56,11 +56,13 @@ def is_disk_full(error: BaseException) -> bool:
 
 
 def lies_in(error: OSError, folder: str | Path) -> bool:
-    """Return whether an error is of a file below a folder, or names no file."""
+    """Return whether an error is of a file below a folder, or beside an output file, or names no file."""
     name = error.filename
     if not isinstance(name, str | bytes | os.PathLike):
         return True
     path, folder = Path(os.fsdecode(name)), Path(folder)
+    # A file is written under another name beside its own.
+    folder = folder if folder.is_dir() else folder.parent
     return path.absolute().is_relative_to(folder.absolute()) or path.resolve().is_relative_to(folder.resolve())
 
 

@@ -13,6 +13,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
 from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
@@ -226,6 +227,8 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
     ------
     InputError
         If the file cannot be written.
+    SimtestError
+        If its disk is full.
     """
     import trimesh  # slow to import
 
@@ -244,4 +247,4 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
     try:
         write_atomically(path, lambda part: part.write_bytes(data))
     except OSError as error:
-        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
+        raise write_error(error, path) from error

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 import simtest
@@ -21,6 +22,8 @@ from simtest.runtime.engines import local
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
 from simtest.runtime.machine_errors import machine_problem, write_error
+from simtest.surfaces.mesh_file import write_mesh
+from simtest.surfaces.model import TriangleMesh
 from simtest.validation import runner
 from studies.bad_inputs import files
 from tests.refusals import refused
@@ -305,6 +308,17 @@ def test_full_disks_end_every_command_alike(tmp_path, number):
     assert type(raised) is (InputError if number == errno.EACCES else SimtestError)
     assert str(raised).startswith(f"--out {tmp_path / 'out'}: cannot be written ({tmp_path / 'out' / 'x.png'}: ")
     assert str(raised).endswith("; what is written stays")
+
+
+def test_a_full_disk_beside_an_output_file_is_told_with_its_option(tmp_path, run_here, monkeypatch):
+    def full(part, data):
+        raise OSError(28, "No space left on device", str(part))
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    mesh = TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3]]), np.eye(4, 3))
+    with pytest.raises(SimtestError, match=r"^--out .*x\.stl: cannot be written \(.*: No space left") as error:
+        write_mesh(tmp_path / "x.stl", mesh)
+    assert error.type is SimtestError
 
 
 def test_errors_of_files_elsewhere_do_not_blame_the_folder(tmp_path, monkeypatch):
