@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.errors import InputError, SimtestError
 from simtest.runtime.lazy_names import lazy_names
-from simtest.runtime.limits import limit
+from simtest.runtime.limits import check_count
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
@@ -157,8 +156,7 @@ def sample_views(
     from simtest.simulation.view_files import ViewWriter
     from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
-    if not 1 <= count <= limit("views"):
-        raise InputError(f"count = {count}: must be 1 to {limit('views')}")
+    check_count("views", count, "count")
     described = _scene(scene, settings)
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     with exclusive_folder(Path(out)):
@@ -215,8 +213,7 @@ def validate(
     from simtest.report import write_report
     from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
-    from simtest.runtime.machine_errors import disk_problem
-    from simtest.runtime.resources import shown
+    from simtest.runtime.machine_errors import disk_problem, write_error
     from simtest.spec import Experiment, load_experiment
     from simtest.validation.runner import run_experiment
 
@@ -227,10 +224,10 @@ def validate(
             run = run_experiment(described, Path(out), command, variant, progress, chosen)
             return write_report(run.folder, progress)
         except OSError as error:
-            if (problem := disk_problem(error, Path(out))) is None:
+            if disk_problem(error) is None:
                 raise
             kept = "what is finished is kept, and the same command goes on from there"
-            raise SimtestError(f"--out {shown(out)}: cannot be written ({problem}); {kept}") from error
+            raise write_error(error, out, kept) from error
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":

@@ -40,18 +40,16 @@ def fit(
         so is a folder whose name ends in .film; any other picture is a scene of its own.
     """
     from simtest.cli.progress import progress_bar
-    from simtest.errors import InputError
     from simtest.realism.fitting.fit import fit as fitted_to
     from simtest.realism.fitting.outcome import check_out, write_fit
     from simtest.realism.fitting.parameters import one_family
     from simtest.realism.frame_sets import open_frames
-    from simtest.runtime.limits import limit
+    from simtest.runtime.limits import check_count
     from simtest.runtime.locks import exclusive_file, exclusive_folder
     from simtest.spec.dataset_recipe import load_dataset
 
     check_out(out)
-    if not 1 <= size <= limit("generated_frames"):
-        raise InputError(f"--size {size}: must be 1 to {limit('generated_frames')}")
+    check_count("generated_frames", size, "--size")
     dataset = one_family(load_dataset(recipe), scene)
     opened, kept = open_frames(frames), bank or out.with_suffix(".bank")
     with exclusive_file(out), exclusive_folder(kept, "--bank"):

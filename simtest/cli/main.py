@@ -66,8 +66,8 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 def main() -> None:
     """Run the command line.
 
-    Exit codes: 0 done, 1 could not render or a command's own verdict, 2 bad input, 130 Ctrl-C, 143 SIGTERM. Of
-    `nightly`, whose 1 is a regression, whatever else went wrong is 2.
+    Exit codes: 0 done, 1 could not render, a full disk, or a command's own verdict, 2 bad input, 130 Ctrl-C, 143
+    SIGTERM. Of `nightly`, whose 1 is a regression or an unexplained change, whatever else went wrong is 2.
     """
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     _mend_terminal()

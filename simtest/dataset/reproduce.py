@@ -8,15 +8,14 @@ from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import disk_problem
-from simtest.runtime.resources import shown
+from simtest.runtime.machine_errors import write_error
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
     """Make a sample anew and write its members as files into a folder, created if needed; return their paths.
 
     By default the dataset's Mitsuba variant renders it. Raises `InputError` if there is no such sample, or the folder
-    cannot be written.
+    cannot be written; `SimtestError` if its disk is full.
     """
     manifest = open_manifest(folder)
     plan = manifest.plan()
@@ -30,7 +29,7 @@ def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = 
                 files.append(out / f"{made.key}.{suffix}")
                 files[-1].write_bytes(data)
         except OSError as error:
-            raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
+            raise write_error(error, out) from error
     return files
 
 

@@ -29,7 +29,7 @@ from simtest.errors import InputError
 from simtest.runtime.engines import Engine, OnStep
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
-from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
@@ -148,14 +148,12 @@ def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, 
 
 @contextmanager
 def _one_line_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of the operating system into an `InputError`."""
+    """Turn errors of the operating system into an error of one line (`write_error`)."""
     try:
         yield
     except OSError as error:
-        raise InputError(
-            f"--out {shown(folder)}: cannot be written ({disk_problem(error, folder) or error}); what is written stays "
-            "valid, and the same command goes on from there"
-        ) from error
+        kept = "what is written stays valid, and the same command goes on from there"
+        raise write_error(error, folder, kept) from error
 
 
 def _open(folder: Path, plan: Plan, variant: str) -> Manifest:

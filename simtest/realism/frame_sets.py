@@ -12,7 +12,7 @@ from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
 from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.limits import limit
+from simtest.runtime.limits import check_count
 from simtest.runtime.resources import shown
 from simtest.spec.scene import Scene, load_scene
 
@@ -109,8 +109,7 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     InputError
         If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
-    if not 1 <= count <= limit("generated_frames"):
-        raise InputError(f"--count {count}: must be 1 to {limit('generated_frames')}")
+    check_count("generated_frames", count, "--count")
     if not against.strip():
         raise InputError("--against is empty; must be a dataset's folder, a folder of pictures, or a scene")
     path = Path(against)

@@ -15,12 +15,15 @@ from PIL import Image as PillowImage
 from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.limits import check_file, check_limit, check_picture_size
 from simtest.runtime.quiet import quiet_libraries
 from simtest.runtime.resources import shown
 
 PATIENCE_MS = 5000
 """After so long FFmpeg gives up opening a film, or reading a frame."""
+
+MOST_BITS = 96
+"""Of a pixel, for which the limit of pixels is meant: three channels of 32 bits."""
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
@@ -61,7 +64,7 @@ def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
         raise InputError(f"{shown(path)}: cannot be decoded ({str(error).splitlines()[0][:120]})") from error
     if picture is None:
         raise InputError(f"{shown(path)}: no picture ({data.size} bytes); must be PNG, JPEG, BMP or TIFF")
-    _check_size(path, picture.shape[1], picture.shape[0])
+    check_picture_size(path, picture.shape[1], picture.shape[0])
     return np.asarray(picture)
 
 
@@ -73,6 +76,7 @@ def _check_header(path: Path) -> None:
             warnings.simplefilter("ignore")
             with PillowImage.open(path) as header:
                 (width, height), animated = header.size, bool(getattr(header, "is_animated", False))
+                bits = 0  # Of what Pillow knows none takes more.
     except PillowImage.DecompressionBombError as error:
         # Beyond a limit of its own Pillow tells the size in words alone.
         pixels = re.search(r"\d+", str(error))
@@ -80,30 +84,34 @@ def _check_header(path: Path) -> None:
         return
     except Exception:
         # OpenCV reads more than Pillow, whose parsers raise whatever they run into, and says what is wrong with others.
-        width, height = _tiff_size(path)
+        width, height, bits = _tiff_size(path)
         animated = False
-    _check_size(path, width, height)
+    check_picture_size(path, width, height)
+    # Floats of several channels may need more memory than the pixels alone tell.
+    share = bits / MOST_BITS
+    check_limit("picture_pixels", width * height * share, f"{path}: {bits} bits a pixel", f"times {MOST_BITS} bits")
     if animated:
         warnings.warn(f"{shown(path)}: holds several pictures; the first is used", stacklevel=4)
 
 
-def _tiff_size(path: Path) -> tuple[int, int]:
-    """Return the size that a TIFF file announces whose pixels Pillow does not know; 0, 0 where it is none."""
+def _tiff_size(path: Path) -> tuple[int, int, int]:
+    """Return width, height and bits a pixel of a TIFF file that Pillow does not know; zeros where it is none."""
     from PIL import TiffImagePlugin
 
     try:
         with path.open("rb") as file:
-            tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+            head = file.read(16)
+            if 43 in head[2:4]:
+                # A BigTIFF: its header has 16 bytes; Pillow knows it by the little-endian one alone.
+                tags = TiffImagePlugin.ImageFileDirectory_v2(b"II\x2b\0" + head[4:], prefix=head[:2])
+            else:
+                tags = TiffImagePlugin.ImageFileDirectory_v2(head[:8])
             file.seek(tags.next)
             tags.load(file)
-            return int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH])
+            width, height = int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH])
+            return width, height, sum(tags.get(TiffImagePlugin.BITSPERSAMPLE, (1,)))
     except Exception:
-        return 0, 0
-
-
-def _check_size(path: Path, width: int, height: int) -> None:
-    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
-    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
+        return 0, 0, 0
 
 
 @dataclass(frozen=True)
@@ -204,7 +212,7 @@ def open_source(path: Path) -> Source:
     keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
     width, height, count = (int(capture.get(key)) for key in keys)
     capture.release()
-    _check_size(path, width, height)
+    check_picture_size(path, width, height)
     return Source(path, max(count, 1))
 
 

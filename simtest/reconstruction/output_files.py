@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from simtest.errors import Failure, InputError
+from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.reconstruction.constraints import constraints_arrays, constraints_json
@@ -19,8 +19,7 @@ from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import disk_problem
-from simtest.runtime.resources import shown
+from simtest.runtime.machine_errors import write_error
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
@@ -42,7 +41,8 @@ def write_outputs(
 ) -> list[Path]:
     """Write what was reconstructed in a picture, its overlay and its page; return the files.
 
-    The folder is made if need be; `InputError` is raised where it cannot be written. A specularity's points and arrow
+    The folder is made if need be; `InputError` is raised where it cannot be written,
+    `SimtestError` where its disk is full. A specularity's points and arrow
     stand at its depth, mm, by default at 1.
     """
     spots, camera = record.specularities, record.camera
@@ -63,7 +63,7 @@ def write_outputs(
         write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
         write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
+        raise write_error(error, out) from error
     return [out / name for name in FILES]
 
 

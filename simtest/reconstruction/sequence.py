@@ -20,7 +20,7 @@ from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
 from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
@@ -201,5 +201,5 @@ def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[P
         write_json(files[1], tracks, compact=True)
         write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
+        raise write_error(error, out) from error
     return files

@@ -10,7 +10,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_limit
+from simtest.runtime.limits import check_picture_size
 from simtest.runtime.resources import shown
 
 HEADER_BYTES = 65536
@@ -76,5 +76,4 @@ def _check_size(path: Path) -> None:
     width, height = right - left + 1, bottom - top + 1
     if width < 1 or height < 1:
         raise InputError(f"{shown(path)}: {width} x {height} px; must be 1 px or more along each side")
-    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
-    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
+    check_picture_size(path, width, height)

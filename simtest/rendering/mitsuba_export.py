@@ -19,6 +19,7 @@ from simtest.rendering.shapes import make_shape
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
+from simtest.runtime.machine_errors import write_error
 from simtest.spec import Scene
 from simtest.spec.falloff import CosineProfile
 from simtest.spec.light_source import DiscSource
@@ -83,9 +84,10 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
             mesh = make_shape(mi, shape, {"type": "diffuse"})
             write_atomically(files[1], lambda part: mesh.write_ply(str(part)))
         write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
-    except (OSError, RuntimeError) as error:
-        cause = getattr(error, "strerror", None) or error
-        raise InputError(f"--out {out}: cannot be written ({cause})") from error
+    except OSError as error:
+        raise write_error(error, out) from error
+    except RuntimeError as error:
+        raise InputError(f"--out {out}: cannot be written ({error})") from error
     return files
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import limit
+from simtest.runtime.limits import VARIABLE, limit
 from simtest.runtime.resources import shown
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -46,7 +46,8 @@ def require_plain(path: Path, limited_by: str | None = None) -> Path:
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.ENXIO, "is no plain file", str(path))
     if limited_by is not None and found.st_size > limit(limited_by):
-        raise OSError(errno.EFBIG, f"{found.st_size} bytes; at most {limit(limited_by)} are allowed", str(path))
+        told = f"at most {limit(limited_by)} are allowed ({VARIABLE}={limited_by}=N sets another limit)"
+        raise OSError(errno.EFBIG, f"{found.st_size} bytes; {told}", str(path))
     return path
 
 

@@ -18,12 +18,12 @@ DEFAULTS = {
     "text_bytes": 1_000_000,  # TOML, YAML, XML, JSON
     "matlab_bytes": 50_000_000,
     "picture_bytes": 250_000_000,
-    "film_bytes": 5_000_000_000,
-    "mesh_bytes": 400_000_000,  # five million faces, binary or as text
+    "film_bytes": 100_000_000_000,  # read frame by frame: hours of lossless video
+    "mesh_bytes": 1_500_000_000,  # five million faces: an STL of text takes about 250 bytes a face, others less
     "manifest_bytes": 100_000_000,
     "record_bytes": 20_000_000,  # JSON that a run has written
     # pictures and frames, px
-    "picture_pixels": 40_000_000,  # 8K has 33 million; every map of a picture takes 8 bytes a pixel
+    "picture_pixels": 100_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
     "picture_side": 16_384,
     "frame_pixels": 20_000_000,
     "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples
@@ -67,6 +67,30 @@ def check_limit(name: str, value: float, where: object, unit: str, hint: str = "
             f"{shown(where)}: {_number(value)} {unit}; at most {_number(most)} are allowed"
             f"{hint and f': {hint}'} ({VARIABLE}={name}=N sets another limit)"
         )
+
+
+def check_count(name: str, value: object, where: str) -> None:
+    """Raise `InputError` unless a value is a whole number from 1 to a limit.
+
+    Parameters
+    ----------
+    name : str
+        Of the limit.
+    value : object
+        To be checked.
+    where : str
+        Key or option, for the message.
+    """
+    most = limit(name)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        joined = f"{where} {value!r}" if where.startswith("--") else f"{where} = {value!r}"
+        raise InputError(f"{joined}: must be 1 to {most} ({VARIABLE}={name}=N sets another limit)")
+
+
+def check_picture_size(path: Path, width: int, height: int) -> None:
+    """Raise `InputError` where a picture has more pixels, or a longer side, than allowed."""
+    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
+    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
 
 
 def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:

@@ -44,7 +44,7 @@ def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
     InputError
         If another run is at work in the folder: the message names its process. If the folder cannot be made.
     """
-    made = _missing(folder)
+    made = _missing(folder, option)
     make_folder(folder, option)
     try:
         with _exclusive(folder / LOCK, f"{option} {shown(folder)}"):
@@ -73,12 +73,17 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
         file = _open(lock)
     except OSError as error:
         # Where nothing can be written nobody writes; a finished run can still be looked at.
-        if error.errno not in _WITHOUT_LOCKS:
-            raise InputError(f"{what}: cannot be written ({error.strerror})") from error
+        _require_without_locks(error, what)
         yield
         return
     with file:
-        if not _taken(lock, file):
+        try:
+            taken = _taken(lock, file)
+        except OSError as error:
+            # A file system without locks refuses nobody.
+            _require_without_locks(error, what)
+            taken = True
+        if not taken:
             raise InputError(f"{what}: is in use by {_holder(lock)}; wait until it ends, or name another")
         try:
             with contextlib.suppress(OSError):
@@ -88,20 +93,48 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
             yield
         finally:
             # While it is held: whoever waits for the file finds that it is no longer the one of this name.
-            lock.unlink(missing_ok=True)
+            # In a folder such as /tmp another user's file stays; without its lock it locks nothing.
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
+
+
+def _require_without_locks(error: OSError, what: str) -> None:
+    """Raise `InputError` unless an error says that nothing can be locked, or written, at this place."""
+    if error.errno not in _WITHOUT_LOCKS:
+        raise InputError(f"{what}: cannot be written ({error.strerror})") from error
 
 
 def _open(lock: Path) -> IO[bytes]:
+    """Open a lock file, made if need be; only to read where it is another user's in a folder that both may write to.
+
+    Raises `OSError` if it cannot be opened, with EBUSY where another user's file cannot even be read.
+    """
     # Not followed where it is a link, and never waited for where it is a pipe.
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    return os.fdopen(os.open(lock, flags, 0o644), "r+b")
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    writing = flags | os.O_RDWR | os.O_CREAT
+    try:
+        return os.fdopen(os.open(lock, writing, 0o644), "r+b")
+    except PermissionError:
+        if not os.access(lock.parent, os.W_OK):
+            raise
+    try:
+        return os.fdopen(os.open(lock, flags | os.O_RDONLY), "rb")
+    except FileNotFoundError:
+        # Just given back, or nothing may be made here.
+        return os.fdopen(os.open(lock, writing, 0o644), "r+b")
+    except PermissionError as error:
+        told = f"{lock.name} is another user's and cannot be read; remove it where no run is at work"
+        raise OSError(errno.EBUSY, told) from error
 
 
 def _taken(lock: Path, file: IO[bytes]) -> bool:
-    """Lock an open file without waiting; return whether that worked and it still is the file of its name."""
+    """Lock an open file without waiting; return whether that worked and it still is the file of its name.
+
+    Raises `OSError` where the file system knows no locks.
+    """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return False
     return is_same(lock, file)
 
@@ -162,9 +195,9 @@ def _holder(lock: Path) -> str:
         return "another process"
 
 
-def _missing(folder: Path) -> list[Path]:
+def _missing(folder: Path, option: str) -> list[Path]:
     """Return the folders that must be made for a folder to be there, the innermost first."""
-    refuse_file(folder)
+    refuse_file(folder, option)
     missing = []
     for path in (folder, *folder.parents):
         try:

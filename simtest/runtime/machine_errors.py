@@ -1,10 +1,12 @@
 """Errors of the machine, of disk and memory, as one line that names what ran out and what can be done."""
 
 import errno
+import os
 import re
 import shutil
 from pathlib import Path
 
+from simtest.errors import InputError, SimtestError
 from simtest.runtime.resources import shown
 
 _OF_THE_DISK = {
@@ -21,9 +23,7 @@ def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
 
     `near` is a path on the same disk, for errors that name no file.
     """
-    number = error.errno if isinstance(error, OSError) else None
-    if number is None and (found := _OS_ERROR.search(str(error))):
-        number = int(found[1])
+    number = _number(error)
     if number not in _OF_THE_DISK:
         return None
     name = getattr(error, "filename", None)
@@ -31,9 +31,39 @@ def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
     file = f"{shown(name, 200)}: " if name else ""
     if number in (errno.ENOSPC, errno.EDQUOT):
         return f"{file}{what}" + (f"; {_free(path)}" if (path := name or near) is not None else "")
-    if number == errno.EFBIG:
+    # A limit of ours (`require_plain`) has the same number, and says so in its text.
+    if number == errno.EFBIG and os.strerror(errno.EFBIG) in what:
         return f"{file}{what}; the system limits the size of a file (ulimit -f)"
     return f"{file}{what}"
+
+
+def write_error(error: OSError, out: str | Path, kept: str = "") -> SimtestError:
+    """Return the error, for a user, that came up while `--out` was written; `kept` says what stays of it.
+
+    It is an `InputError` where another folder would do, and a plain `SimtestError` where the disk is full or fails, or
+    the error is of a file elsewhere: an input that has gone, or a program that is missing, is no fault of the folder.
+    """
+    told = disk_problem(error, Path(out)) or error
+    if not lies_in(error, out):
+        return SimtestError(f"{told}{kept and f'; {kept}'}")
+    kind = SimtestError if is_disk_full(error) else InputError
+    return kind(f"--out {shown(out)}: cannot be written ({told}){kept and f'; {kept}'}")
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Return whether an error says that a disk is full, or fails."""
+    return _number(error) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+def lies_in(error: OSError, folder: str | Path) -> bool:
+    """Return whether an error is of a file below a folder, or beside an output file, or names no file."""
+    name = error.filename
+    if not isinstance(name, str | bytes | os.PathLike):
+        return True
+    path, folder = Path(os.fsdecode(name)), Path(folder)
+    # A file is written under another name beside its own.
+    folder = folder if folder.is_dir() else folder.parent
+    return path.absolute().is_relative_to(folder.absolute()) or path.resolve().is_relative_to(folder.resolve())
 
 
 def machine_problem(error: BaseException) -> str | None:
@@ -44,6 +74,14 @@ def machine_problem(error: BaseException) -> str | None:
     if isinstance(error, RecursionError):
         return "a value is nested too deeply"
     return disk_problem(error)
+
+
+def _number(error: BaseException) -> int | None:
+    """Return the number that the system gave to an error."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None and (found := _OS_ERROR.search(str(error))):
+        number = int(found[1])
+    return number
 
 
 def _free(name: str | Path) -> str:

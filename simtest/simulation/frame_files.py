@@ -9,14 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, Response
-from simtest.errors import InputError
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
 from simtest.runtime.array_files import write_arrays
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import disk_problem
-from simtest.runtime.resources import shown
+from simtest.runtime.machine_errors import write_error
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
@@ -68,7 +66,8 @@ MOTION_FIELD = (
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml and calibration.toml.
 
-    The folder is made if need be; `InputError` is raised if it cannot be written. Returns the files.
+    The folder is made if need be; `InputError` is raised if it cannot be written,
+    `SimtestError` if its disk is full. Returns the files.
     """
     names = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml")
     files = [out / name for name in names]
@@ -82,7 +81,7 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
         write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"--out {shown(out)}: cannot be written ({disk_problem(error, out) or error})") from error
+        raise write_error(error, out) from error
     return files
 
 

@@ -9,15 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
 from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.repair import Repairs, repair
-from simtest.surfaces.vtk_file import read_vtk
+from simtest.surfaces.vtk_file import check_indices, read_vtk
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")
@@ -62,7 +63,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     try:
         with _quiet():
             vertices, faces = read_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
-    except InputError:
+    except SimtestError:
         raise
     except Exception as error:
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
@@ -165,12 +166,6 @@ def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
     return vertices, np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
 
 
-def _check_indices(path: Path, indices: IntArray, count: int) -> None:
-    if len(indices) and not (indices.min() >= 0 and indices.max() < count):
-        wrong = indices.max() if indices.max() >= count else indices.min()
-        raise InputError(f"{path}: a face names vertex {wrong}; allowed: 0 to {count - 1}")
-
-
 def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
     # shapes and counts
     if vertices.ndim != 2 or vertices.shape[-1] != 3 or not len(vertices):
@@ -183,7 +178,7 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         raise InputError(f"{path}: {len(faces)} face{'s'[: len(faces) != 1]}; at least {MIN_FACES} are needed")
     check_limit("mesh_faces", len(faces), path, "faces", "decimate the mesh")
     # values
-    _check_indices(path, faces.ravel(), len(vertices))
+    check_indices(faces.ravel(), len(vertices), f"{path}: ")
     if not np.isfinite(vertices).all():
         row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         values = ", ".join(f"{x:g}" for x in vertices[row])
@@ -237,6 +232,8 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
     ------
     InputError
         If the file cannot be written.
+    SimtestError
+        If its disk is full.
     """
     import trimesh  # slow to import
 
@@ -255,4 +252,4 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
     try:
         write_atomically(path, lambda part: part.write_bytes(data))
     except OSError as error:
-        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
+        raise write_error(error, path) from error

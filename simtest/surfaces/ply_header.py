@@ -89,7 +89,8 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
 def _parse(text: str, where: str) -> tuple[str, list[_Element]]:
     """Return the format and the elements that a header announces."""
     kind, elements = "", list[_Element]()
-    for line in text.splitlines()[1:]:
+    # Not by splitlines: in Latin-1 it also ends lines at bytes of UTF-8 text, such as 0x85 of a capital A with a ring.
+    for line in (line.rstrip("\r") for line in text.split("\n")[1:]):
         words = line.split()
         match words[:1]:
             case ["format"]:

@@ -3,6 +3,7 @@
 python -m simtest.surfaces.vtk_file MESH.vtk OUT.npz
 """
 
+import signal
 import subprocess
 import sys
 import tempfile
@@ -10,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.machine_errors import disk_problem, machine_problem
 from simtest.runtime.resources import shown
 
 TIMEOUT_S = 300
 REFUSED = 3
 """Exit code of a file that is refused; the last line of the output says why."""
+FAILED = 4
+"""Exit code where the machine lacks memory or room on its disk; the last line of the output says which."""
 
 
 def read_vtk(path: Path) -> tuple[Array, IntArray]:
@@ -32,6 +36,8 @@ def read_vtk(path: Path) -> tuple[Array, IntArray]:
     ------
     InputError
         If the file is no such mesh, or VTK breaks down over it.
+    SimtestError
+        If memory, or the disk of temporary files, does not hold it.
     """
     with tempfile.TemporaryDirectory() as scratch:
         made = Path(scratch) / "mesh.npz"
@@ -44,6 +50,11 @@ def read_vtk(path: Path) -> tuple[Array, IntArray]:
         if child.returncode == 0:
             with np.load(made, allow_pickle=False) as arrays:
                 return arrays["vertices"], arrays["faces"]
+    # What the machine did is no damage of the file.
+    if child.returncode == -signal.SIGKILL:
+        raise SimtestError(f"{shown(path)}: VTK was killed while it read the file, mostly for want of memory")
+    if child.returncode == FAILED:
+        raise SimtestError(f"{shown(path)}: {(child.stdout.strip().splitlines() or ['not read'])[-1]}")
     said = (child.stdout.strip().splitlines() or [""])[-1] if child.returncode == REFUSED else ""
     raise InputError(f"{shown(path)}: {said or 'damaged: VTK breaks down over its points or cells'}")
 
@@ -57,21 +68,22 @@ def _triangles(path: str) -> tuple[Array, IntArray]:
     vtkObject.GlobalWarningDisplayOff()
     data = pyvista.read(path)
     if isinstance(data, pyvista.UnstructuredGrid):
-        _check(np.asarray(data.cell_connectivity), data.n_points)
+        check_indices(np.asarray(data.cell_connectivity), data.n_points)
         data = data.extract_surface(algorithm="dataset_surface")
     if not isinstance(data, pyvista.PolyData):
         raise InputError(f"a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
     # VTK's filters trust the indices, so they are checked first.
     for cells in (data.GetPolys(), data.GetStrips()):
-        _check(pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
+        check_indices(pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
     data = data.triangulate()
     return np.array(data.points, dtype=np.float64), np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
 
 
-def _check(indices: IntArray, count: int) -> None:
+def check_indices(indices: IntArray, count: int, where: str = "") -> None:
+    """Raise `InputError` where a corner of a face, of shape (N,), is none of `count` vertices; `where` begins it."""
     if len(indices) and not (indices.min() >= 0 and indices.max() < count):
         wrong = indices.max() if indices.max() >= count else indices.min()
-        raise InputError(f"a face names vertex {wrong}; allowed: 0 to {count - 1}")
+        raise InputError(f"{where}a face names vertex {wrong}; allowed: 0 to {count - 1}")
 
 
 def main() -> int:
@@ -81,11 +93,18 @@ def main() -> int:
     except InputError as error:
         print(error)
         return REFUSED
+    except MemoryError as error:
+        print(machine_problem(error))
+        return FAILED
     except Exception as error:
         # The reader raises whatever it runs into; the file is at fault.
         print(f"not a readable VTK mesh ({' '.join(str(error).split())[:160] or type(error).__name__})")
         return REFUSED
-    np.savez(sys.argv[2], vertices=vertices, faces=faces)
+    try:
+        np.savez(sys.argv[2], vertices=vertices, faces=faces)
+    except OSError as error:
+        print(f"its triangles cannot be stored ({disk_problem(error, Path(sys.argv[2])) or error})")
+        return FAILED
     return 0
 
 

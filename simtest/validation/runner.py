@@ -23,6 +23,7 @@ from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json, require_plain, write_atomically, write_json
 from simtest.runtime.locks import LOCK
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
@@ -391,7 +392,7 @@ def _prepare(folder: Path, digest: str) -> None:
         (folder / "gallery").mkdir(exist_ok=True)
         write_json(record, digest)
     except OSError as error:
-        raise InputError(f"--out {shown(folder)}: cannot be written ({error.strerror})") from error
+        raise write_error(error, folder) from error
 
 
 def _told_digest(record: Path) -> str:

@@ -402,8 +402,10 @@ def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
         write_sample(file, key, members)
 
     monkeypatch.setattr("simtest.dataset.shard_writer.write_sample", full)
-    with pytest.raises(InputError, match=r"\(No space left on device; .* are free .*\); what is written stays valid"):
+    said = r"\(No space left on device; .* are free .*\); what is written stays valid"
+    with pytest.raises(SimtestError, match=said) as error:
         write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
+    assert error.type is SimtestError
     monkeypatch.undo()
     write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
     assert contents(tmp_path / "full") == contents(made)

@@ -1,16 +1,31 @@
 """Limits of inputs: refused at once, with what is allowed and how to allow more."""
 
 import os
+import signal
+import struct
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from simtest.reconstruction.image_io import read_picture
+from simtest.api import sample_views
+from simtest.cli.fit import fit
+from simtest.dataset.manifest import ManifestError, read_manifest
+from simtest.errors import InputError, SimtestError
+from simtest.realism.frame_sets import open_generated
+from simtest.reconstruction.image_io import _tiff_size, read_picture
+from simtest.runtime.engines.engine import check_workers
+from simtest.runtime.files import require_plain
 from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, limit
+from simtest.runtime.machine_errors import disk_problem
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
+from simtest.surfaces import vtk_file
 from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.vtk_file import read_vtk
 from simtest.validation import runner
 from simtest.validation.cases import check_effort
@@ -61,7 +76,7 @@ def test_what_is_no_plain_file_is_refused_without_opening_it(tmp_path):
     refused(lambda: check_file(tmp_path / ("n" * 300), "text_bytes", "a TOML file"), "File name too long")
 
 
-@pytest.mark.parametrize(("width", "height"), [(10_000, 9_999), (65_500, 1), (1, 65_500)])
+@pytest.mark.parametrize(("width", "height"), [(10_001, 10_000), (65_500, 1), (1, 65_500)])
 def test_large_pictures_are_refused_by_their_header(tmp_path, width, height):
     path = tmp_path / "x.png"
     path.write_bytes(files.png(width, height, b""))
@@ -74,6 +89,68 @@ def test_tiff_of_pixels_that_pillow_does_not_know_is_refused_by_its_header(tmp_p
     path.write_bytes(files.encoded(".tif", np.zeros((48, 64, 3), np.float32)))
     monkeypatch.setenv(VARIABLE, "picture_pixels=3000")
     refused(lambda: read_picture(path), "x.tif: 64 x 48 px: 3072 px; at most 3000 are allowed")
+    monkeypatch.setenv(VARIABLE, "picture_pixels=5000")
+    path.write_bytes(files.encoded(".tif", np.zeros((48, 64, 3), np.float64)))
+    refused(lambda: read_picture(path), "x.tif: 192 bits a pixel: 6144 times 96 bits; at most 5000 are allowed (")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_big_tiff_is_refused_by_its_header(tmp_path, monkeypatch, order):
+    # Width, height and three channels of 32 bits: their values stand in the entries, the bits' as 16-bit numbers.
+    tags = [(256, 4, 1, struct.pack(order + "L4x", 64)), (257, 4, 1, struct.pack(order + "L4x", 48)),
+            (258, 3, 3, struct.pack(order + "3H2x", 32, 32, 32))]  # fmt: skip
+    head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HHHQQ", 43, 8, 0, 16, len(tags))
+    path = tmp_path / "x.tif"
+    path.write_bytes(head + b"".join(struct.pack(order + "HHQ8s", *tag) for tag in tags) + bytes(8))
+    assert _tiff_size(path) == (64, 48, 96)
+    monkeypatch.setenv(VARIABLE, "picture_pixels=3000")
+    refused(lambda: read_picture(path), "x.tif: 64 x 48 px: 3072 px; at most 3000 are allowed")
+    head = struct.pack("<2sHL", b"II", 42, 8)
+    path.write_bytes(head + struct.pack("<HHHLHHHHLHHL", 2, 256, 3, 1, 64, 0, 257, 3, 1, 48, 0, 0))
+    assert _tiff_size(path) == (64, 48, 1)
+
+
+def test_a_picture_of_99_megapixels_passes_the_limits(tmp_path):
+    path = tmp_path / "x.png"
+    path.write_bytes(files.png(9_999, 9_900, b""))
+    # What is wrong with it are its missing pixels.
+    refused(lambda: read_picture(path), "x.png: no picture (")
+    sizes = {"mesh_bytes": 248 * 5_000_000, "film_bytes": 50 * 10**9, "picture_pixels": 99_000_000}
+    for name, size in sizes.items():
+        check_limit(name, size, "x", "units")
+
+
+@pytest.mark.parametrize(
+    ("name", "call", "said"),
+    [
+        ("workers", lambda: check_workers(257), "workers = 257: must be 1 to 256"),
+        ("workers", lambda: check_workers(True), "workers = True: must be 1 to 256"),
+        ("workers", lambda: check_workers(2.0), "workers = 2.0: must be 1 to 256"),
+        ("views", lambda: sample_views("anatomy", "out", 1001), "count = 1001: must be 1 to 1000"),
+        ("generated_frames", lambda: open_generated("plane", 0), "--count 0: must be 1 to 10000"),
+        (
+            "generated_frames",
+            lambda: fit([Path("a.png")], recipe="tiny", out=Path("x.toml"), size=10_001),
+            "--size 10001: must be 1 to 10000",
+        ),
+    ],
+)
+def test_counts_of_work_are_refused_with_the_limit_s_name(tmp_path, monkeypatch, name, call, said):
+    monkeypatch.chdir(tmp_path)
+    refused(call, f"{said} ({VARIABLE}={name}=N sets another limit)")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_large_records_are_refused_with_the_limit_s_name(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "manifest_bytes=3,record_bytes=3")
+    (tmp_path / "manifest.json").write_text("{   }")
+    with pytest.raises(ManifestError, match=rf"manifest.json: 5 bytes; .* \({VARIABLE}=manifest_bytes=N sets another"):
+        read_manifest(tmp_path)
+    with pytest.raises(OSError, match="at most 3 are allowed") as error:
+        require_plain(tmp_path / "manifest.json", "record_bytes")
+    told = f"5 bytes; at most 3 are allowed ({VARIABLE}=record_bytes=N sets another limit)"
+    # The system's limit (ulimit -f) has nothing to do with it.
+    assert disk_problem(error.value) == f"{tmp_path / 'manifest.json'}: {told}"
 
 
 @pytest.mark.parametrize(("kind", "suffix"), [("PNG", "png"), ("WEBP", "webp"), ("TIFF", "tif"), ("GIF", "gif")])
@@ -144,6 +221,16 @@ def test_ply_files_are_checked_by_their_header(tmp_path, name):
     refused(lambda: read_mesh(path), f"{path}: ", said)
 
 
+def test_lines_of_a_ply_header_end_at_line_feeds_alone(tmp_path):
+    path = tmp_path / "m.ply"
+    odd = "comment by \u00c5sa\x0b,\x0c,\x1c,\x1d,\x1e,\x85, \u2028\nelement vertex"
+    path.write_bytes(PLY.replace("element vertex", odd, 1).encode())
+    assert read_mesh(path)[1].shape == (4, 3)
+    # Lines of Windows end with a carriage return too.
+    path.write_bytes(PLY.replace("\n", "\r\n").encode())
+    assert check_ply(path, path.stat().st_size) == (4, 4)
+
+
 def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
     path = tmp_path / "m.vtk"
     path.write_text(files.vtk())
@@ -152,6 +239,30 @@ def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
     refused(lambda: read_mesh(path), f"{path}: damaged: VTK breaks down")
     path.write_text(files.vtk().replace("POINTS 4", "POINTS 9000000000"))
     refused(lambda: read_mesh(path), "POINTS 9000000000: the file has", "too few for them")
+
+
+def test_what_the_machine_lacks_is_no_damage_of_a_vtk_file(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "m.vtk"
+    path.write_text(files.vtk())
+
+    def ended(code, said=""):
+        monkeypatch.setattr(subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, code, said))
+        with pytest.raises(SimtestError) as error:
+            read_mesh(path)
+        return error
+
+    killed = ended(-signal.SIGKILL)
+    assert str(killed.value) == f"{path}: VTK was killed while it read the file, mostly for want of memory"
+    assert killed.type is SimtestError
+    assert ended(-signal.SIGSEGV).type is InputError
+    # In VTK's process: no room for the triangles, no memory.
+    monkeypatch.setattr(sys, "argv", ["vtk_file", str(path), str(tmp_path / "none" / "out.npz")])
+    code, said = vtk_file.main(), capsys.readouterr().out
+    full = ended(code, said)
+    assert full.type is SimtestError
+    assert str(full.value).startswith(f"{path}: its triangles cannot be stored ({tmp_path / 'none' / 'out.npz'}: No")
+    monkeypatch.setattr(vtk_file, "_triangles", lambda _: np.empty(2**58))
+    assert str(ended(vtk_file.main(), capsys.readouterr().out).value).startswith(f"{path}: not enough memory (")
 
 
 def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):

@@ -1,5 +1,7 @@
 """Two runs on one folder, stops by a signal, and disks that are full: one line each, and nothing lost."""
 
+import errno
+import fcntl
 import json
 import os
 import resource
@@ -9,6 +11,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 import simtest
@@ -18,7 +21,9 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import local
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
-from simtest.runtime.machine_errors import machine_problem
+from simtest.runtime.machine_errors import machine_problem, write_error
+from simtest.surfaces.mesh_file import write_mesh
+from simtest.surfaces.model import TriangleMesh
 from simtest.validation import runner
 from studies.bad_inputs import files
 from tests.refusals import refused
@@ -87,6 +92,59 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     (tmp_path / LOCK).symlink_to(tmp_path / "mine.txt")
     refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written")
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def permission_denied(monkeypatch, denied):
+    """Let `os.open` deny what a function of its flags says: the superuser is denied nothing."""
+    opened = os.open
+
+    def checked(path, flags, *mode, **options):
+        if str(path).endswith(LOCK) and denied(flags):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, flags, *mode, **options)
+
+    monkeypatch.setattr(os, "open", checked)
+
+
+def test_a_lock_of_another_user_holds(tmp_path, monkeypatch):
+    with exclusive_folder(tmp_path):
+        permission_denied(monkeypatch, lambda flags: flags & os.O_RDWR)
+        refused(lambda: entered(exclusive_folder(tmp_path)), f"is in use by process {os.getpid()} (")
+        monkeypatch.undo()
+    # One that was left behind is taken: it keeps others out, and its own text stays.
+    (tmp_path / LOCK).write_bytes(b"left behind")
+    permission_denied(monkeypatch, lambda flags: flags & os.O_RDWR)
+    with exclusive_folder(tmp_path):
+        assert is_held(tmp_path / LOCK)
+        assert (tmp_path / LOCK).read_bytes() == b"left behind"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_of_another_user_that_cannot_be_read_is_refused(tmp_path, monkeypatch):
+    (tmp_path / LOCK).touch()
+    permission_denied(monkeypatch, lambda flags: True)
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (.lock is another user's", "remove it")
+    # Where nothing can be written nobody writes.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    entered(exclusive_folder(tmp_path))
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks_refuses_nobody(tmp_path, monkeypatch, number):
+    def without(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    entered(exclusive_folder(tmp_path / "a"))
+    entered(exclusive_file(tmp_path / "m.ply"))
+    assert list(tmp_path.iterdir()) == []
+    number = errno.EIO
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (Input/output error)")
+
+
+def test_a_file_in_place_of_a_folder_is_refused_with_its_option(tmp_path):
+    (tmp_path / "bank").touch()
+    refused(lambda: entered(exclusive_folder(tmp_path / "bank", "--bank")), f"--bank {tmp_path / 'bank'}: is a file")
 
 
 # Signals ----------------------------------------------------------------------------------------------------------
@@ -240,6 +298,49 @@ def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
     assert (code, len(lines)) == (2, 1)
     assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES])
+def test_full_disks_end_every_command_alike(tmp_path, number):
+    error = OSError(number, os.strerror(number), str(tmp_path / "out" / "x.png"))
+    raised = write_error(error, tmp_path / "out", "what is written stays")
+    # Another folder would do where a permission is missing; the exit codes are 2 and 1.
+    assert type(raised) is (InputError if number == errno.EACCES else SimtestError)
+    assert str(raised).startswith(f"--out {tmp_path / 'out'}: cannot be written ({tmp_path / 'out' / 'x.png'}: ")
+    assert str(raised).endswith("; what is written stays")
+
+
+def test_a_full_disk_beside_an_output_file_is_told_with_its_option(tmp_path, run_here, monkeypatch):
+    def full(part, data):
+        raise OSError(28, "No space left on device", str(part))
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    mesh = TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3]]), np.eye(4, 3))
+    with pytest.raises(SimtestError, match=r"^--out .*x\.stl: cannot be written \(.*: No space left") as error:
+        write_mesh(tmp_path / "x.stl", mesh)
+    assert error.type is SimtestError
+
+
+def test_errors_of_files_elsewhere_do_not_blame_the_folder(tmp_path, monkeypatch):
+    def missing(*_):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "some-core")
+
+    monkeypatch.setattr(runner, "run_experiment", missing)
+    with pytest.raises(SimtestError) as error:
+        simtest.validate("overview", tmp_path / "out")
+    assert str(error.value).startswith("some-core: No such file or directory; ")
+    assert "--out" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore:no calibration")
+def test_a_full_disk_is_exit_1(tmp_path, run_here, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("simtest.reconstruction.output_files.write_json", full)
+    code, lines = run_here("reconstruct", "a.png", "--fov", "60", "--out", "out")
+    assert code == 1
+    assert lines[-1].startswith("simtest: --out out: cannot be written (No space left on device; ")
 
 
 def test_a_full_disk_in_a_worker_names_the_folder(tmp_path, monkeypatch):

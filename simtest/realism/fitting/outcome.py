@@ -13,6 +13,7 @@ from simtest.realism.fitting.fit import FittedRecipe
 from simtest.realism.fitting.parameters import KNOWN
 from simtest.realism.fitting.summaries import NAMES
 from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.toml_files import toml_value
@@ -34,7 +35,7 @@ def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
         write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
         write_json(report, report_json(found))
     except OSError as error:
-        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
+        raise write_error(error, path) from error
     return path, report
 
 

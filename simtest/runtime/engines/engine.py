@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 from simtest.errors import InputError
-from simtest.runtime.limits import limit
+from simtest.runtime.limits import check_count
 
 OnStep = Callable[[], None]
 """Called by a task after each step; an exception from it stops the task."""
@@ -47,8 +47,7 @@ class Engine(Protocol):
 
 def check_workers(workers: int) -> None:
     """Raise `InputError` if a number of workers is out of range."""
-    if isinstance(workers, bool) or not isinstance(workers, int) or not 1 <= workers <= limit("workers"):
-        raise InputError(f"workers = {workers!r}: must be 1 to {limit('workers')}")
+    check_count("workers", workers, "workers")
 
 
 def make_engine(
