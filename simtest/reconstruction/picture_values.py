@@ -46,7 +46,7 @@ CODED_GREY, COLOURED_SHARE = 2.5 / 255, 0.005
 
 
 def is_coloured(picture: Image) -> bool:
-    """Return whether a picture, values in [0, 1], has colours: channels that differ by more than a coder makes of grey."""
+    """Return whether a picture, values in [0, 1], has colours: channels further apart than coding makes of grey."""
     if picture.ndim != 3 or picture.shape[2] != 3:
         return False
     red, green, blue = cv2.split(picture)

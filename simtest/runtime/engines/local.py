@@ -78,7 +78,7 @@ class _Pool:
         here, there = context.Pipe()
         threads = max(1, (os.cpu_count() or 1) // self._count)
         process = context.Process(target=_work, args=(there, self._task, threads), daemon=True)
-        # Masks are inherited: a Ctrl-C must not break into the child's imports. Here it comes when the child is started.
+        # Masks are inherited: a Ctrl-C must not break into the child's imports. Here it comes once that is started.
         stops = {signal.SIGINT, signal.SIGTERM}
         before = signal.pthread_sigmask(signal.SIG_BLOCK, stops)
         try:
