@@ -1,5 +1,7 @@
 """Reads and writes OpenEXR files with Mitsuba's own image library."""
 
+import errno
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,8 +23,14 @@ def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
     """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
     mi = backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
-    with _two_threads():
-        bitmap.write(str(path))
+    try:
+        with _two_threads():
+            bitmap.write(str(path))
+    except RuntimeError as error:
+        # Mitsuba's stream tells the system's error by its text alone.
+        known = (number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error))
+        number = next(known, errno.EIO)
+        raise OSError(number, os.strerror(number), str(path)) from error
 
 
 @contextmanager

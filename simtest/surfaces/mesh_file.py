@@ -29,6 +29,12 @@ MIN_FACES = 4
 LEAST_SOUND = 0.5
 """A file of whose faces a smaller share has an area was not written so."""
 
+LARGE_BYTES = 100_000_000
+"""Files of text beyond it are searched for faces before they are read."""
+
+MOST_BYTES_PER_FACE = 2000
+"""Of a large file of text: an STL file takes about 250, an OBJ file with its vertices less."""
+
 EXTENT_RANGE_MM = (1.0, 1e5)
 """Largest extent that is plausible; a mesh in metres falls below it."""
 
@@ -123,7 +129,29 @@ def _check_file(path: Path, suffix: str) -> tuple[int, int]:
         raise InputError(f"{shown(path)}: no OBJ file; it is no text")
     if suffix == ".vtk":
         _check_vtk(path, head, size)
+    is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * int.from_bytes(head[80:84], "little"))
+    if is_text and size > LARGE_BYTES:
+        _check_large_text(path, size, b"endfacet" if suffix == ".stl" else b"\nf")
     return announced
+
+
+def _check_large_text(path: Path, size: int, word: bytes) -> None:
+    """Raise `InputError` where a large file of text holds too many or too few of a word, of which each face has one."""
+    count, end = 0, b""
+    try:
+        with path.open("rb") as file:
+            # By pieces, since readers keep all of the text in memory; a word may stand across two of them.
+            while piece := file.read(2**20):
+                piece = end + piece.lower()
+                count += piece.count(word)
+                end = piece[1 - len(word) :]
+    except OSError as error:
+        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
+    if size > MOST_BYTES_PER_FACE * count:
+        raise InputError(
+            f"{shown(path)}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most"
+        )
 
 
 def _check_vtk(path: Path, head: bytes, size: int) -> None:

@@ -23,7 +23,7 @@ from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, 
 from simtest.runtime.machine_errors import disk_problem
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
-from simtest.surfaces import vtk_file
+from simtest.surfaces import mesh_file, vtk_file
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.vtk_file import read_vtk
@@ -219,6 +219,26 @@ def test_ply_files_are_checked_by_their_header(tmp_path, name):
     path = tmp_path / "m.ply"
     path.write_text(text)
     refused(lambda: read_mesh(path), f"{path}: ", said)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("m.obj", "v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"),
+        ("m.stl", "solid x\n" + "facet normal 0 0 1\nouter loop\nendloop\nENDFACET\n" * 4 + "endsolid x\n"),
+    ],
+)
+def test_large_meshes_of_text_are_searched_for_faces_before_they_are_read(tmp_path, monkeypatch, name, text):
+    monkeypatch.setattr(mesh_file, "LARGE_BYTES", 10)
+    path = tmp_path / name
+    path.write_text(text)
+    assert mesh_file._check_file(path, path.suffix) == (0, 0)
+    path.write_text(text + "# rubbish\n" * 1000)
+    refused(lambda: read_mesh(path), f"{path}: 4 faces in 1", " bytes; must be 2000 bytes a face at most")
+    # The words that are counted stand across the pieces too.
+    monkeypatch.setenv(VARIABLE, "mesh_faces=299999")
+    path.write_text((text.splitlines()[4] + "\n" + "\nf" if name == "m.obj" else "endfacet ") * 300_000)
+    refused(lambda: read_mesh(path), "faces; at most 299999 are allowed: decimate the mesh")
 
 
 def test_lines_of_a_ply_header_end_at_line_feeds_alone(tmp_path):

@@ -1,6 +1,8 @@
 """Odd surroundings: terminals, names, homes, and files as other programs write them."""
 
+import errno
 import io
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -16,6 +18,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct_colour
 from simtest.reconstruction.picture_values import is_coloured
+from simtest.rendering import bitmap
 from simtest.runtime.kept_arrays import cache_folder
 from simtest.runtime.user_cache import user_cache
 from simtest.spec import load_calibration, load_scene
@@ -90,13 +93,14 @@ def test_a_mark_of_the_encoding_is_read_over(tmp_path):
     ):
         (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert load_scene(tmp_path / "scene.toml").surface.type == "plane"
-    with pytest.raises(InputError, match=r"camera\.toml: camera\.fx"):
+    with pytest.raises(InputError, match=r"camera\.toml: fx: missing"):
         load_calibration(tmp_path / "camera.toml")
 
 
 def test_a_light_a_kilometre_away_is_refused(tmp_path):
     (tmp_path / "c.toml").write_text(
-        "[camera]\nwidth = 64\nheight = 48\nfx = 60.0\nfy = 60.0\ncx = 32.0\ncy = 24.0\n[rig]\nlights_mm = [[0, 0, 1e6]]\n"
+        "[camera]\nwidth = 64\nheight = 48\nfx = 60.0\nfy = 60.0\ncx = 32.0\ncy = 24.0\n"
+        "[rig]\nlights_mm = [[0, 0, 1e6]]\n"
     )
     with pytest.raises(InputError, match=r"rig\.lights_mm.*1000"):
         load_calibration(tmp_path / "c.toml")
@@ -108,3 +112,21 @@ def test_a_mesh_most_of_whose_faces_have_no_area_is_damaged(tmp_path):
     (tmp_path / "m.obj").write_text(corners + faces + "f 1 1 1\n" * 5)
     with pytest.raises(InputError, match=r"m\.obj: 4 of 9 faces have an area: it is damaged or cut short"):
         read_mesh(tmp_path / "m.obj")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EFBIG])
+def test_an_image_that_cannot_be_written_whole_names_the_cause(tmp_path, monkeypatch, number):
+    path = tmp_path / "o.exr"
+
+    class Stream:
+        def Bitmap(self, _):
+            return self
+
+        def write(self, name):
+            raise RuntimeError(f'[FileStream] "{name}": I/O error while writing: {os.strerror(number)}')
+
+    monkeypatch.setattr(bitmap.backend, "load", lambda _: Stream())
+    with pytest.raises(OSError, match=os.strerror(number)) as error:
+        bitmap.write_exr(path, np.ones((4, 4), np.float32))
+    assert (error.value.errno, error.value.filename) == (number, str(path))
