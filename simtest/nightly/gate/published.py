@@ -18,7 +18,7 @@ PUBLISHED = "published "
 SAME = 1e-9
 """Two figures that differ by a smaller share are the same: sums may be taken in another order."""
 
-FLOOR = 1e-5
+FLOOR = 1e-2
 """Figures below it, such as a deviation of equal errors, are held to as much as this one."""
 
 _TAIL = (1 - CONFIDENCE) / 2
