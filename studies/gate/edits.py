@@ -115,7 +115,7 @@ def narrow_covariances(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataF
 
 
 def shared_seeds(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
-    """Give all settings of an experiment the seeds of its first one."""
+    """Set the seeds of all settings of an experiment to those of its first one."""
     first = rows.filter(pl.col("setting") == pl.col("setting").first().over("experiment"))
     seeds = first.select("experiment", "realisation", new="seed").unique(("experiment", "realisation"))
     joined = rows.join(seeds, on=("experiment", "realisation"), how="left", maintain_order="left")
@@ -123,7 +123,7 @@ def shared_seeds(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
 
 
 def duplicated(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
-    """Give the second realisation of every setting the results of the first, seeds left as they are."""
+    """Replace the results of every setting's second realisation by those of the first, seeds left as they are."""
     key = ("experiment", "setting", "estimator", "true_id")
     rank = pl.col("realisation").rank("dense").over("experiment", "setting")
     first = rows.filter(rank == 1, OK).unique(key).select(*key, **{f"new_{name}": pl.col(name) for name in OF_ANSWERS})
