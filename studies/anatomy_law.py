@@ -1,8 +1,8 @@
 """Compare circle pose with its law at each highlight of an anatomy: `python -m studies.anatomy_law FOLDER...`.
 
-FOLDER is a run on the scene `anatomy`, such as studies/anatomy_table.py writes. The law (docs/theory.md, section 4) has
-the highlight's own exact curvatures; beside it stands the law of a picture that is smoothed before the ellipse is
-fitted, which adds s^2 to the ellipse's second moments (section 3).
+FOLDER is a run on the scene `anatomy`, such as studies/anatomy_table.py writes. The law (docs/concepts/theory.md,
+section 4) has the highlight's own exact curvatures; beside it stands the law of a picture that is smoothed before the
+ellipse is fitted, which adds s^2 to the ellipse's second moments (section 3).
 """
 
 import sys

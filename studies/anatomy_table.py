@@ -1,4 +1,4 @@
-"""Print the table of docs/experiments.md, "Curved anatomy": what was found, what was false, and the errors.
+"""Print the table of docs/reference/experiments.md, "Curved anatomy": what was found, what was false, and the errors.
 
 python -m studies.anatomy_table colon 1000 1400 FOLDER
 

@@ -48,7 +48,7 @@ LEVER_MM = 60.0
 
 TARGET_ERRORS_MM = {"registered exactly": 0.0, "3.5 mm": 3.5, "7 mm": 7.0, "12 mm": 12.0}
 """Target registration errors: of rigid registrations of the liver 7 to 10 mm are reported on phantoms, 12 to 13 mm in
-patients (docs/article.md); 3.5 mm is half of the former. Half of the square is a translation, half a rotation."""
+patients (docs/gallery/article.md); 3.5 mm is half of the former. Half of the square is translation, half rotation."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Print the table of docs/theory.md, section 3: `python -m studies.curvature_table reports/runs/curvature`."""
+"""Print the table of docs/concepts/theory.md, section 3: `python -m studies.curvature_table reports/runs/curvature`."""
 
 import sys
 from pathlib import Path

@@ -153,7 +153,7 @@ def surfaces() -> dict[str, list[tuple[Patches, float]]]:
     for u, v in np.random.default_rng(3).uniform([15, 0], [100, 2 * np.pi], size=(60, 2)):
         patch, curvatures = colon_patch(u, v)
         stretch = np.abs(1 + DISTANCE_MM * curvatures)
-        # What counts as an isolated highlight (docs/theory.md).
+        # What counts as an isolated highlight (docs/concepts/theory.md).
         if stretch.min() > 0.25 and (1 + DISTANCE_MM * curvatures).min() > 0:
             spots.append((patch, narrow(*curvatures)))
     return {

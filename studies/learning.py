@@ -1,4 +1,4 @@
-"""Train the network of docs/learning.md, compare it with the classical estimators, print a table, draw a figure.
+"""Train the network of docs/gallery/learning.md, compare it with classical estimators, print a table, draw a figure.
 
 simtest dataset learning --out data/learning
 python -m studies.learning data/learning docs/images/learning.png

@@ -1,7 +1,7 @@
 """Images of a sample: what each holds, its unit, frame and sign, and how it is encoded.
 
-Compression was chosen by measurement (docs/datasets.md): PNG without a row filter for pictures, with one for the smooth
-maps of 16 bits.
+Compression was chosen by measurement (docs/howto/datasets.md): PNG without a row filter for pictures, with one for the
+smooth maps of 16 bits.
 """
 
 from collections.abc import Callable

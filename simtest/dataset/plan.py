@@ -22,7 +22,7 @@ ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """Keys that determine an anatomy."""
 
 BYTES_PER_PIXEL = 4.5
-"""Size of a sample with its labels, as measured on the shipped datasets (docs/datasets.md)."""
+"""Size of a sample with its labels, as measured on the shipped datasets (docs/howto/datasets.md)."""
 
 RELIEF_BYTES_PER_PIXEL = 6.0
 """What a relief adds: normals and curvatures of the base, and more detail in those of the fine surface."""

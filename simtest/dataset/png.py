@@ -1,7 +1,7 @@
 """PNG written and read by ISA-L: our own, since no library uses its deflate, several times faster than zlib's.
 
-With OpenCV encoding took most of the time of writing and reading a dataset (docs/datasets.md). The files are plain PNG,
-which any reader opens. Any PNG can be read: one that was not written here is left to OpenCV.
+With OpenCV encoding took most of the time of writing and reading a dataset (docs/howto/datasets.md). The files are
+plain PNG, which any reader opens. Any PNG can be read: one that was not written here is left to OpenCV.
 """
 
 import struct
@@ -21,7 +21,7 @@ _COLOURS = {0: 1, 2: 3}
 """Channels by PNG's colour type: grey, and red, green, blue."""
 
 LEVEL = 1
-"""Of ISA-L's 0 to 3: higher ones take longer for files 1 % smaller (docs/datasets.md)."""
+"""Of ISA-L's 0 to 3: higher ones take longer for files 1 % smaller (docs/howto/datasets.md)."""
 
 
 def encode(image: AnyArray, rows: Filter, level: int = LEVEL) -> bytes:

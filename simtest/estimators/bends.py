@@ -16,7 +16,7 @@ MEAN_BENDS, PEAK_BENDS = 5.5, 4.5
 MELTED, MELTED_RESIDUAL, STEEPNESS = 0.3, 0.02, 4
 """... and, as a share of the radius, where the residual is so large that a melted spot is as likely as a single one;
 below it the share falls with this power of the residual. All were fitted to 506 highlights on 32 of the scenes 0 to 35
-of the corpus `hard`, 396 of which hold one glint (docs/uncertainty.md)."""
+of the corpus `hard`, 396 of which hold one glint (docs/concepts/uncertainty.md)."""
 
 
 def bend_variance(residuals: Array, by_noise: Array, moments: Array, slope: float) -> float:

@@ -23,7 +23,7 @@ PIXEL_PX2 = 0.005
 GAP_SHARE, RIPPLES = 1.5, 7.0
 """Variances of the peak over its squared gap from the isophotes' axis followed to t -> 1, which is usually nearer to
 the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
-no published figure uses (docs/uncertainty.md)."""
+no published figure uses (docs/concepts/uncertainty.md)."""
 
 
 @dataclass(frozen=True)

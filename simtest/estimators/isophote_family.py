@@ -42,11 +42,11 @@ and, in renders of meshes, triangles."""
 MEAN_PX2, PEAK_PX2 = 4e-5, 8e-5
 """Variances of the mean axis and of the axis at the peak by the grid of pixels, px^2: crossings are interpolated, and a
 lobe is averaged over a pixel. These and the numbers of the drift were fitted to 718 highlights of the corpus `hard`, on
-scenes that no quoted figure uses (docs/uncertainty.md)."""
+scenes that no quoted figure uses (docs/concepts/uncertainty.md)."""
 
 MEAN_RIPPLES, PEAK_RIPPLES = 11.0, 17.0
 """Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`);
-fitted to random fields of glints that no published figure uses (docs/uncertainty.md)."""
+fitted to random fields of glints that no published figure uses (docs/concepts/uncertainty.md)."""
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""

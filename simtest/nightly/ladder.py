@@ -10,7 +10,7 @@ from simtest.validation.error_ladder import RUNGS, error_ladder
 
 PROTOTYPE_NOISE_DEG, PROTOTYPE_CURVED_DEG = 0.008, 59.9
 """Mean error of cone_axis at sigma 5 %, n = 50, f = 406 px, and of circle pose on a cylinder with R = d, as an analytic
-prototype measured them (docs/theory.md, section 3)."""
+prototype measured them (docs/concepts/theory.md, section 3)."""
 
 
 def ladder_figures(seed: int = 0) -> pl.DataFrame:
@@ -43,8 +43,8 @@ def ladder_values(figures: pl.DataFrame) -> pl.DataFrame:
     """Return the canaries of the rungs whose height is known.
 
     Where the pose, or the cone of a plane, is exact nothing is left. Pixels widen an isophote as smoothing does, and a
-    round cone's pose errs by the root of the widening (docs/theory.md, sections 3 and 4). Noise and curvature leave
-    what a prototype apart from this package measured there.
+    round cone's pose errs by the root of the widening (docs/concepts/theory.md, sections 3 and 4). Noise and curvature
+    leave what a prototype apart from this package measured there.
     """
     plane, pose = pl.col("setting").str.starts_with("plane"), pl.col("estimator") == "circle_pose"
 

@@ -36,7 +36,7 @@ NEAR_MISSES = Assumption(
     "its normal is then off by 2 to 3 deg along its longer axis, which no budget holds",
     "compare neighbours; Priors(plane=True) for a plane",
 )
-"""Shares and errors: python -m studies.human_meshes (docs/uncertainty.md)."""
+"""Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""
 
 
 def calibration_of_view(fov_deg: float, width: int, height: int) -> Calibration:

@@ -1,6 +1,6 @@
 """The stage after the estimators: describe what was reconstructed, as records that files and pages are made of.
 
-docs/reconstruct.md explains the keys. `write_json` writes a record by its `to_json`, or else by its fields.
+docs/howto/reconstruct.md explains the keys. `write_json` writes a record by its `to_json`, or else by its fields.
 """
 
 from collections.abc import Mapping, Sequence

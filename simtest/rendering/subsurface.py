@@ -7,7 +7,7 @@ to it, whose widths, in mm on the surface, become px by the size of each pixel's
 blurred at dyadic widths, and blended.
 
 The surface is taken as locally flat, and lit and seen diffusely; light does not cross steps of the depth, edges of the
-surface and folds. The albedo stays that of the reflectance: the spread is normalised. See docs/tissue.md.
+surface and folds. The albedo stays that of the reflectance: the spread is normalised. See docs/concepts/tissue.md.
 """
 
 from functools import lru_cache

@@ -173,7 +173,7 @@ def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> 
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read a camera file; the half pixel between conventions is added or subtracted here (docs/cameras.md).
+    """Read a camera file; the half pixel between conventions is added or subtracted here (docs/howto/cameras.md).
 
     Parameters
     ----------

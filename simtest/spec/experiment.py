@@ -13,7 +13,7 @@ from simtest.spec.spec_model import Name, Spec, load
 LawName = Literal[
     "circle_pose", "branch_point", "axis_ratio", "axis_ratio_seen", "offset", "bisector", "falloff", "look"
 ]
-"""Error laws of docs/theory.md, section 4, that a page compares with measured errors."""
+"""Error laws of docs/concepts/theory.md, section 4, that a page compares with measured errors."""
 
 
 class Uniform(Spec):
@@ -44,7 +44,8 @@ class Group(Spec):
     random: dict[str, Uniform] = Field(default_factory=dict)
     realisations: int | None = Field(None, ge=1, le=10**6, description="default the experiment's")
     laws: tuple[LawName, ...] = Field(
-        (), description="laws of docs/theory.md, section 4, that the page holds against what these settings measure"
+        (),
+        description="laws of docs/concepts/theory.md, section 4, that the page compares with these settings' results",
     )
     isolated: bool = Field(
         True,

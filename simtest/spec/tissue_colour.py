@@ -45,7 +45,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
     }
 )
-"""Numbers of the presets; docs/tissue.md gives their sources."""
+"""Numbers of the presets; docs/concepts/tissue.md gives their sources."""
 
 _COLON = PRESETS["colon_mucosa"]
 

@@ -11,7 +11,7 @@ Absorption = Annotated[float, Field(ge=1e-3, le=100)]
 
 
 class Translucency(Spec):
-    """Optical properties that the spread of the diffuse light follows, per channel; sources in docs/tissue.md."""
+    """Optical properties that the spread of diffuse light follows, per channel; sources in docs/concepts/tissue.md."""
 
     scattering_per_mm: tuple[Scattering, Scattering, Scattering] = Field(
         (1.0, 1.1, 1.25), description="reduced scattering coefficient in red, green and blue, 1/mm"

@@ -1,4 +1,4 @@
-"""How fine a mesh must be for the highlights on it (docs/theory.md, section 3)."""
+"""How fine a mesh must be for the highlights on it (docs/concepts/theory.md, section 3)."""
 
 import math
 from typing import overload
@@ -16,7 +16,7 @@ ISOVALUE = 0.5
 """Level at which half-widths are taken: the middle of the default isovalues."""
 
 LEAST_STRETCH = 0.25
-"""Below this |1 + d k| there is no isolated highlight (docs/theory.md, section 6)."""
+"""Below this |1 + d k| there is no isolated highlight (docs/concepts/theory.md, section 6)."""
 
 
 def phong_concentration(exponent: float) -> float:

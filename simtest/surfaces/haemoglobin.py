@@ -32,7 +32,7 @@ SOFT_TISSUE = (1.89, 1.3)
 
 TISSUE_SATURATION = 0.7
 """Share of oxygenated haemoglobin in the ground: 0.72 in normal colon mucosa (Friedland et al. 2003), 0.67 (Wang et al.
-2009); see docs/tissue.md."""
+2009); see docs/concepts/tissue.md."""
 
 
 def blood_absorption(saturation: float) -> Array:

@@ -47,7 +47,7 @@ class ResultRow:
     """One estimator at one detected or missed highlight.
 
     Fields are named like the columns and stand in the order in which they become known; None where there is none.
-    docs/experiments.md describes them. `swept` holds the swept and drawn parameters by key path, `budget`
+    docs/reference/experiments.md describes them. `swept` holds the swept and drawn parameters by key path, `budget`
     the columns of `BUDGET_COLUMNS` that an estimate has.
     """
 

@@ -1,1 +1,1 @@
-"""The factors of ripples and bends (docs/uncertainty.md), fitted to random fields of glints. See `__main__`."""
+"""Factors of ripples and bends (docs/concepts/uncertainty.md), fitted to random fields of glints. See `__main__`."""

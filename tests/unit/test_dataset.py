@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,12 @@ def tiny(**values):
 
 
 def contents(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+    """Hashes of a dataset's files and, so that a difference names the field, of the members of its shards."""
+    held = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for shard in sorted(folder.glob("*.tar")):
+        with tarfile.open(shard) as tar:
+            held |= {f"{shard.name}: {member.name}": tar.extractfile(member).read() for member in tar}
+    return {name: hashlib.sha256(data).hexdigest() for name, data in held.items()}
 
 
 @pytest.fixture(scope="module")

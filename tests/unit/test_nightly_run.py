@@ -153,7 +153,7 @@ def test_a_profile_cuts_experiments_down(tmp_path):
 
 
 def test_the_profile_of_the_page_on_the_nightly_is_sound(tmp_path):
-    (text,) = re.findall(r"```toml\n(.*?)```", (DOCS / "nightly.md").read_text(), re.DOTALL)
+    (text,) = re.findall(r"```toml\n(.*?)```", (DOCS / "howto" / "nightly.md").read_text(), re.DOTALL)
     profile = profile_of(tmp_path, text)
     curvature, dark = experiments_of(profile)
     assert (curvature.realisations, dark.name, len(expand(dark))) == (8, "colon_dark", 4)

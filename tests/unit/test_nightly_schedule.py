@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-UNITS = ROOT / "docs" / "nightly"
+UNITS = ROOT / "deploy"
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)

@@ -1,4 +1,4 @@
-"""Rays, normals and radiance computed anew, from docs/theory.md: canaries share no code with what they watch."""
+"""Rays, normals and radiance computed from docs/concepts/theory.md: canaries share no code with what they watch."""
 
 import math
 from typing import Any

@@ -31,7 +31,7 @@ AIR = 1.000277
 """Index of the air that Mitsuba has outside its own plastic."""
 
 MARGIN = 1 / 40
-"""Share of the light through the film that is given up per unit of alpha (docs/tissue.md)."""
+"""Share of the light through the film that is given up per unit of alpha (docs/concepts/tissue.md)."""
 
 
 def lobes(session: Session) -> list[Figure]:

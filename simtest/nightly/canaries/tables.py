@@ -157,8 +157,8 @@ def thresholds(session: Session) -> list[Figure]:
 
 
 MEASURED = ((1000.0, 2.4), (100.0, 8.0), (10.0, 24.6), (3.0, 41.3), (1.0, 59.9), (0.5, 70.4))
-"""Radius over distance of a cylinder and circle pose's error, deg, that a prototype measured (docs/theory.md, section
-4): n = 50, t = 0.5, without noise."""
+"""Radius over distance of a cylinder and circle pose's error, deg, that a prototype measured (docs/concepts/theory.md,
+section 4): n = 50, t = 0.5, without noise."""
 
 
 def law_values() -> list[Figure]:

@@ -46,7 +46,7 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
     """Compare a run with the baseline, if there is one; canaries and the run's own consistency are judged all the same.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
-    are the same, with all tests as one family (docs/gate.md).
+    are the same, with all tests as one family (docs/concepts/gate.md).
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The verdict for machines and for readers without the page: JSON, JUnit XML, Markdown, a badge (docs/nightly.md)."""
+"""The verdict for machines and readers without the page: JSON, JUnit XML, Markdown, a badge (docs/howto/nightly.md)."""
 
 import math
 from pathlib import Path

@@ -17,7 +17,7 @@ PART, FEW = "only part of the range", "too few realisations"
 
 ESTIMATOR = "circle_pose"  # the article's method; only its sweeps are compared
 ARTICLE, EXPECTED = "published", "expected here"
-# Figures of [MB, section 3.1]; docs/theory.md, section 2.
+# Figures of [MB, section 3.1]; docs/concepts/theory.md, section 2.
 MEAN_BELOW_DEG = 1.25
 SLANT_BELOW_DEG = 7.0
 EXPONENT_BELOW_DEG = 1.75

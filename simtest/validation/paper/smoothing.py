@@ -1,4 +1,4 @@
-"""Predicts the bias of circle pose under smoothing: its error without noise (docs/theory.md, section 4)."""
+"""Predicts the bias of circle pose under smoothing: its error without noise (docs/concepts/theory.md, section 4)."""
 
 import numpy as np
 
