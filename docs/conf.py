@@ -22,9 +22,11 @@ default_role = "code"
 # Anchors like GitHub's, so that links work on both.
 myst_heading_anchors = 5
 myst_enable_extensions = ["dollarmath"]
-# A console block shows a session and an `sh` block is run by `python -m studies.manual commands`: both look the same.
 highlight_language = "none"
+# Two hyphens are an option of a command.
+smartquotes = False
 
+toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_google_docstring = False

@@ -1,42 +1,47 @@
-"""Equations as MathML, made when the manual is built: no script, no font and no network when it is read."""
+"""Equations as MathML, made when the manual is built: no script, no font and no network when it is read.
 
+The converter is docutils' own. A command that it does not know is a warning, so that no page shows half an equation.
+"""
+
+import re
 from html import escape
 from typing import Any
 
 from docutils import nodes
-from latex2mathml.converter import convert
+from docutils.utils.math import MathError
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
 LOGGER = logging.getLogger(__name__)
 
+TAG = re.compile(r"\\tag\{([^}]*)\}")
+"""An equation's own number, which the converter does not know."""
 
-def _mathml(self: Any, node: nodes.Element, display: str) -> str:
-    """Return an equation's MathML; one that cannot be converted, or not whole, is a warning."""
-    tex = node.astext()
+BARE_FRACTION = re.compile(r"(\\[dt]?frac) *([0-9A-Za-z]) *([0-9A-Za-z])")
+"""A fraction of two single signs without braces, of which the converter would make one number."""
+
+
+def _mathml(node: nodes.Element, as_block: bool) -> str:
+    tex = BARE_FRACTION.sub(r"\1{\2}{\3}", TAG.sub("", node.astext())).strip()
     try:
-        made = convert(tex, display=display)
-    except Exception as error:  # the converter raises its own kinds, and IndexError on unbalanced braces
+        return str(tex2mathml(tex, as_block=as_block))
+    except MathError as error:
         LOGGER.warning("equation cannot be converted (%s): %s", error, tex, location=node)
         return f"<code>{escape(tex)}</code>"
-    # The converter shows a command that it does not know as its name.
-    if "\\" in made:
-        LOGGER.warning("equation holds a command that has no MathML: %s", tex, location=node)
-    return made
 
 
 def inline(self: Any, node: nodes.math) -> None:
     """Write an equation within a line."""
-    self.body.append(_mathml(self, node, "inline"))
+    self.body.append(_mathml(node, as_block=False))
     raise nodes.SkipNode
 
 
 def block(self: Any, node: nodes.math_block) -> None:
-    """Write an equation of its own, in a box that scrolls where it is wider than the page."""
-    label = node.get("label")
-    anchor = f' id="equation-{nodes.make_id(label)}"' if label else ""
-    number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    self.body.append(f'<div class="math"{anchor}>{_mathml(self, node, "block")}{number}</div>\n')
+    """Write an equation of its own, with its number, in a box that scrolls where it is wider than the page."""
+    tag = TAG.search(node.astext())
+    number = f'<span class="eqno">({escape(tag[1])})</span>' if tag else ""
+    self.body.append(f'<div class="math">{_mathml(node, as_block=True)}{number}</div>\n')
     raise nodes.SkipNode
 
 
