@@ -17,7 +17,8 @@ from typing import Any
 
 from cyclopts import CycloptsError
 
-from simtest.cli.main import APP
+from simtest.cli.commands import APP
+from simtest.cli.manners import FLAGS
 from simtest.errors import InputError
 from studies.manual.blocks import ROOT, Block, blocks_of, manual_pages
 
@@ -78,7 +79,8 @@ def _fault(command: list[str], runs: bool) -> str | None:
 
 
 def _simtest_fault(arguments: list[str], runs: bool) -> str | None:
-    # Completion and the like, and flags of the program itself.
+    arguments = [word for word in arguments if word not in FLAGS]
+    # Flags of the program itself.
     if not arguments or arguments[0].startswith("-"):
         return None
     try:
