@@ -10,7 +10,8 @@ from simtest.cli.commands import APP
 OPENING = """# Commands
 
 This page is made from the commands' own help; `simtest COMMAND --help` prints the same. Every command also takes
-`--quiet` (neither progress nor warnings), `--verbose` (every step, every row) and `--traceback` (where an error came up).
+`--quiet` (neither progress nor warnings), `--verbose` (every step, every row) and `--traceback` (where an error came
+up).
 
 Exit codes: 0 done; 1 could not render, a full disk, or a command's own verdict; 2 bad input; 130 Ctrl-C; 143 SIGTERM.
 For `nightly`, 1 is a regression or an unexplained change, and whatever else went wrong is 2.
