@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import glob
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,7 +34,29 @@ def replacing(example: str) -> Parameter:
     return Parameter(name="--set", negative="", help=text)
 
 
-SceneName = Annotated[str, Parameter(help="A scene file, or the name of a shipped scene.")]
+def named(kind: str, files: bool = False, **options: Any) -> Parameter:
+    """Return the parameter of a name that `simtest list` knows, which a shell completes; or of a TOML file."""
+
+    def names(context: Any) -> dict[str, str]:
+        from simtest.cli.listing import names_of
+
+        return names_of(kind) | (_toml_files(context.incomplete) if files else {})
+
+    # Older releases of cyclopts complete no names.
+    if hasattr(Parameter, "completer"):
+        options["completer"] = names
+    return Parameter(**options)
+
+
+def _toml_files(begun: str) -> dict[str, str]:
+    """Return the folders and TOML files whose path begins so."""
+    folder, _, start = begun.rpartition("/")
+    found = sorted(Path(folder or ("/" if begun.startswith("/") else ".")).glob(f"{glob.escape(start)}*"))
+    head = begun[: len(begun) - len(start)]
+    return {f"{head}{path.name}{'/' * path.is_dir()}": "" for path in found if path.is_dir() or path.suffix == ".toml"}
+
+
+SceneName = Annotated[str, named("scenes", files=True, help="A scene file, or the name of a shipped scene.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
@@ -44,7 +67,8 @@ Variant = Annotated[
     ),
 ]
 Estimators = Annotated[
-    list[str] | None, Parameter(name="--estimator", negative="", help="Estimator by name; may be repeated.")
+    list[str] | None,
+    named("estimators", name="--estimator", negative="", help="Estimator by name; may be repeated."),
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from simtest.cli.options import (
     Address,
+    AsJson,
     EngineName,
     Estimators,
     Realisations,
@@ -16,6 +17,7 @@ from simtest.cli.options import (
     Settings,
     Variant,
     Workers,
+    named,
     named_path,
 )
 
@@ -23,7 +25,7 @@ DEFAULT_OUT = Path("reports/runs")
 
 
 def validate(
-    experiment: str,
+    experiment: Annotated[str, named("experiments", files=True)],
     /,
     *,
     out: Annotated[
@@ -37,6 +39,7 @@ def validate(
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
+    as_json: AsJson = False,
 ) -> None:
     """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
 
@@ -62,4 +65,9 @@ def validate(
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
+    if as_json:
+        from simtest.cli.printing import print_run
+
+        print_run(page)
+        return
     print(page)

@@ -19,6 +19,7 @@ from simtest.dataset.sample import Sample
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.files import write_atomically
+from simtest.runtime.machine_errors import cannot_write
 
 WIDTH = 240
 """Width of a thumbnail, px."""
@@ -68,7 +69,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     try:
         write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"--out {page}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, f"--out {page}", page) from error
     return page
 
 

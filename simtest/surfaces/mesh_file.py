@@ -13,7 +13,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
 from simtest.runtime.limits import check_file, check_limit
-from simtest.runtime.machine_errors import write_error
+from simtest.runtime.machine_errors import cannot_write, write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
@@ -241,7 +241,7 @@ def check_target(path: Path) -> None:
         if not path.parent.is_dir():
             raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
     except OSError as error:
-        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, f"--out {shown(path)}", path) from error
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:
