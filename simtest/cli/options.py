@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
-
 _SEPARATOR = "\0"
 """No argument of a command can hold it."""
 
