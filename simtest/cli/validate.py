@@ -68,6 +68,6 @@ def validate(
     if as_json:
         from simtest.cli.printing import print_run
 
-        print_run(page)
+        print_run(folder)
         return
     print(page)
