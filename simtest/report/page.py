@@ -18,7 +18,7 @@ from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
-from simtest.report.run_folder import ExperimentSummary, GalleryItem, Run
+from simtest.report.run_folder import GalleryItem, Run
 from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
@@ -107,7 +107,7 @@ def _draw_view(figures: FigureFiles, view: View3D) -> str:
 
 def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
     """Fill in the page's template."""
-    summary = run.experiments.get(run.experiment) or ExperimentSummary()
+    summary = run.summary
     cards, still = sections["cards"], sections["still"]
     return environment().get_template("run.html.j2").render(
         {
