@@ -1,11 +1,11 @@
 """What each estimator does, in one line for a reader who chooses one."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from simtest.estimators.registry import load_estimators
 
-DESCRIPTIONS: Mapping[str, str] = {
+DESCRIPTIONS: dict[str, str] = {
     "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",
     "circle_pose": "The published method: takes one isophote for a circle and solves for its pose; two candidates.",
     "brightest_point": "The line of sight through the brightest pixel.",
