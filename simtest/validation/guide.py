@@ -103,7 +103,7 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
 def _advice(situation: Situation, true: pl.DataFrame) -> Advice:
     rows = true.filter(pl.col("setting").is_in(situation.settings))
     wide, names = side_by_side(rows)
-    methods = {name: _figures(name, wide[name]) for name in names}
+    methods = {name: _figures(name, wide[f"of {name}"]) for name in names}
     ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
     if not any(each.answered for each in ranked):
         return Advice(situation, wide.height, methods, None, (), {})
@@ -112,28 +112,30 @@ def _advice(situation: Situation, true: pl.DataFrame) -> Advice:
     ties = [
         each.estimator
         for each in ranked[1:]
-        if each.answered and not _is_worse(_penalised(wide[each.estimator]) - _penalised(wide[best]), frames)
+        if each.answered
+        and not _is_worse(_penalised(wide[f"of {each.estimator}"]) - _penalised(wide[f"of {best}"]), frames)
     ]
     by_setting = {
-        str(setting): _figures(best, part[best])
+        str(setting): _figures(best, part[f"of {best}"])
         for (setting,), part in wide.group_by("setting", maintain_order=True)
     }  # fmt: skip
     return Advice(situation, wide.height, methods, best, tuple(ties), by_setting)
 
 
 def side_by_side(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
-    """Return a row for each true highlight with a column for each estimator's error, deg, null without an answer.
+    """Return a row for each true highlight with each estimator's error.
 
     Returns
     -------
     (polars.DataFrame, list of str)
-        The table, with the columns `KEYS`, and the estimators that were run on all of these highlights or some.
+        The table, with the columns `KEYS`, `label`, and "of NAME" for each estimator: its error, deg, null without an
+        answer; and the estimators that were run on all of these highlights or some, in order of appearance.
     """
     names = [str(name) for name in rows["estimator"].drop_nulls().unique(maintain_order=True)]
     error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
     # A highlight may be found twice; the first detection counts for all estimators alike.
-    columns = [error.filter(pl.col("estimator") == name).first().alias(name) for name in names]
-    return rows.group_by(KEYS, maintain_order=True).agg(columns), names
+    columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]
+    return rows.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns), names
 
 
 def _figures(name: str, errors: pl.Series) -> MethodFigures:
