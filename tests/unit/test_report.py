@@ -254,7 +254,15 @@ def test_overview_page_has_its_sections(overview):
     assert wanted <= page.ids()
     assert not {"heatmap", "surfaces"} & page.ids()
     text = " ".join(page.text)
-    parts = ("Title of overview", "Which method, and where does it break?", "outside of a tube", "gave no normal", "0123abc", "ab" * 32, "simtest render cylinder")
+    parts = (
+        "Title of overview",
+        "Which method, and where does it break?",
+        "outside of a tube",
+        "gave no normal",
+        "0123abc",
+        "ab" * 32,
+        "simtest render cylinder",
+    )
     for part in parts:
         assert part in text, part
     assert {"viewport"} <= {attrs.get("name") for tag, attrs in page.tags if tag == "meta"}
