@@ -39,7 +39,7 @@ QUALITY = 88
 
 @dataclass(frozen=True)
 class Spot:
-    """A highlight: its pixel, its point on the surface, mm, camera frame, and its normals by name, the true one last."""
+    """A highlight: its pixel, its surface point (mm, camera frame) and its normals by name, the true one last."""
 
     bp_px: Array
     point: Array
