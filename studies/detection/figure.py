@@ -1,4 +1,4 @@
-"""Draw docs/images/detection.png: rendered frames with their true masks and what is detected.
+"""Draw docs/images/detection.jpg: rendered frames with their true masks and what is detected.
 
 python -m studies.detection.figure FIGURE
 """
@@ -30,7 +30,7 @@ def panel(frame: StudyFrame) -> np.ndarray:
     for highlight in found.highlights:
         colour = ISOLATED if highlight.is_isolated else OTHER
         if len(highlight.outline):
-            cv2.polylines(drawn, [np.rint(highlight.outline - 0.5).astype(np.int32)], True, colour, 1)
+            cv2.polylines(drawn, [np.rint(highlight.outline - 0.5).astype(np.int32)], True, colour, 2)
     return np.hstack([plain, drawn])
 
 
