@@ -336,11 +336,12 @@ def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str
 
 
 def definition(experiment: Experiment, cases: list[Case]) -> str:
-    """Return a hash of what an experiment is: itself, its scenes and its input files; not of code, versions, paths."""
+    """Return a hash of what an experiment is: itself, its scenes and input files; not code, versions, paths, prose."""
     # Names without folders: a moved checkout holds the same experiments.
     files = sorted((Path(name).name, digest) for name, digest in _inputs(cases).items())
     scenes = [case.data for case in cases]
-    return _hash({"experiment": experiment.model_dump(mode="json"), "scenes": scenes, "inputs": files})
+    itself = experiment.model_dump(mode="json", exclude={"title", "description"})
+    return _hash({"experiment": itself, "scenes": scenes, "inputs": files})
 
 
 def _hash(content: Json) -> str:
