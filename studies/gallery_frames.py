@@ -21,6 +21,11 @@ LIT: dict[str, object] = {
 }  # fmt: skip
 """A lobe over a base that shows the surface's form, with little noise."""
 
+Crop = tuple[int, int, int, int]
+
+CHAIN_CROP: Crop = (370, 330, 192, 144)
+"""Column, row, width and height of the part that shows what a camera chain does to highlights, px."""
+
 Tile = tuple[str, str, dict[str, object]]
 """Caption, scene, and the values that replace the scene's."""
 
@@ -51,13 +56,16 @@ SHEETS: dict[str, tuple[Tile, ...]] = {
 }  # fmt: skip
 
 
-def tile(caption: str, scene: str, values: dict[str, object], folder: Path) -> np.ndarray:
-    """Render a scene in colour and return the frame at the size of a tile, with its caption."""
+def tile(caption: str, scene: str, values: dict[str, object], folder: Path, crop: Crop | None) -> np.ndarray:
+    """Render a scene in colour and return the frame, or a part of it, at the size of a tile, with its caption."""
     settings = [part for key, value in values.items() for part in ("--set", f"{key}={_text(value)}")]
     command = [sys.executable, "-m", "simtest", "render", scene, "--variant", "llvm_ad_rgb", "--out", str(folder)]
     subprocess.run([*command, *settings], check=True, stdout=subprocess.DEVNULL)
     frame = cv2.imread(str(folder / "frame.png"), cv2.IMREAD_COLOR)
-    scaled = cv2.resize(frame, TILE, interpolation=cv2.INTER_AREA)
+    if crop is not None:
+        x, y, wide, high = crop
+        frame = frame[y : y + high, x : x + wide]
+    scaled = cv2.resize(frame, TILE, interpolation=cv2.INTER_AREA if crop is None else cv2.INTER_NEAREST)
     (width, height), _ = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     cv2.rectangle(scaled, (0, TILE[1] - height - 14), (width + 14, TILE[1]), (0, 0, 0), cv2.FILLED)
     cv2.putText(scaled, caption, (7, TILE[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
@@ -71,7 +79,8 @@ def _text(value: object) -> str:
 def draw(name: str, folder: Path) -> None:
     """Render the tiles of a sheet and write it."""
     with tempfile.TemporaryDirectory() as work:
-        tiles = [tile(*each, Path(work) / str(i)) for i, each in enumerate(SHEETS[name])]
+        crop = CHAIN_CROP if name == "camera_chains" else None
+        tiles = [tile(*each, Path(work) / str(i), crop) for i, each in enumerate(SHEETS[name])]
     rows = np.vstack([np.hstack(tiles[i : i + 2]) for i in range(0, len(tiles), 2)])
     cv2.imwrite(str(folder / f"{name}.jpg"), rows, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
