@@ -1,4 +1,4 @@
-"""Draw the gallery's sheets of rendered frames: surfaces, tissue, camera chains, and a lens, a rig and an instrument.
+"""Draw the gallery's sheets of frames: surfaces, anatomies, tissue, camera chains; rigs, a lens and an instrument.
 
 python -m studies.gallery_frames FOLDER [SHEET]...
 
@@ -21,6 +21,8 @@ LIT: dict[str, object] = {
 }  # fmt: skip
 """A lobe over a base that shows the surface's form, with little noise."""
 
+GLOSSY = LIT | {"reflectance.specular": 1.0, "reflectance.diffuse": 0.5}
+
 Crop = tuple[int, int, int, int]
 
 CHAIN_CROP: Crop = (370, 330, 192, 144)
@@ -29,8 +31,19 @@ CHAIN_CROP: Crop = (370, 330, 192, 144)
 Tile = tuple[str, str, dict[str, object]]
 """Caption, scene, and the values that replace the scene's."""
 
+ORGAN: dict[str, object] = {"sensor.exposure": "{average = 0.3}", "sensor.saturation": True, "sensor.noise_sigma": 0.01}
+
+POLYPS = "{polyps = [{along_mm = 60, around_deg = 90, height_mm = 9, width_mm = 8, neck_mm = 4}]}"
+
 SHEETS: dict[str, tuple[Tile, ...]] = {
     "surfaces": tuple((name, name, LIT) for name in ("plane", "cylinder", "sphere", "saddle")),
+    "anatomies": (
+        ("colon, along its path", "anatomy", {**ORGAN, "surface.view": "path", "surface.path_share": 0.3}),
+        ("colon, facing the wall", "anatomy", {**ORGAN, "surface.view": "wall", "surface.path_share": 0.5}),
+        ("colon with a pedunculated polyp", "anatomy",
+         {**ORGAN, "surface.view": "path", "surface.path_share": 0.35, "surface.recipe": POLYPS}),
+        ("liver", "anatomy", {**ORGAN, "surface.path": "liver", "camera.fx": 480, "camera.fy": 480}),
+    ),
     "tissue": tuple((name, f"tissue_{name}", {}) for name in ("colon", "liver", "stomach", "gallbladder")),
     "camera_chains": (
         ("no camera chain", "tissue_colon", {}),
@@ -40,10 +53,10 @@ SHEETS: dict[str, tuple[Tile, ...]] = {
     ),
     "rigs": (
         ("laparoscope: a ring of eight lights", "sphere",
-         {**LIT, "rig.preset": "laparoscope", "surface.distance_mm": 30, "surface.radius_mm": 15,
+         {**GLOSSY, "rig.preset": "laparoscope", "surface.distance_mm": 30, "surface.radius_mm": 15,
           "reflectance.exponent": 800}),
         ("colonoscope: two lights", "cylinder",
-         {**LIT, "rig.preset": "colonoscope_2", "surface.distance_mm": 30, "surface.radius_mm": 15,
+         {**GLOSSY, "rig.preset": "colonoscope_2", "surface.distance_mm": 30, "surface.radius_mm": 15,
           "reflectance.exponent": 400}),
         ("fisheye with cut corners, inside a colon", "anatomy",
          {"camera.fx": 170, "camera.fy": 170, "camera.width": 512, "camera.height": 384,
