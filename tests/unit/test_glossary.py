@@ -1,15 +1,16 @@
 """The glossary names everything that the manual's concepts define and that results are made of."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from simtest.detection.blobs import Kind
 from simtest.estimators.budget import PARTS
-from simtest.pages.style import ESTIMATOR_COLOURS
 
-CONCEPTS = Path(__file__).parents[2] / "docs/concepts"
+ROOT = Path(__file__).parents[2]
+CONCEPTS = ROOT / "docs/concepts"
 GLOSSARY = (CONCEPTS / "glossary.md").read_text(encoding="utf-8").lower()
 
 
@@ -28,7 +29,8 @@ def test_every_term_that_a_page_defines_stands_in_the_glossary(page: str) -> Non
 
 
 def test_the_glossary_has_all_budget_parts_estimators_and_where_kinds_are_listed() -> None:
-    names = [*PARTS, *ESTIMATOR_COLOURS]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    names = [*PARTS, *project["entry-points"]["simtest.estimators"]]
     assert [name for name in names if f"`{name}`" not in GLOSSARY] == []
     detection = (CONCEPTS / "detection.md").read_text(encoding="utf-8")
     assert [kind.value for kind in Kind if f"| {kind.value} |" not in detection] == []
