@@ -17,7 +17,7 @@ GLOSSARY = (CONCEPTS / "glossary.md").read_text(encoding="utf-8").lower()
 def defined_terms(page: str) -> list[str]:
     """Return the terms that a page defines: bold words inside a sentence, which begin small or with a name."""
     bold = re.findall(r"\*\*((?:[a-z]|Cramer)[^*]*)\*\*", (CONCEPTS / page).read_text(encoding="utf-8"))
-    return [text.lower() for text in bold]
+    return [" ".join(text.lower().split()) for text in bold]
 
 
 @pytest.mark.parametrize("page", ["theory.md", "uncertainty.md"])
