@@ -77,6 +77,12 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
         _require_without_locks(error, what, lock)
         yield
         return
+    except KeyboardInterrupt:
+        # Just made, perhaps; what nobody holds may go.
+        if not is_held(lock):
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
+        raise
     with file:
         try:
             taken = _taken(lock, file)

@@ -21,7 +21,7 @@ class MeshVerdict:
 
     file: str
     usable: bool
-    """Whether highlights on it mean something, after the refinement that the scene asks for."""
+    """Whether highlights on it mean something; a refinement by ``surface.edge_mm`` counts, subdivisions do not."""
 
     text: str
     """The verdict and what is wrong, in words."""
