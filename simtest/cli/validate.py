@@ -77,8 +77,6 @@ def validate(
     if as_json:
         print_run(folder, meshes=meshes)
         return
-    print(*meshes, sep="
-", end="
-" * bool(meshes))
+    print(*meshes, sep="\n", end="\n" * bool(meshes))
     print_guide(folder)
     print(folder / "index.html")
