@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 LOADED = {"script": "src", "img": "src", "link": "href", "source": "src", "iframe": "src"}
 """What a browser loads with a page, by tag; a link that is followed by hand may lead elsewhere."""
 
-UNREACHED = ("search.html", "genindex.html", "py-modindex.html")
+UNREACHED = ("search.html", "py-modindex.html")
 """Pages of Sphinx's own that a page need not link to."""
 
 

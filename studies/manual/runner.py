@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -107,7 +108,7 @@ def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
     try:
         text, _ = child.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        os.killpg(child.pid, 15)
+        os.killpg(child.pid, signal.SIGTERM)
         return False, f"{child.communicate()[0]}\nstopped after {timeout_s:g} s"
     return child.returncode == 0, text
 
@@ -123,15 +124,19 @@ class _Python:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._child and self._child.stdin:
-            self._child.stdin.close()
-            self._child.wait(timeout=60)
+        self._end()
+
+    def _end(self) -> None:
+        """End the process, if there is one; its input's end is what it ends by."""
+        if self._child is not None:
+            self._child.communicate()
 
     def run(self, code: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
         """Run a block among the names of those before it."""
         if ">>> " in code:
             code = "\n".join(line[4:] for line in code.splitlines() if line.startswith((">>> ", "... ")))
         if self._child is None or self._child.poll() is not None:
+            self._end()
             self._child = subprocess.Popen(
                 [sys.executable, "-c", NAMESPACE], cwd=scratch, env=_environment(scratch), text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
