@@ -44,16 +44,21 @@ def _run(stop: Termination) -> int:
     from cyclopts import CycloptsError
 
     from simtest.cli.commands import APP
+    from simtest.cli.options import gather_settings
     from simtest.errors import InputError, SimtestError
+
+    words = gather_settings(sys.argv[1:])
 
     if wants_traceback:
         with stop.working():
-            return _code(APP(result_action="return_value"))
+            return _code(APP(words, result_action="return_value"))
     try:
         with stop.working():
             _require_folder()
+            if MANNERS.quiet and MANNERS.verbose:
+                raise InputError("--quiet and --verbose exclude each other; give one of them")
             # A command's result is its exit code.
-            code = _code(APP(exit_on_error=False, print_error=False, result_action="return_value"))
+            code = _code(APP(words, exit_on_error=False, print_error=False, result_action="return_value"))
         # Output may wait in a buffer whose reader has gone, or whose disk is full.
         if sys.stdout is not None:
             sys.stdout.flush()

@@ -35,11 +35,6 @@ def take_flags(words: Sequence[str]) -> tuple[list[str], bool]:
         The others.
     traceback : bool
         Whether errors are to be shown with where they came up.
-
-    Raises
-    ------
-    InputError
-        If both --quiet and --verbose are among them.
     """
     end = list(words).index("--") if "--" in words else len(words)
     flags = set(words[:end]).intersection(FLAGS)

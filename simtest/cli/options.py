@@ -7,6 +7,9 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
+_SEPARATOR = "\0"
+"""No argument of a command can hold it."""
+
 
 def whole_number(_: Any, tokens: Sequence[Token]) -> int:
     """Convert an option to an integer; 2.7 is not rounded."""
@@ -31,7 +34,26 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
 def replacing(example: str) -> Parameter:
     """Return the option that replaces values of a file, with an example of one in its help."""
     text = f"Replace a value: key=value, such as {example}; may be repeated."
-    return Parameter(name="--set", negative="", help=text)
+    return Parameter(name="--set", negative="", help=text, converter=_gathered)
+
+
+def gather_settings(words: Sequence[str]) -> list[str]:
+    """Join the values of all ``--set`` of a command line in one: parsing takes time with the square of their number."""
+    end = list(words).index("--") if "--" in words else len(words)
+    others, values, first, i = list[str](), list[str](), -1, 0
+    while i < len(words):
+        is_pair = words[i] == "--set" and i + 1 < end and not words[i + 1].startswith("-")
+        if is_pair:
+            first = len(others) if first < 0 else first
+            values.append(words[i + 1])
+        else:
+            others.append(words[i])
+        i += 1 + is_pair
+    return [*others[:first], "--set", _SEPARATOR.join(values), *others[first:]] if values else others
+
+
+def _gathered(_: Any, tokens: Sequence[Token]) -> list[str]:
+    return [value for token in tokens for value in token.value.split(_SEPARATOR)]
 
 
 def named(kind: str, files: bool = False, **options: Any) -> Parameter:

@@ -51,6 +51,8 @@ def validate(
         mesh, paper, paper_limits.
     """
     from simtest.api import validate as run
+    from simtest.cli.guide_table import print_guide
+    from simtest.cli.printing import print_run
     from simtest.cli.progress import progress_bar
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
@@ -64,10 +66,9 @@ def validate(
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
-        page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
+        run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
     if as_json:
-        from simtest.cli.printing import print_run
-
-        print_run(page)
+        print_run(folder)
         return
-    print(page)
+    print_guide(folder)
+    print(folder / "index.html")

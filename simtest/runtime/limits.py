@@ -24,7 +24,7 @@ DEFAULTS = {
     "manifest_bytes": 100_000_000,
     "record_bytes": 20_000_000,  # JSON that a run has written
     # pictures and frames, px
-    "picture_pixels": 100_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
+    "picture_pixels": 50_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
     "picture_side": 16_384,
     "frame_pixels": 20_000_000,
     "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples

@@ -116,8 +116,8 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
 
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
-    location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
     kind, value = error["type"], error.get("input")
+    location = [shown(part, 60) for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
@@ -155,20 +155,26 @@ def _demand(error: Any) -> str:
     return f"be {error['msg'].removeprefix('Input should be ')}"
 
 
-def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
-    """Drop the tags that pydantic puts into the location for each tagged union."""
+def _without_tags(location: tuple[Any, ...], data: Any, missing: bool) -> list[Any]:
+    """Drop what pydantic puts into the location for each union: the type of a tagged one, a name of its own else.
+
+    `missing` says that the last part is a key that is not there.
+    """
     path: list[Any] = []
     tagged: Any = None
-    for part in location:
+    for i, part in enumerate(location):
         # The tag comes first; after it the same word is a key (type = "gamma" has a key gamma).
         if isinstance(data, Mapping) and data is not tagged and part == data.get("type"):
             tagged = data
             continue
-        path.append(part)
         try:
             data = data[part]
         except (KeyError, IndexError, TypeError):
+            # Of a plain union, such as a number or a table, no user knows the name.
+            if not (missing and i == len(location) - 1):
+                continue
             data = None
+        path.append(part)
     return path
 
 
