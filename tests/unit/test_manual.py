@@ -29,7 +29,7 @@ from studies.manual.blocks import ROOT, blocks_of, manual_pages
 from studies.manual.commands_page import command, commands, commands_page, shipped_page
 from studies.manual.files_page import files_page
 from studies.manual.keys_page import MODELS, keys_page
-from studies.manual.links import dead_links
+from studies.manual.links import anchors_of, dead_in_markdown, dead_links
 from studies.manual.pages import PAGES
 from studies.manual.runner import run_pages
 from studies.manual.stale import faults, stale
@@ -330,6 +330,31 @@ def test_dead_links_are_found(tmp_path):
         "a/b.html: x.png: no such file",
         "index.html: a/b.html#there: no such anchor",
         "index.html: a/c.html: no such file",
+    ]
+
+
+@pytest.mark.parametrize("page", manual_pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_no_link_in_markdown_is_dead(page):
+    assert list(dead_in_markdown(page, {DOCS / name for name in PAGES})) == []
+
+
+def test_dead_links_in_markdown_are_found(tmp_path):
+    (tmp_path / "other.md").write_text("# A title\n\n## 3. Your `own`, mesh\n\n## A title\n", encoding="utf-8")
+    assert anchors_of((tmp_path / "other.md").read_text(encoding="utf-8")) == {
+        "a-title",
+        "3-your-own-mesh",
+        "a-title-1",
+    }
+    page = written(
+        tmp_path,
+        "# P\n\n[a](other.md#3-your-own-mesh), [b](other.md#none), [c](gone.md), [d](#p), [e](#q), ![f](no.png),\n"
+        "`[g](code.md)`, [h](https://elsewhere.org), [![i](gone.png)](other.md), [j](made.md)\n",
+    )
+    assert list(dead_in_markdown(page, {tmp_path / "made.md"})) == [
+        "page.md: other.md#none: no such anchor",
+        "page.md: gone.md: no such file",
+        "page.md: #q: no such anchor",
+        "page.md: no.png: no such file",
     ]
 
 
