@@ -5,11 +5,12 @@ WORKERS ?= auto
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo docs test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
+.PHONY: help demo docs docs-commands test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
+	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
 	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-ci   fast tests and those of all extras, which it installs"
@@ -58,6 +59,9 @@ docs: $(VENV)/.docs
 	rm -rf build/manual
 	$(BIN)/python -m sphinx --fail-on-warning --quiet --builder html --doctree-dir build/doctrees docs build/manual
 	$(BIN)/python -m studies.manual links build/manual
+
+docs-commands: $(VENV)/.docs
+	$(BIN)/python -m studies.manual commands $(QUICK) $(PAGES)
 
 test: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
