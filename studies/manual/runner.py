@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -56,11 +57,13 @@ def _run_page(blocks: list[Block], scratch: Path, quick: bool, timeout_s: float,
     """Run the blocks of a page in a copy of the checkout; return how many failed."""
     _copy_checkout(scratch)
     failed = 0
+    unmade: list[str] = []
     with _Python(scratch) as python:
         for block in blocks:
             for command in _pieces(block):
-                # What installs is run by CI's steps.
-                if any(word in command for word in NEVER + (SLOW if quick else ())):
+                # What needs a result that was left out is left out too.
+                if any(word in command for word in NEVER + (SLOW if quick else ())) or reads(command, unmade):
+                    unmade += outputs_of(command)
                     _tell(f"{'left out':>8}         {block.place}: {_first(command)}", log)
                     continue
                 started = time.monotonic()
@@ -82,6 +85,18 @@ def _pieces(block: Block) -> Iterator[str]:
         yield block.code
     else:
         yield from block.lines
+
+
+def outputs_of(command: str) -> list[str]:
+    """Return the folders and files that a command of simtest writes to, as they stand in it or by default."""
+    named = re.findall(r"--out[ =](\S+)", command)
+    runs = [f"reports/runs/{name}" for name in re.findall(r"simtest validate (\w+)", command) if not named]
+    return [*named, *runs, *(["reports/nightly"] if "simtest nightly" in command else [])]
+
+
+def reads(command: str, paths: list[str]) -> bool:
+    """Return whether a command or block names one of these paths, or what lies below it."""
+    return any(re.search(rf"(?<![\w./-]){re.escape(path)}(?![\w-])", command) for path in paths)
 
 
 def _copy_checkout(scratch: Path) -> None:

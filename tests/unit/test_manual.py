@@ -31,7 +31,7 @@ from studies.manual.files_page import files_page
 from studies.manual.keys_page import MODELS, keys_page
 from studies.manual.links import anchors_of, dead_in_markdown, dead_links
 from studies.manual.pages import PAGES
-from studies.manual.runner import run_pages
+from studies.manual.runner import reads, run_pages
 from studies.manual.stale import faults, stale
 
 DOCS = ROOT / "docs"
@@ -300,6 +300,14 @@ def test_blocks_run_in_order_and_failures_are_counted(tmp_path, monkeypatch, cap
     said = capsys.readouterr().out
     assert said.count("FAILED") == 2
     assert "2 failed" in said
+    page.write_text(
+        "```sh\nsimtest validate overview --out run\n```\n```python\nopen('run/results.parquet')\n```\n",
+        encoding="utf-8",
+    )
+    assert run_pages([page], quick=True, timeout_s=60, log=None) == 0
+    assert capsys.readouterr().out.count("left out") == 2
+    assert reads("open('run/a.json')", ["run"])
+    assert not reads("simtest render run_2 --out rerun; ls out/run", ["run"])
     page.write_text("```sh\nsleep 30\n```\n```sh\nsimtest nightly\nmake demo\n```\n", encoding="utf-8")
     assert run_pages([page], quick=True, timeout_s=0.2, log=None) == 1
     said = capsys.readouterr().out
