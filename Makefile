@@ -5,10 +5,11 @@ WORKERS ?= auto
 BIN := $(VENV)/bin
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
+.PHONY: help demo docs test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
+	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
 	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-ci   fast tests and those of all extras, which it installs"
@@ -37,6 +38,10 @@ $(VENV)/.ci: $(VENV)/.tests
 		echo "no CPU build of torch $(TORCH) was found: tests that need it are skipped"
 	@touch $@
 
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	@touch $@
+
 $(VENV)/.benchmarks: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench]"
 	@touch $@
@@ -48,6 +53,11 @@ $(VENV)-cycles/.installed: benchmarks/cycles-requirements.txt
 
 demo: $(VENV)/.installed
 	$(BIN)/simtest validate overview
+
+docs: $(VENV)/.docs
+	rm -rf build/manual
+	$(BIN)/python -m sphinx --fail-on-warning --quiet --builder html --doctree-dir build/doctrees docs build/manual
+	$(BIN)/python -m studies.manual links build/manual
 
 test: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"

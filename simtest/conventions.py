@@ -28,7 +28,7 @@ DEFAULT_SMOOTHING_PX = 2.0
 
 PAPER_SMOOTHING_PX = 3.0
 """The same in the published protocol, in px. The article does not state it; its slope against n and its best isovalue
-are those of about 3 px (docs/reference/experiments.md)."""
+are those of about 3 px (docs/gallery/experiments_measured.md)."""
 
 CIRCLE_POSE_ISOVALUE = 0.5
 """Default isovalue of `circle_pose` in rendered experiments."""

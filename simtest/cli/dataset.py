@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Address, EngineName, Seed, Workers, named_path, replacing, whole_number
+from simtest.cli.options import Address, AsJson, EngineName, Seed, Workers, named, named_path, replacing, whole_number
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
 
@@ -17,7 +17,7 @@ Samples = Annotated[int | None, Parameter(help="Number of samples; default the f
 
 @dataset.default
 def make(
-    described: Annotated[str, Parameter(name="DATASET")],
+    described: Annotated[str, named("datasets", files=True, name="DATASET")],
     /,
     *,
     out: Annotated[Path, Parameter(help="Folder of the dataset; made if need be.", converter=named_path)],
@@ -28,6 +28,7 @@ def make(
     workers: Workers = 1,
     address: Address = None,
     variant: Variant = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a dataset: shards, tables, manifest and card; the same command goes on where it was stopped.
 
@@ -36,6 +37,7 @@ def make(
     described : str
         A dataset file, or the name of a shipped one: endoscopy, learning, smooth, tiny.
     """
+    from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
@@ -50,7 +52,7 @@ def make(
         gpu = variant is not None and needs_gpu(variant)
         chosen = make_engine(engine, workers, address, gpu, SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
-    print(out / "README.md")
+    print_files([out / "README.md"], as_json, dataset=wanted.name, samples=wanted.samples)
 
 
 @dataset.command
@@ -64,27 +66,34 @@ def verify(
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
+    as_json: AsJson = False,
 ) -> int:
     """Check a dataset's files and values; exit 1 if anything is broken, and name it."""
+    from simtest.cli.printing import counted, print_json, print_lines
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
     from simtest.dataset.verify import repair_files
     from simtest.dataset.verify import verify as check
     from simtest.runtime.engines import make_engine
 
+    left = None
     with progress_bar("done") as progress:
         faults = check(folder, progress)
-        for fault in faults:
-            print(fault)
+        if not as_json:
+            print_lines(list(map(str, faults)))
         if faults and repair:
-            left = repair_files(
-                folder, faults, make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS), progress
-            )
-            print(*(f"still broken: {fault}" for fault in left), sep="\n", end="\n" * bool(left))
-            print("mended" if not left else f"left: {len(left)}")
-            return 1 if left else 0
-    print(f"{len(faults)} fault{'s' * (len(faults) > 1)}" if faults else "sound")
-    return 1 if faults else 0
+            chosen = make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS)
+            left = repair_files(folder, faults, chosen, progress)
+    broken = faults if left is None else left
+    if as_json:
+        print_json({"folder": str(folder), "sound": not broken, "repaired": left is not None,
+                    "faults": faults, "left": broken})  # fmt: skip
+    elif left is not None:
+        print_lines([f"still broken: {fault}" for fault in left])
+        print("mended" if not left else f"left: {len(left)}")
+    else:
+        print(counted(len(faults), "fault") if faults else "sound")
+    return 1 if broken else 0
 
 
 @dataset.command
@@ -97,6 +106,7 @@ def sample(
         Path | None, Parameter(help="Folder for the files; default sample-INDEX.", converter=named_path)
     ] = None,
     variant: Annotated[str | None, Parameter(help="Mitsuba variant; default the dataset's own.")] = None,
+    as_json: AsJson = False,
 ) -> int:
     """Make one sample of a dataset again, alone; exit 1 if it differs from the stored one.
 
@@ -105,14 +115,17 @@ def sample(
     index : int
         Of the sample, from 0.
     """
+    from simtest.cli.printing import print_files
     from simtest.dataset.reproduce import compare, reproduce_sample
 
     target = out or Path(f"sample-{index}")
     files = reproduce_sample(folder, index, target, variant)
-    print(*files, sep="\n")
     verdict = compare(folder, index, target)
-    print(verdict)
-    return 0 if verdict.endswith("same bytes") else 1
+    same = verdict.endswith("same bytes")
+    print_files(files, as_json, **({"same": same, "verdict": verdict} if as_json else {}))
+    if not as_json:
+        print(verdict)
+    return 0 if same else 1
 
 
 @dataset.command
@@ -124,11 +137,13 @@ def preview(
         Path | None, Parameter(help="Page to write; default preview.html in the current folder.", converter=named_path)
     ] = None,
     samples: Annotated[int, Parameter(help="How many samples to show.", converter=whole_number)] = 24,
+    as_json: AsJson = False,
 ) -> None:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
+    from simtest.cli.printing import print_files
     from simtest.dataset.preview import write_preview
     from simtest.runtime.locks import exclusive_file
 
     page = out or Path("preview.html")
     with exclusive_file(page):
-        print(write_preview(folder, page, samples))
+        print_files([write_preview(folder, page, samples)], as_json)

@@ -1,17 +1,16 @@
 """`simtest doctor`."""
 
-import json
-
 from simtest.cli.options import AsJson, Variant
 
 
 def doctor(*, as_json: AsJson = False, variant: Variant = None) -> int:
     """Check the rendering backend in a child process and say how to mend it; exit 1 if it cannot render."""
+    from simtest.cli.printing import print_json
     from simtest.rendering.backend_check import examine
 
     report = examine(variant)
     if as_json:
-        print(json.dumps(report.to_json(), indent=2))
+        print_json(report)
         return 0 if report.can_render else 1
     print(f"variant     {report.variant}")
     for candidate in report.candidates:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Seed, named_path, whole_number
+from simtest.cli.options import AsJson, Seed, named_path, whole_number
 
 if TYPE_CHECKING:
     from simtest.realism.fitting.fit import FittedRecipe
@@ -30,6 +30,7 @@ def fit(
         ),
     ] = None,
     seed: Seed = None,
+    as_json: AsJson = False,
 ) -> None:
     """Fit the ranges of a dataset recipe to real frames, with intervals, and say what the frames do not tell.
 
@@ -39,9 +40,10 @@ def fit(
         Real colour frames of at least three scenes: pictures, films, or folders of pictures. A film is one scene, and
         so is a folder whose name ends in .film; any other picture is a scene of its own.
     """
+    from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
     from simtest.realism.fitting.fit import fit as fitted_to
-    from simtest.realism.fitting.outcome import check_out, write_fit
+    from simtest.realism.fitting.outcome import check_out, report_json, write_fit
     from simtest.realism.fitting.parameters import one_family
     from simtest.realism.frame_sets import open_frames
     from simtest.runtime.limits import check_count
@@ -56,25 +58,24 @@ def fit(
         with progress_bar("writing") as progress:
             found = fitted_to(opened, dataset, kept, size, seed or 0, progress)
         paths = write_fit(found, out)
+    if as_json:
+        print_files(paths, as_json, **report_json(found))
+        return
     _print_table(found)
-    print(*paths, sep="\n")
+    print_files(paths, as_json)
 
 
 def _print_table(found: "FittedRecipe") -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from simtest.cli.printing import print_lines, print_table
 
-    table = Table("parameter", "key", "centre", "95 % interval", "of its range", "told")
+    rows = []
     for number, parameter in enumerate(found.parameters):
         share = found.fitted.interval[number]
         low, high = parameter.from_unit(share)
         centre = parameter.from_unit(found.fitted.centre[number])
         told = "yes" if found.fitted.told[number] else "not told"
-        table.add_row(parameter.kind, parameter.key, f"{centre:.3g}", f"{low:.3g} to {high:.3g}",
-                      f"{share[1] - share[0]:.0%}", told)  # fmt: skip
-    console = Console(width=140)
-    console.print(table)
-    for note in found.notes():
-        console.print(f"note: {note}", highlight=False)
-    for name, reason in found.left_out.items():
-        console.print(f"left out: {name}: {reason}", highlight=False)
+        rows.append((parameter.kind, parameter.key, f"{centre:.3g}", f"{low:.3g} to {high:.3g}",
+                     f"{share[1] - share[0]:.0%}", told))  # fmt: skip
+    print_table(("parameter", "key", "centre", "95 % interval", "of its range", "told"), rows, width=140)
+    print_lines([f"note: {note}" for note in found.notes()])
+    print_lines([f"left out: {name}: {reason}" for name, reason in found.left_out.items()])

@@ -1,19 +1,11 @@
-"""The `simtest` command: its sub-commands, and errors of one line.
+"""The `simtest` command: runs the application, and reports errors in one line.
 
-Sub-commands are imported when they are called, so that `simtest --help` answers at once.
+It loads nothing before signals are answered, so that a stop in the first moments is a silent one.
 """
 
-import io
-import os
 import sys
-import warnings
 
-from cyclopts import App, CycloptsError
-
-from simtest.cli.stopping import Termination
-from simtest.errors import InputError, SimtestError
-from simtest.runtime.machine_errors import machine_problem
-from simtest.runtime.resources import shown
+from simtest.cli.stopping import INTERRUPTED, TERMINATED, Termination
 
 NARROWEST = 20
 """Columns of a terminal; tables and help cannot be laid out in fewer."""
@@ -21,89 +13,126 @@ NARROWEST = 20
 LONGEST = 900
 """Characters of a line; a longer one is cut."""
 
-APP = App(
-    name="simtest",
-    help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
-    version_flags=["--version"],
-    version=lambda: _version(),
-    # `main` reports what is kept.
-    suppress_keyboard_interrupt=False,
-)
-# Stated here, since a sub-command's own text is loaded with its module.
-_COMMANDS = {
-    "doctor": "Check the rendering backend.",
-    "schema": "Print the JSON schema of a scene, experiment, dataset, camera, calibration or profile file.",
-    "render": "Render a scene with its ground truth.",
-    "views": "Pick viewpoints of an anatomy that show isolated highlights.",
-    "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
-    "export": "Write a scene as files that Mitsuba itself loads.",
-    "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
-    "realism": "Measure how far generated frames are from real ones.",
-    "fit": "Fit the ranges of a dataset recipe to real frames.",
-    "validate": "Run an experiment and write its report.",
-    "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
-    "dataset": "Make a labelled dataset for learning, check it, look at it.",
-    "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
-}
-for _name, _help in _COMMANDS.items():
-    APP.command(f"simtest.cli.{_name}:{_name}", help=_help)
-
-INTERRUPTED = 130
-TERMINATED = 143
 BAD_USE = 2
-
-
-def _version() -> str:
-    from simtest.runtime.provenance import version
-
-    return version()
-
-
-def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
 
 
 def main() -> None:
     """Run the command line.
 
     Exit codes: 0 done, 1 could not render, a full disk, or a command's own verdict, 2 bad input, 130 Ctrl-C, 143
-    SIGTERM. Of `nightly`, whose 1 is a regression or an unexplained change, whatever else went wrong is 2.
+    SIGTERM. Of `nightly`, whose 1 is a regression or an unexplained change, whatever else went wrong is 2. A reader of
+    the output that has gone is no error.
     """
+    with Termination() as stop:
+        _mend_terminal()
+        sys.exit(_run(stop))
+
+
+def _run(stop: Termination) -> int:
+    """Run the command and return its exit code."""
+    import warnings
+
+    from simtest.cli.manners import MANNERS, take_flags
+
+    sys.argv[1:], wants_traceback = take_flags(sys.argv[1:])
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
-    _mend_terminal()
-    stop = Termination()
-    if "--traceback" in sys.argv:
-        sys.argv.remove("--traceback")
-        sys.exit(APP())
-    warnings.showwarning = _warn
+    if MANNERS.quiet:
+        warnings.showwarning = lambda *_, **__: None
+    elif not wants_traceback:
+        warnings.showwarning = _warn
+
+    from cyclopts import CycloptsError
+
+    from simtest.cli.commands import APP
+    from simtest.cli.options import gather_settings
+    from simtest.errors import InputError, SimtestError
+
+    words = gather_settings(sys.argv[1:])
+
+    if wants_traceback:
+        with stop.working():
+            return _code(APP(words, result_action="return_value"))
     try:
-        with stop:
+        with stop.working():
+            _require_folder()
+            if MANNERS.quiet and MANNERS.verbose:
+                raise InputError("--quiet and --verbose exclude each other; give one of them")
             # A command's result is its exit code.
-            code = APP(exit_on_error=False, print_error=False, result_action="return_value")
-        # Output may wait in a buffer whose reader has gone.
+            code = _code(APP(words, exit_on_error=False, print_error=False, result_action="return_value"))
+        # Output may wait in a buffer whose reader has gone, or whose disk is full.
         if sys.stdout is not None:
             sys.stdout.flush()
+        return code
     except (CycloptsError, InputError) as error:
-        sys.exit(_report(str(error), BAD_USE))
+        return _report(str(error), BAD_USE)
     except SimtestError as error:
-        sys.exit(_report(str(error), failed))
+        return _report(str(error), failed)
     except KeyboardInterrupt as stopped:
         kept = "what is finished is kept, and the same command goes on from there"
         how = "terminated" if stop.came else "stopped"
-        sys.exit(_report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED))
+        return _report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        _discard_output()
+        return 0
     except Exception as error:
-        what = machine_problem(error) or (
-            f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
-        )
-        sys.exit(_report(what, failed))
-    sys.exit(code if isinstance(code, int) else 0)
+        return _report(_problem(error), failed)
+
+
+def _problem(error: Exception) -> str:
+    """Return an error that no command foresaw as text: of the output, of the machine, or of the program."""
+    from simtest.runtime.machine_errors import machine_problem
+
+    # Only the output's stream has neither a name nor a reason of its own to fail.
+    what = machine_problem(error)
+    if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
+        return f"the output cannot be written ({what})"
+    return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+
+
+def _output_fails() -> bool:
+    """Return whether what is printed cannot be written; then it is given up, or Python would say so at its end."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError, AttributeError):
+        _discard_output()
+        return True
+    return False
+
+
+def _discard_output() -> None:
+    import os
+
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _code(result: object) -> int:
+    return result if isinstance(result, int) else 0
+
+
+def _require_folder() -> None:
+    """Raise `InputError` where the working folder was deleted: libraries and child processes end without one."""
+    import os
+
+    from simtest.errors import InputError
+
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        if not {"--help", "-h", "--version"} & set(sys.argv):
+            raise InputError("the working folder was deleted; change to another one") from None
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    from simtest.runtime.resources import shown
+
+    print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
 
 
 def _mend_terminal() -> None:
     """Let output never fail: characters that a terminal lacks are replaced, and one of no width gets the usual one."""
+    import io
+    import os
+
     for stream in (sys.stdout, sys.stderr):
         # None where it is closed.
         if isinstance(stream, io.TextIOWrapper):
@@ -114,6 +143,8 @@ def _mend_terminal() -> None:
 
 def _report(text: str, code: int) -> int:
     """Print an error as one line and return the exit code."""
+    from simtest.runtime.resources import shown
+
     line = " ".join(text.split())
     print(f"simtest: {shown(line, LONGEST)}", file=sys.stderr)
     return code

@@ -1,6 +1,5 @@
 """`simtest mesh`: check a user's mesh, or make one from a recipe."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -42,6 +41,7 @@ def check(
     kind : str
         Which side the camera is on; auto goes by the shape.
     """
+    from simtest.cli.printing import print_json
     from simtest.errors import InputError
     from simtest.surfaces.fineness import concentration
     from simtest.surfaces.mesh_check import check_mesh
@@ -50,7 +50,7 @@ def check(
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")
     verdict = check_mesh(file, distance, concentration(exponent, roughness), kind)
     if as_json:
-        print(json.dumps(verdict.to_json(), indent=2, allow_nan=False))
+        print_json(verdict)
     else:
         print(*verdict.lines(), sep="\n")
     return 0 if verdict.usable else 1
@@ -71,6 +71,7 @@ class Recipe:
     curvature: Annotated[
         bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
     ] = False
+    as_json: AsJson = False
 
 
 @mesh.command
@@ -86,6 +87,7 @@ def liver(*, options: Recipe) -> None:
 
 
 def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
+    from simtest.cli.printing import print_json
     from simtest.errors import InputError
     from simtest.runtime.locks import exclusive_file
     from simtest.spec import parse_settings
@@ -100,4 +102,8 @@ def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
     with exclusive_file(given.out):
         made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
         write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
-    print(f"{given.out}: {len(made.vertices)} vertices, {len(made.faces)} faces")
+    told = {"file": str(given.out), "vertices": len(made.vertices), "faces": len(made.faces)}
+    if given.as_json:
+        print_json(told)
+    else:
+        print("{file}: {vertices} vertices, {faces} faces".format_map(told))

@@ -5,19 +5,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import Address, EngineName, Variant, named_path, whole_number
+from simtest.cli.options import Address, AsJson, EngineName, Variant, named, named_path, whole_number
 
 if TYPE_CHECKING:
     from simtest.nightly.run import Outcome
 
 nightly = App(name="nightly", help="Run the fixed experiments, compare with the baseline, write the page.")
 
-ProfileName = Annotated[str, Parameter(help="A profile file, or the name of a shipped one: quick, full.")]
+ProfileName = Annotated[
+    str, named("profiles", files=True, help="A profile file, or the name of a shipped one: quick, full.")
+]
 ReportsFolder = Annotated[
     Path, Parameter(name="--reports", help="Folder of history, baselines and pages.", converter=named_path)
 ]
 DEFAULT_REPORTS = Path("reports")
-TABLE_WIDTH = 125
 
 
 @nightly.default
@@ -32,6 +33,7 @@ def run(
         Parameter(help="Processes that work at once; default one for each core, 8 at most.", converter=whole_number),
     ] = None,
     address: Address = None,
+    as_json: AsJson = False,
 ) -> int:
     """Run a profile; exit 0 fine, 1 a regression or a change to explain, 2 it could not be run.
 
@@ -42,7 +44,10 @@ def run(
     except KeyboardInterrupt as stop:
         nothing = "nothing of this night is kept; history, baseline and the last page are as they were"
         raise KeyboardInterrupt(str(stop) or nothing) from None
-    _print(outcome)
+    if as_json:
+        _print_json(outcome)
+    else:
+        _print(outcome)
     return outcome.judged.verdict.exit_code
 
 
@@ -74,17 +79,23 @@ def accept(
     reason: Annotated[str, Parameter(help="Why these numbers are right; stored with them.")],
     profile: ProfileName = "quick",
     reports: ReportsFolder = DEFAULT_REPORTS,
+    as_json: AsJson = False,
 ) -> None:
     """Make the last night's numbers the baseline."""
+    from simtest.cli.printing import print_json
     from simtest.nightly.baseline import accept as accept_night
     from simtest.nightly.baseline import log_note
     from simtest.nightly.layout import Reports
     from simtest.spec import load_profile
 
     folder, name = Reports(reports), load_profile(profile).name
-    if note := log_note(folder, name):
+    note = log_note(folder, name)
+    if note and not as_json:
         print(note)
     accepted = accept_night(folder, name, reason)
+    if as_json:
+        print_json({"baseline": accepted.id, "profile": accepted.profile, "reason": accepted.reason, "note": note})
+        return
     print(f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}")
 
 
@@ -94,22 +105,31 @@ def _cores() -> int:
     return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
+def _print_json(outcome: "Outcome") -> None:
+    """Print the verdict as it stands in the folder of the last run, with the page."""
+    import json
+
+    from simtest.cli.printing import print_files
+    from simtest.nightly.outputs import VERDICT
+
+    told = json.loads((outcome.folder / VERDICT).read_text(encoding="utf-8"))
+    print_files([outcome.folder / "index.html"], True, **told)
+
+
 def _print(outcome: "Outcome") -> None:
     """Print what the gate says, a table by experiment, and where the page lies."""
-    from rich.console import Console
-    from rich.table import Table
-
+    from simtest.cli.printing import print_table
     from simtest.nightly.phrases import headline
     from simtest.nightly.records import OUTCOMES
 
     judged, verdict = outcome.judged, outcome.judged.verdict
     counts = OUTCOMES if verdict.baseline is not None else ()
     columns = ("experiment", "rows", "answered", "missed", "false", *counts)
-    table = Table(*columns, title=f"{judged.run.record.profile}: {headline(verdict)}", title_justify="left")
-    for values in judged.by_experiment().select(columns).iter_rows():
-        table.add_row(*("" if value is None else str(value) for value in values))
-    console = Console(width=TABLE_WIDTH)
-    console.print(table)
+    rows = [
+        ["" if value is None else str(value) for value in values]
+        for values in judged.by_experiment().select(columns).iter_rows()
+    ]
+    print_table(columns, rows, title=f"{judged.run.record.profile}: {headline(verdict)}")
     # The cause first, then what else a reader must know.
     print(*verdict.causes, sep="\n", end="\n" * bool(verdict.causes))
     print(*verdict.notes, sep="\n", end="\n" * bool(verdict.notes))

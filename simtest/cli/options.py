@@ -1,10 +1,14 @@
 """Options that several commands share."""
 
+import glob
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
+
+_SEPARATOR = "\0"
+"""No argument of a command can hold it."""
 
 
 def whole_number(_: Any, tokens: Sequence[Token]) -> int:
@@ -30,10 +34,51 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
 def replacing(example: str) -> Parameter:
     """Return the option that replaces values of a file, with an example of one in its help."""
     text = f"Replace a value: key=value, such as {example}; may be repeated."
-    return Parameter(name="--set", negative="", help=text)
+    return Parameter(name="--set", negative="", help=text, converter=_gathered)
 
 
-SceneName = Annotated[str, Parameter(help="A scene file, or the name of a shipped scene.")]
+def gather_settings(words: Sequence[str]) -> list[str]:
+    """Join the values of all ``--set`` of a command line in one: parsing takes time with the square of their number."""
+    end = list(words).index("--") if "--" in words else len(words)
+    others, values, first, i = list[str](), list[str](), -1, 0
+    while i < len(words):
+        is_pair = words[i] == "--set" and i + 1 < end and not words[i + 1].startswith("-")
+        if is_pair:
+            first = len(others) if first < 0 else first
+            values.append(words[i + 1])
+        else:
+            others.append(words[i])
+        i += 1 + is_pair
+    return [*others[:first], "--set", _SEPARATOR.join(values), *others[first:]] if values else others
+
+
+def _gathered(_: Any, tokens: Sequence[Token]) -> list[str]:
+    return [value for token in tokens for value in token.value.split(_SEPARATOR)]
+
+
+def named(kind: str, files: bool = False, **options: Any) -> Parameter:
+    """Return the parameter of a name that `simtest list` knows, which a shell completes; or of a TOML file."""
+
+    def names(context: Any) -> dict[str, str]:
+        from simtest.cli.listing import names_of
+
+        return names_of(kind) | (_toml_files(context.incomplete) if files else {})
+
+    # Older releases of cyclopts complete no names.
+    if hasattr(Parameter, "completer"):
+        options["completer"] = names
+    return Parameter(**options)
+
+
+def _toml_files(begun: str) -> dict[str, str]:
+    """Return the folders and TOML files whose path begins so."""
+    folder, _, start = begun.rpartition("/")
+    found = sorted(Path(folder or ("/" if begun.startswith("/") else ".")).glob(f"{glob.escape(start)}*"))
+    head = begun[: len(begun) - len(start)]
+    return {f"{head}{path.name}{'/' * path.is_dir()}": "" for path in found if path.is_dir() or path.suffix == ".toml"}
+
+
+SceneName = Annotated[str, named("scenes", files=True, help="A scene file, or the name of a shipped scene.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
@@ -44,7 +89,8 @@ Variant = Annotated[
     ),
 ]
 Estimators = Annotated[
-    list[str] | None, Parameter(name="--estimator", negative="", help="Estimator by name; may be repeated.")
+    list[str] | None,
+    named("estimators", name="--estimator", negative="", help="Estimator by name; may be repeated."),
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]

@@ -1,12 +1,19 @@
-"""A progress bar with time left, on the error stream, and a stop between two steps."""
+"""Progress on the error stream: a bar with time left at a terminal, else plain lines; and a stop between two steps."""
 
 import signal
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
+
+from simtest.cli.manners import MANNERS
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+LINE_EVERY_S = 10.0
+"""Of a log; work that takes less leaves no line."""
 
 
 @contextmanager
@@ -34,43 +41,103 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
+class Display(Protocol):
+    """What shows the steps of some work."""
+
+    def show(self, done: int, total: int, what: str) -> None:
+        """Show how many steps are done, and the present one."""
+
+    def close(self) -> None:
+        """End the display."""
+
+
 @contextmanager
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
-    """Show a bar while the body runs, and yield the callable that moves it: (done, total, what).
+    """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
 
     `afterwards` is what the body does once all steps are done, unless the last step says itself how it ended: with a
     text that ends in "written". A single step shows no bar. What comes after all steps of a bar, such as the steps of
     a page, has a bar of its own below.
     """
-    bar: Progress | None = None
-    task: TaskID | None = None
+    display: Display | None = None
     with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
-            nonlocal bar, task
+            nonlocal display
             check()
-            if bar is None:
+            if display is None:
                 if done == total:
                     return
                 # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
-                bar = _bar()
-                task = bar.add_task("starting", total=None)
-                bar.start()
-            assert task is not None
-            if done < total and bar.tasks[-1].finished:
-                bar.update(task, description="done")
-                task = bar.add_task(what, total=total)
-            described = afterwards if done == total and not what.endswith("written") else what
-            bar.update(task, completed=done, total=total, description=described)
+                display = _display()
+            display.show(done, total, afterwards if done == total and not what.endswith("written") else what)
 
         try:
             yield move
         finally:
-            if bar is not None:
-                bar.stop()
+            if display is not None:
+                display.close()
 
 
-def _bar() -> "Progress":
+def at_terminal() -> bool:
+    """Return whether a person sees the error stream."""
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+def _display() -> Display:
+    if MANNERS.quiet:
+        return _Nothing()
+    return _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
+
+
+class _Nothing:
+    def show(self, done: int, total: int, what: str) -> None:
+        """Show nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class _Lines:
+    """Plain lines for a log: one in `LINE_EVERY_S`, or with --verbose one a step."""
+
+    def __init__(self) -> None:
+        self.began = self.told = time.monotonic()
+
+    def show(self, done: int, total: int, what: str) -> None:
+        """Print a line where the last one is old enough."""
+        now = time.monotonic()
+        if not MANNERS.verbose and now - self.told < LINE_EVERY_S:
+            return
+        self.told, passed = now, now - self.began
+        left = f", about {passed * (total - done) / done:.0f} s left" if 0 < done < total and passed >= 1 else ""
+        print(f"simtest: {done}/{total} {what} ({passed:.0f} s{left})", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Do nothing: the command says what came of it."""
+
+
+class _Bar:
+    """A bar for each stretch of the work."""
+
+    def __init__(self) -> None:
+        self.bar = _rich_bar()
+        self.task: TaskID = self.bar.add_task("starting", total=None)
+        self.bar.start()
+
+    def show(self, done: int, total: int, what: str) -> None:
+        """Move the bar, or begin the next."""
+        if done < total and self.bar.tasks[-1].finished:
+            self.bar.update(self.task, description="done")
+            self.task = self.bar.add_task(what, total=total)
+        self.bar.update(self.task, completed=done, total=total, description=what)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        self.bar.stop()
+
+
+def _rich_bar() -> "Progress":
     """Return a bar on the error stream."""
     from rich import progress as rich
     from rich.console import Console

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Out, Seed, whole_number
+from simtest.cli.options import AsJson, Out, Seed, whole_number
 
 if TYPE_CHECKING:
     from simtest.realism.comparison import Comparison
@@ -27,6 +27,7 @@ def realism(
         Parameter(name="--surface", negative="", help="Take samples of this surface alone; may be repeated."),
     ] = None,
     seed: Seed = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure how far generated frames are from real ones, statistic by statistic; write a page and JSON.
 
@@ -36,6 +37,7 @@ def realism(
         Real colour frames: pictures, films, or folders of pictures. A film is one scene, and so is a folder whose name
         ends in .film; any other picture is a scene of its own.
     """
+    from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
     from simtest.realism.comparison import compare
     from simtest.realism.frame_sets import open_frames, open_generated
@@ -50,24 +52,22 @@ def realism(
             page = write_comparison(found, out, against, command, progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("an earlier page stays; the same command begins anew") from None
+    if as_json:
+        print_files([page], as_json, **found.to_json())
+        return
     _print_table(found)
     print(page)
 
 
 def _print_table(found: "Comparison") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+    from simtest.cli.printing import print_lines, print_table
     from simtest.realism.distance import distance_text
 
-    table = Table("statistic", "distance", "95 % interval", "scenes, real / generated", "verdict")
+    rows = []
     for d in found.distances:
         interval = f"{distance_text(d.interval[0])} to {distance_text(d.interval[1])}"
-        table.add_row(
-            d.statistic.title, distance_text(d.distance), interval, f"{d.n_real} / {d.n_generated}", d.verdict
-        )
-    console = Console(width=125)
-    console.print(table)
-    for frame in found.left_out:
-        console.print(f"left out: {frame.frame}: {frame.reason}", highlight=False, markup=False)
-    console.print(found.verdict, highlight=False)
+        counts = f"{d.n_real} / {d.n_generated}"
+        rows.append((d.statistic.title, distance_text(d.distance), interval, counts, d.verdict))
+    print_table(("statistic", "distance", "95 % interval", "scenes, real / generated", "verdict"), rows)
+    print_lines([f"left out: {frame.frame}: {frame.reason}" for frame in found.left_out])
+    print(found.verdict)

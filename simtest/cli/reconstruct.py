@@ -6,15 +6,56 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Estimators, Out, named_path
+from simtest.cli.manners import MANNERS
+from simtest.cli.options import AsJson, Estimators, Out, named, named_path
+from simtest.cli.printing import MOST_ROWS, counted, print_files, print_json, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from simtest.reconstruction.assumptions import Assumption
     from simtest.reconstruction.description import PictureRecord, SpecularityRecord
+    from simtest.reconstruction.picture import Options
 
-TABLE_WIDTH = 125
+Calibrated = Annotated[
+    Path | None,
+    Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
+]
+FieldOfView = Annotated[float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")]
+Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
+Encoding = Annotated[
+    Literal["srgb", "linear"] | None,
+    Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
+]
+DetectorName = Annotated[
+    str,
+    named(
+        "detectors",
+        help="colour: by the tissue's colour; peaks; or the name of another package's. "
+        "auto: by colour where there is any.",
+    ),
+]
+Smoothing = Annotated[float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")]
+Target = Annotated[
+    Literal["fine", "base"],
+    Parameter(help="Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
+]
+Every = Annotated[
+    bool,
+    Parameter(
+        name="--all",
+        negative="",
+        help="Take peaks too that the border cuts or whose shape is not that of one point highlight.",
+    ),
+]
+Reference = Annotated[Path | None, Parameter(help="Mesh in mm, or depth map, that the normals are compared with.")]
+Pose = Annotated[
+    Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
+]
+Depth = Annotated[
+    str | None, Parameter(help="Depth at which normals.ply and arrows.ply stand: mm, or a depth map; default 1.")
+]
+DepthScale = Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")]
 
 
 def reconstruct(
@@ -22,51 +63,20 @@ def reconstruct(
     /,
     *,
     out: Out,
-    camera: Annotated[
-        Path | None,
-        Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
-    ] = None,
-    fov: Annotated[
-        float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")
-    ] = None,
+    camera: Calibrated = None,
+    fov: FieldOfView = None,
     estimators: Estimators = None,
-    roi: Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")] = None,
-    encoding: Annotated[
-        Literal["srgb", "linear"] | None,
-        Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
-    ] = None,
-    detector: Annotated[
-        str,
-        Parameter(
-            help="colour: by the tissue's colour; peaks; or the name of another package's. "
-            "auto: by colour where there is any."
-        ),
-    ] = "auto",
-    smoothing: Annotated[
-        float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")
-    ] = None,
-    target: Annotated[
-        Literal["fine", "base"],
-        Parameter(help="Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
-    ] = "fine",
-    every: Annotated[
-        bool,
-        Parameter(
-            name="--all",
-            negative="",
-            help="Take peaks too that the border cuts or whose shape is not that of one point highlight.",
-        ),
-    ] = False,
-    reference: Annotated[
-        Path | None, Parameter(help="Mesh in mm, or depth map, that the normals are compared with.")
-    ] = None,
-    camera_from_model: Annotated[
-        Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
-    ] = None,
-    depth: Annotated[
-        str | None, Parameter(help="Depth at which normals.ply and arrows.ply stand: mm, or a depth map; default 1.")
-    ] = None,
-    depth_scale: Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")] = None,
+    roi: Roi = None,
+    encoding: Encoding = None,
+    detector: DetectorName = "auto",
+    smoothing: Smoothing = None,
+    target: Target = "fine",
+    every: Every = False,
+    reference: Reference = None,
+    camera_from_model: Pose = None,
+    depth: Depth = None,
+    depth_scale: DepthScale = None,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
 
@@ -85,54 +95,78 @@ def reconstruct(
     box = None if roi is None else parse_roi(roi)
     names = None if estimators is None else tuple(estimators)
     options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target)
-    if not sequence:
-        from simtest.api import Extras, reconstruct_picture
+    if sequence:
+        _sequence(image, out, options, as_json)
+        return
+    from simtest.api import Extras, reconstruct_picture
 
-        extras = Extras(reference, camera_from_model, depth, depth_scale)
-        record, files = reconstruct_picture(image, out, options, extras)
-        _print_tables(record)
-        if record.stated is not None:
-            print(f"stated: {record.stated}")
-        _print_assumed(record.assumed)
-        count = len(record.specularities)
-        print(f"{count} specularit{'y' if count == 1 else 'ies'} found in {image}")
-    else:
-        from simtest.cli.progress import progress_bar
-        from simtest.reconstruction.sequence import reconstruct_sequence
+    record, files = reconstruct_picture(image, out, options, Extras(reference, camera_from_model, depth, depth_scale))
+    if as_json:
+        print_files(files, as_json, **record.to_json())
+        return
+    _print_tables(record)
+    if record.stated is not None:
+        print(f"stated: {record.stated}")
+    _print_assumed(record.assumed)
+    print(f"{counted(len(record.specularities), 'specularity', 'specularities')} found in {image}")
+    print_files(files, as_json)
 
-        with progress_bar("writing the tables") as progress:
-            made = reconstruct_sequence(image, out, options, progress)
-        files = made.files
-        _print_assumed(made.assumed)
-        unread = f", {made.failed} unreadable" if made.failed else ""
-        print(f"{made.frames} frames{unread}: {made.specularities} specularities, {made.tracks} seen in several frames")
-    for file in files:
-        print(file)
+
+def _sequence(source: Path, out: Path, options: "Options", as_json: bool) -> None:
+    """Reconstruct the frames of a folder or a video, and print what came of them."""
+    from dataclasses import asdict
+
+    from simtest.cli.progress import progress_bar
+    from simtest.reconstruction.sequence import reconstruct_sequence
+
+    with progress_bar("writing the tables") as progress:
+        made = reconstruct_sequence(source, out, options, progress)
+    if as_json:
+        print_json(asdict(made))
+        return
+    _print_assumed(made.assumed)
+    unread = f", {made.failed} unreadable" if made.failed else ""
+    found = counted(made.specularities, "specularity", "specularities")
+    print(f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames")
+    print_files(made.files, as_json)
 
 
 def _print_tables(record: "PictureRecord") -> None:
-    """Print the best normal of each specularity, and how the estimators compare with a reference."""
-    from rich.console import Console
-    from rich.table import Table
-
-    # Without the names of emojis, which take as long to load as the table to print.
-    console = Console(emoji=False)
-    # Narrower, normals would be cut off.
-    console.width = max(console.width, TABLE_WIDTH)
-    if record.specularities:
-        table = Table("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
-        for spot in record.specularities:
-            table.add_row(*_cells(spot))
-        console.print(table)
+    """Print the best normals, or a summary of many, and how the estimators compare with a reference."""
+    spots = record.specularities
+    if len(spots) > MOST_ROWS and not MANNERS.verbose:
+        _print_summary(spots)
+    elif spots:
+        columns = ("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
+        print_table(columns, [_cells(spot) for spot in spots])
     if (compared := record.reference) is not None:
         for problem in compared.problems:
             print(f"reference: {problem}")
-        table = Table("estimator", "n", "mean ± std (deg)", "better candidate (deg)")
-        for name, errors in compared.estimators.items():
-            proposed = _pair(errors.mean_deg, errors.std_deg)
-            table.add_row(name, str(errors.n), proposed, _pair(errors.mean_oracle_deg, errors.std_oracle_deg))
-        console.print(table)
+        rows = [
+            (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
+             _pair(errors.mean_oracle_deg, errors.std_oracle_deg))
+            for name, errors in compared.estimators.items()
+        ]  # fmt: skip
+        print_table(("estimator", "n", "mean ± std (deg)", "better candidate (deg)"), rows)
         print(f"{compared.missed} sightlines miss {compared.source}")
+
+
+def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
+    """Print how many specularities of each kind have which best estimator, and what that states."""
+    from statistics import median
+
+    from simtest.reconstruction.ranking import deviation_deg
+
+    groups: dict[tuple[str, str], list[SpecularityRecord]] = {}
+    for spot in spots:
+        groups.setdefault((spot.kind or "", spot.best or "none"), []).append(spot)
+    rows = []
+    for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
+        stated = [d for s in held if s.best_estimate and (d := deviation_deg(s.best_estimate)) is not None]
+        flagged = sum(bool(s.best_estimate and s.best_estimate.flags) for s in held)
+        rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", str(flagged)))
+    print_table(("kind", "best", "n", "median ± deg", "flagged"), rows)
+    print(f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them")
 
 
 def _print_assumed(assumed: "Sequence[Assumption]") -> None:

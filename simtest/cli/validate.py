@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from simtest.cli.options import (
     Address,
+    AsJson,
     EngineName,
     Estimators,
     Realisations,
@@ -16,6 +17,7 @@ from simtest.cli.options import (
     Settings,
     Variant,
     Workers,
+    named,
     named_path,
 )
 
@@ -23,7 +25,7 @@ DEFAULT_OUT = Path("reports/runs")
 
 
 def validate(
-    experiment: str,
+    experiment: Annotated[str, named("experiments", files=True)],
     /,
     *,
     out: Annotated[
@@ -37,6 +39,7 @@ def validate(
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
+    as_json: AsJson = False,
 ) -> None:
     """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
 
@@ -48,6 +51,8 @@ def validate(
         mesh, paper, paper_limits.
     """
     from simtest.api import validate as run
+    from simtest.cli.guide_table import print_guide
+    from simtest.cli.printing import print_run
     from simtest.cli.progress import progress_bar
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
@@ -61,5 +66,9 @@ def validate(
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
-        page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
-    print(page)
+        run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
+    if as_json:
+        print_run(folder)
+        return
+    print_guide(folder)
+    print(folder / "index.html")

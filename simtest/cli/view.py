@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import SceneName, Settings, Variant, named_path
+from simtest.cli.options import AsJson, SceneName, Settings, Variant, named_path
 
 
 def view(
@@ -18,8 +18,10 @@ def view(
     ] = None,
     settings: Settings = None,
     variant: Variant = None,
+    as_json: AsJson = False,
 ) -> None:
     """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals."""
+    from simtest.cli.printing import print_files
     from simtest.report.viewer import check_target, make_content, save_screenshot, show
     from simtest.runtime.locks import exclusive_file
     from simtest.spec import load_scene, parse_settings
@@ -31,4 +33,4 @@ def view(
         return
     with exclusive_file(screenshot, "--screenshot"):
         save_screenshot(make_content(described, variant), screenshot)
-    print(screenshot)
+    print_files([screenshot], as_json)

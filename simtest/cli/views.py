@@ -4,7 +4,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import Out, SceneName, Settings, Variant, whole_number
+from simtest.cli.options import AsJson, Out, SceneName, Settings, Variant, whole_number
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
 
@@ -20,12 +20,14 @@ def views(
     ] = None,
     settings: Settings = None,
     variant: Variant = None,
+    as_json: AsJson = False,
 ) -> None:
     """Pick viewpoints of an anatomy that show isolated highlights: views.json, a picture of each, a sheet of all.
 
     With --along, a film along the camera path instead.
     """
     from simtest import api
+    from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
     from simtest.spec import parse_settings
 
@@ -33,6 +35,10 @@ def views(
     with progress_bar("sampling views") as move:
         sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends)
     with_one = sum(view.isolated_highlights > 0 for view in sampled.views)
+    if as_json:
+        told = {"tried": sampled.tried, "kept": len(sampled.views), "with_isolated_highlight": with_one}
+        print_files([out / "views.json"], as_json, **told, left_out=sampled.rejected)
+        return
     print(f"{with_one} of {sampled.tried} views show an isolated highlight")
     for reason, number in sampled.rejected.items():
         print(f"left out: {number} ({reason})")

@@ -32,7 +32,31 @@ _ESTIMATE_SCHEMA = {
 
 @dataclass(frozen=True)
 class SampleRow:
-    """Row of index.parquet: a sample, and its bytes in the shard."""
+    """Row of index.parquet: a sample, and its bytes in the shard.
+
+    Parameters
+    ----------
+    index, key, split : int, str, str
+        Number of the sample, its key in the shard, and the split that it belongs to.
+    shard, offset, bytes : str, int, int
+        File of the shard, and where in it the sample's members start and how long they are, bytes.
+    family, surface, anatomy, anatomy_seed : int, str, int, int or None
+        Number of the recipe's family, kind of surface, number of the anatomy, and its seed.
+    attempt : int
+        Which draw was taken, from 0.
+    width, height : int
+        Of the frame, px.
+    full_scale : float
+        Radiance of the picture's largest value.
+    depth_scale_mm : float
+        Unit of the stored depth, mm.
+    n_highlights, n_isolated, n_detections : int
+        True highlights, isolated ones of these, and detections.
+    drawn : str
+        The drawn values by key path, as JSON.
+    instrument_share : float or None
+        Share of the pixels that show an instrument; None where the scene lists none.
+    """
 
     index: int
     key: str
@@ -71,7 +95,35 @@ class SampleRow:
 
 @dataclass(frozen=True)
 class HighlightRow:
-    """Row of highlights.parquet: a true highlight of a sample; camera frame."""
+    """Row of highlights.parquet: a true highlight of a sample; camera frame.
+
+    Parameters
+    ----------
+    index, split : int, str
+        The sample, and its split.
+    highlight, light : int
+        Number of the highlight in the sample, and of the light that makes it.
+    isolated, why_not : bool, str or None
+        Whether it is isolated, and the first condition that fails where it is not.
+    bp_x_px, bp_y_px : float
+        Its brightest point, px.
+    x_mm, y_mm, z_mm : float
+        Its point on the surface, mm.
+    normal_x, normal_y, normal_z : float
+        Unit normal of the fine surface there.
+    distance_mm : float
+        Distance of that point from the camera, mm.
+    kd_min, kd_max : float
+        Distance times principal curvature of the fine surface.
+    peak_snr : float or None
+        Peak above its surroundings over the noise there; None without noise.
+    normal_base_x, normal_base_y, normal_base_z : float
+        Unit normal of the base, without the relief.
+    kd_min_base, kd_max_base : float
+        Distance times principal curvature of the base.
+    pool : bool
+        Whether the point lies in a pool of the film.
+    """
 
     index: int
     split: str

@@ -16,6 +16,7 @@ from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
 from simtest.spec.dataset_recipe import Dataset, Distribution, Family
+from simtest.spec.type_change import replace_values
 from simtest.surfaces.recipe import load_recipe
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
@@ -135,7 +136,7 @@ class Plan:
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")
-        base = apply_settings(read_toml(path), family.set, f"families.{number}.set")
+        base = replace_values(Scene, read_toml(path), family.set, f"families.{number}.set")
         base.setdefault("name", f"{self.dataset.name}-{number}"[:80])
         return base
 
@@ -324,7 +325,7 @@ def spec_files(dataset: Dataset) -> Iterator[Path]:
     for family in dataset.families:
         path = find(family.scene, "scenes")
         yield path
-        data = apply_settings(read_toml(path), family.set, str(path))
+        data = replace_values(Scene, read_toml(path), family.set, str(path))
         surface = data.get("surface", {})
         if surface.get("type") == "anatomy":
             yield find(surface["path"], "meshes")

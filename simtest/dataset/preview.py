@@ -17,8 +17,10 @@ from simtest.dataset.metadata import has_relief
 from simtest.dataset.reader import open_manifest, read_samples, shard_names
 from simtest.dataset.sample import Sample
 from simtest.errors import InputError
+from simtest.pages import palette
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.files import write_atomically
+from simtest.runtime.machine_errors import cannot_write
 
 WIDTH = 240
 """Width of a thumbnail, px."""
@@ -28,7 +30,7 @@ CURVATURE_END = 0.15
 
 MAX_SAMPLES = 500
 
-_FRAME_COLOUR, _HIGHLIGHT_COLOUR = "#0072B2", (245, 217, 10)
+_FRAME_COLOUR, _HIGHLIGHT_COLOUR = palette.SERIES[0], palette.rgb(palette.TRUTH)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     try:
         write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"--out {page}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, f"--out {page}", page) from error
     return page
 
 

@@ -41,9 +41,9 @@ class FittedArc:
 
 
 def fit_arc(points: npt.ArrayLike) -> FittedArc | Failure:
-    """Fit an ellipse to an arc, array_like of shape (N, 2): minimise the sum of (F / |grad F|)^2, F the conic's value.
+    """Fit an ellipse to an arc, array_like of shape (N, 2): the least sum of `(F / |grad F|)^2`, F the conic's value.
 
-    The ellipse is |L^T (x - c)| = 1 with L lower triangular, so every step stays an ellipse. The direct fit is the
+    The ellipse is `|L^T (x - c)| = 1` with L lower triangular, so every step stays an ellipse. The direct fit is the
     starting point. A Failure where `fit_ellipse` fails, where the fit does not converge to an ellipse, and, with the
     reason ``too_few_points``, for arcs shorter than 120 deg.
 

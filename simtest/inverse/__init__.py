@@ -1,6 +1,7 @@
-"""The estimator that differentiates the renderer; no other estimator may import it.
+"""`inverse_rendering`: a quadric patch fitted by differentiating the renderer, as a reference for the others.
 
-`estimator` fits a `rendered_quadric`, whose radiance and derivatives come from `patch_renderer`.
+No other estimator may import it. `estimator` fits a `rendered_quadric`, whose radiance and derivatives come from
+`patch_renderer`.
 """
 
 from simtest.inverse.estimator import InverseRendering, inverse_rendering

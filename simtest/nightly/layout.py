@@ -12,6 +12,7 @@ from pathlib import Path
 from simtest.errors import InputError
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import exclusive_file, is_held, waiting_for
+from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown
 
 LOCK = "lock"
@@ -49,7 +50,7 @@ class Reports:
         except FileExistsError:
             raise InputError(f"--reports {shown(self.root)}: is a file; must be a folder") from None
         except OSError as error:
-            raise InputError(f"--reports {shown(self.root)}: cannot be written ({error.strerror})") from error
+            raise cannot_write(error, f"--reports {shown(self.root)}", self.root) from error
 
 
 def new_run_id(now: datetime) -> str:

@@ -5,6 +5,7 @@ import errno
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
@@ -16,6 +17,10 @@ from simtest.runtime.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
 LATEST_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
+
+_FAST: dict[str, Any] = {"compression": "zstd", "compression_level": 19}
+_SMALL: dict[str, Any] = {"compression": "brotli", "compression_level": 11}
+"""4 % smaller, in seven times the time: for baselines, which stand in git."""
 
 _OF_THE_DISK = {
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
@@ -46,15 +51,12 @@ def save_run(folder: Path, run: NightlyRun, rows_file: str, columns: Sequence[st
     rows = run.rows if columns is None else run.rows.select(name for name in columns if name in run.rows.columns)
     # The record comes last: it holds the hashes of the tables.
     tables = {rows_file: rows, FIGURES_FILE: run.figures}
+    how = _FAST if columns is None else _SMALL
     for name, table in tables.items():
-        write_atomically(folder / name, lambda part, table=table: _write(table, part))  # type: ignore[misc]
+        write_atomically(folder / name, lambda part, table=table: table.write_parquet(part, **how))  # type: ignore[misc]
     hashes = {name: file_hash(folder / name) for name in tables}
     write_json(folder / RUN_FILE, {**run.record.to_json(), "files": hashes})
     sync_folder(folder)
-
-
-def _write(table: pl.DataFrame, path: Path) -> None:
-    table.write_parquet(path, compression="zstd", compression_level=19)
 
 
 def load_run(folder: Path, rows_file: str) -> NightlyRun:

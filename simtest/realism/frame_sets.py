@@ -12,7 +12,7 @@ from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
 from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.limits import check_count
+from simtest.runtime.limits import check_count, check_file
 from simtest.runtime.resources import shown
 from simtest.spec.scene import Scene, load_scene
 
@@ -50,8 +50,7 @@ def open_frames(paths: Sequence[Path]) -> list[NamedFrame]:
     frames: list[NamedFrame] = []
     for path in paths:
         if not is_sequence(path):
-            if not path.is_file():
-                raise InputError(f"{shown(path)}: no such file; must be a picture, a film or a folder of pictures")
+            check_file(path, "picture_bytes", "a picture, a film or a folder of pictures")
             frames.append(NamedFrame(str(path), path.name, partial(read_picture, path)))
             continue
         source = open_source(path)

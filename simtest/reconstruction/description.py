@@ -25,6 +25,9 @@ from simtest.spec import describe_camera
 
 Points = list[list[float]]
 
+SAME_GLINT_PX = 2.5
+"""A glint of a cloud and a highlight whose peaks are nearer to each other are the same: two detectors found them."""
+
 FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
 
 
@@ -252,6 +255,23 @@ def _cloud_outline(result: Estimate, camera: Camera) -> list[Points]:
         return []
     look = camera.unproject(result.look_px)
     return [drawable(camera.project(result.cloud.outline(result.normal, look)))]
+
+
+def members(spots: Sequence[SpecularityRecord]) -> dict[int, int]:
+    """Return the specularity of the cloud that each single highlight belongs to, by the highlight's id.
+
+    A highlight belongs to a cloud where one of the cloud's glints lies within `SAME_GLINT_PX` of its peak.
+    """
+    found: dict[int, int] = {}
+    single = [spot for spot in spots if spot.peak_px is not None]
+    peaks = np.array([spot.peak_px for spot in single]).reshape(-1, 2)
+    for spot in spots:
+        for result in spot.normals.values():
+            if result.cloud is not None and single:
+                apart = np.linalg.norm(peaks[:, None] - result.cloud.points_px[None], axis=2).min(axis=1)
+                near = np.flatnonzero(apart < SAME_GLINT_PX)
+                found |= {single[i].id: spot.id for i in near}
+    return found
 
 
 def _clouds_json(spot: SpecularityRecord) -> list[JsonObject]:

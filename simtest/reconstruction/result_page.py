@@ -1,7 +1,9 @@
 """The pages of a picture and of a sequence: one file each that needs nothing else, but for a sequence's pictures."""
 
 import base64
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -11,9 +13,11 @@ import numpy.typing as npt
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.budget import deviations
+from simtest.geometry.vectors import basis_across
 from simtest.pages.html import write_page
 from simtest.pages.style import colours
-from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord
+from simtest.reconstruction import explanations
+from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
 from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.arrays import Image
@@ -24,26 +28,34 @@ MAX_PICTURE_BYTES = 1_200_000
 LEAST_FRAMES = 3
 """Shorter tracks are counted, not listed."""
 
+HALF = 0.5
+"""Isovalue of the isophote that is drawn of every highlight."""
+
 
 def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> None:
     """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
     spots = record.specularities
     palette = colours(name for spot in spots for name in spot.estimates)
+    belongs = members(spots)
     data = {
-        "spots": [_spot(spot, palette) for spot in spots],
+        "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
         "others": [
             {"kind": h.kind, "outline": _rounded(h.outline, 1), "peak": np.add(h.region.peak, 0.5).tolist(),
              "score": h.score}
             for h in (*record.other_highlights, *(s.highlight for s in spots if s.highlight and s.peak_px is None))
         ],
         "colours": palette,
+        "words": {name: getattr(explanations, name.upper()) for name in ("flags", "kinds", "reasons", "parts")},
     }  # fmt: skip
     height, width = picture.shape[:2]
-    address = _data_address(picture)
-    title, stated = Path(record.image).name, str(record.stated or "")
+    best, stated = Counter(spot.best for spot in spots if spot.best), record.stated
+    # Parts below a hundredth of the whole change nothing that is shown.
+    told = [] if stated is None else [p for p in stated.parts_deg.items() if p[1] >= 0.01 * stated.median_deg]
     write_page(
-        path, "picture.html.j2", data, record=record, stated=stated, picture=address, title=title, width=width,
-        height=height,
+        path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_data_address(picture),
+        title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
+        answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
+        others=len(data["others"]), parts=explanations.PARTS,
     )  # fmt: skip
 
 
@@ -58,7 +70,12 @@ def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequ
         "position": {frame.index: i for i, frame in enumerate(frames)},
     }  # fmt: skip
     listed = [track for track in tracks if len(track.frames) >= LEAST_FRAMES]
-    write_page(path, "sequence.html.j2", data, count=len(frames), tracks=listed, short=len(tracks) - len(listed))
+    # the longest first: those are what a reader looks for
+    listed.sort(key=lambda track: (-len(track.frames), track.track))
+    write_page(
+        path, "sequence.html.j2", data, count=len(frames), tracks=listed, short=len(tracks) - len(listed),
+        terms=explanations.TERMS,
+    )  # fmt: skip
 
 
 def _data_address(picture: Image) -> str:
@@ -74,41 +91,83 @@ def _data_address(picture: Image) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
 
 
-def _spot(spot: SpecularityRecord, palette: dict[str, str]) -> JsonObject:
+@dataclass
+class _Lines:
+    """Lines to draw, each kept once: estimators share isophotes and fitted curves."""
+
+    kept: list[Points] = field(default_factory=list)
+
+    def index(self, line: Points) -> int:
+        """Return the index of a line, px, after rounding to what can be seen."""
+        # A tenth of a pixel cannot be seen, and the digits would double the page.
+        rounded = _rounded(line, 1)
+        if rounded not in self.kept:
+            self.kept.append(rounded)
+        return self.kept.index(rounded)
+
+
+def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
+    lines = _Lines()
+    rows = [{"name": name, **_row(name, result, spot, lines)} for name, result in spot.estimates.items()]
     return {
         "id": spot.id,
-        "peak": spot.position_px.tolist(),
+        "peak": _rounded(spot.position_px, 2),
         "size": max(spot.box_px[2:]),
         "kind": spot.kind,
         "score": spot.score,
         "best": spot.best,
         "because": spot.best_because,
-        "rows": [
-            {"name": name, "colour": palette[name], **_row(name, result, spot)}
-            for name, result in spot.estimates.items()
-        ],
+        "cloud": cloud_id,
+        "lines": lines.kept,
+        "rows": rows,
     }
 
 
-def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord) -> JsonObject:
+def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: _Lines) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": str(result.reason), "detail": result.detail}
-    # Rounded: a tenth of a pixel cannot be seen, and the digits would double the page.
     error = spot.reference.errors.get(name) if spot.reference else None
     drawing = spot.drawings[name]
+    traced = sorted(drawing.isophotes, key=lambda each: abs(each[0] - HALF))
+    # nearest to half height first, which is drawn of every highlight
     return {
         "status": "ok",
         "normals": _rounded(result.candidates, 4),
+        "tilt": round(float(np.degrees(np.arccos(np.clip(-result.normal[2], -1, 1)))), 2),
         "margin": result.choice_margin,
-        "look": [v if np.isfinite(v) else None for v in result.look_px.tolist()],
-        "isophotes": [_rounded(points, 1) for _, points in drawing.isophotes],
-        "curves": [_rounded(curve, 1) for curve in drawing.curves],
+        "look": [v if np.isfinite(v) else None for v in _rounded(result.look_px, 2)],
+        "isophotes": [lines.index(points) for _, points in traced],
+        "curves": [lines.index(curve) for curve in drawing.curves],
         "deviation": deviation_deg(result),
+        "across": None if result.covariance is None else _across(result),
         "target": result.target,
         "parts": {name: round(float(np.degrees(v)), 4) for name, v in deviations(result.budget or {}).items()},
         "flags": result.flags,
         "error": error and error.error_deg,
+        "cloud": _cloud(result),
     }
+
+
+def _across(result: Estimate) -> list[float]:
+    """Return the covariance of the normal's part across the view: xx, xy and yy."""
+    assert result.covariance is not None
+    basis = basis_across(result.normal)[:, :2]
+    seen = basis.T @ result.covariance @ basis
+    return [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
+
+
+def _cloud(result: Estimate) -> JsonObject | None:
+    """Describe the cloud of glints that an estimate stands on."""
+    if (cloud := result.cloud) is None:
+        return None
+    slope = [round(float(np.degrees(v)), 2) for v in (cloud.slope.value, cloud.slope.low, cloud.slope.high)]
+    points = _rounded(cloud.points_px, 1)
+    return {"points": points, "seen": cloud.seen, "ratio": round(cloud.axis_ratio, 3), "slope": slope}
+
+
+def _clouds(spot: SpecularityRecord) -> list[str]:
+    """Return the names of the estimates of a specularity that stand on a cloud."""
+    return [name for name, result in spot.normals.items() if result.cloud is not None]
 
 
 def _rounded(points: npt.ArrayLike, digits: int) -> Points:

@@ -20,7 +20,7 @@ from typing import Any
 
 from simtest.errors import BackendError, InputError
 from simtest.runtime.files import Json, write_json
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import shown, suggestion
 from simtest.runtime.user_cache import user_cache
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
@@ -80,13 +80,16 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
     """Return the Mitsuba variant: the argument, else the environment's SIMTEST_VARIANT, else the default.
 
     A device alone (see `DEVICES`, the default is the processor) is its variant of one channel, or of three where the
-    scene is `coloured`.
+    scene is `coloured`. Raises `InputError` for a name that is no variant's.
     """
     if variant is not None and not variant.strip():
         raise InputError(f"--variant is empty; must be one of {', '.join((*DEVICES, *VARIANTS))}")
     name = variant or os.environ.get(VARIANT_VARIABLE) or LLVM
     if name not in (*DEVICES, *VARIANTS):
-        raise BackendError(f"variant {shown(name, 60)!r}: cannot be used; allowed: {', '.join((*DEVICES, *VARIANTS))}")
+        allowed = (*DEVICES, *VARIANTS)
+        meant = suggestion(name, allowed)
+        given = "variant" if variant else VARIANT_VARIABLE
+        raise InputError(f"{given} {shown(name, 60)!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 
@@ -267,7 +270,7 @@ def release_memory() -> None:
 
 def _limit_threads(threads: str) -> None:
     if not threads.isdecimal() or not 1 <= int(threads) <= 1024:
-        raise BackendError(f"SIMTEST_THREADS = {threads!r}: must be a number of threads, 1 to 1024")
+        raise InputError(f"SIMTEST_THREADS = {threads!r}: must be a number of threads, 1 to 1024")
     import drjit
 
     drjit.set_thread_count(int(threads))
@@ -367,12 +370,12 @@ class BackendReport:
 
 
 def library_report(variant: str | None = None) -> BackendReport:
-    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
+    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered.
+
+    Raises `InputError` for a name that is no variant's.
+    """
     versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
-    try:
-        name = requested_variant(variant)
-    except BackendError as error:
-        return BackendReport(variant or os.environ[VARIANT_VARIABLE], None, [], versions, str(error))
+    name = requested_variant(variant)
     chosen, tried = choose_library() if needs_llvm(name) else (None, [])
     problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
     return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)

@@ -82,12 +82,13 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
         if shape.mesh:
             files.append(out / MESH_FILE)
             mesh = make_shape(mi, shape, {"type": "diffuse"})
-            write_atomically(files[1], lambda part: mesh.write_ply(str(part)))
+            # By way of memory, since Mitsuba does not tell which of the system's errors it met.
+            stream = mi.MemoryStream()
+            mesh.write_ply(stream)
+            write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
         write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
     except OSError as error:
         raise write_error(error, out) from error
-    except RuntimeError as error:
-        raise InputError(f"--out {out}: cannot be written ({error})") from error
     return files
 
 

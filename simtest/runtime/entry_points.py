@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import shown, suggestion
 
 OWN = "simtest"
 """This package's name, and that of its top module."""
@@ -49,7 +50,8 @@ class EntryPointGroup:
         """
         found = self._registered(name)
         if not found:
-            raise InputError(f"{self.kind} {shown(name, 80)!r}: not installed; allowed: {', '.join(self.names())}")
+            names, meant = self.names(), suggestion(name, self.names())
+            raise InputError(f"{self.kind} {shown(name, 80)!r}: not installed; allowed: {', '.join(names)}{meant}")
         if len(found) > 1:
             full = " or ".join(sorted(f"{_package(point)}:{point.name}" for point in found))
             raise InputError(f"{self.kind} {name!r}: registered by {len(found)} packages; name one of them: {full}")
@@ -62,6 +64,10 @@ class EntryPointGroup:
             return found[0].load()
         except Exception as error:
             raise InputError(f"{self.kind} {name!r}: {found[0].value} cannot be imported ({error})") from error
+
+    def described(self) -> dict[str, str]:
+        """Return the first line of each member's module, by name; modules are read, not imported."""
+        return {name: _first_line(point) for name in self.names() for point in self._registered(name)[:1]}
 
     def distributions(self, names: Sequence[str]) -> dict[str, str]:
         """Return package and version of each installed name, by "kind NAME"."""
@@ -82,6 +88,23 @@ class EntryPointGroup:
 def _installed(group: str, _path: tuple[str, ...]) -> EntryPoints:
     """Return a group's entry points of all packages on the path; reading them takes 10 ms each time."""
     return entry_points(group=group)
+
+
+def _first_line(point: EntryPoint) -> str:
+    """Return the first line of what a member's module says of itself, without its own name and references."""
+    import ast
+    from importlib.util import find_spec
+
+    try:
+        spec = find_spec(point.module)
+        if spec is None or spec.origin is None:
+            return ""
+        text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
+    except (ImportError, OSError, ValueError, SyntaxError):
+        # A package that is broken is told of where it is used.
+        return ""
+    line = text.partition("\n")[0].removeprefix(f"`{point.name}`: ")
+    return re.sub(r" [(\[][^()\[\]]*(section|theory)[^()\[\]]*[)\]]", "", line).rstrip(".")
 
 
 def _package(point: EntryPoint) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime.limits import VARIABLE, limit
+from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -20,21 +21,27 @@ JsonObject = dict[str, Any]
 
 
 def refuse_file(folder: Path, option: str = "--out") -> None:
-    """Raise `InputError` if the path of a results folder is a file; `option` is how the user names it."""
+    """Raise `InputError` if the path of a results folder is a file, or a link that leads nowhere.
+
+    `option` is how the user names it.
+    """
+    what = f"{option} {shown(folder)}"
     try:
         if folder.exists() and not folder.is_dir():
-            raise InputError(f"{option} {shown(folder)}: is a file; must be a folder")
+            raise InputError(f"{what}: is a file; must be a folder")
+        if not folder.exists() and folder.is_symlink():
+            raise InputError(f"{what}: is a link to {shown(os.readlink(folder))}, which does not exist; make it first")
     except OSError as error:
-        raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, what, folder) from error
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make a folder for results; raise `InputError` if that is impossible."""
+    """Make a folder for results; raise `InputError` if that is impossible, `SimtestError` if its disk is full."""
     refuse_file(folder, option)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{option} {shown(folder)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, f"{option} {shown(folder)}", folder) from error
 
 
 def require_plain(path: Path, limited_by: str | None = None) -> Path:

@@ -5,11 +5,12 @@ The ranges of single values (a width, an exponent) stand in the schemas and are 
 """
 
 import os
+import stat
 from functools import lru_cache
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import kind_of, leads_nowhere, shown, suggestion
 
 VARIABLE = "SIMTEST_LIMITS"
 
@@ -23,7 +24,7 @@ DEFAULTS = {
     "manifest_bytes": 100_000_000,
     "record_bytes": 20_000_000,  # JSON that a run has written
     # pictures and frames, px
-    "picture_pixels": 100_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
+    "picture_pixels": 50_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
     "picture_side": 16_384,
     "frame_pixels": 20_000_000,
     "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples
@@ -114,17 +115,16 @@ def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
     """
     where = shown(path)
     try:
-        size = path.stat().st_size
-        if not path.is_file():
-            kind = "a folder" if path.is_dir() else "no plain file"
-            raise InputError(f"{where}: is {kind}; must be {wanted}")
+        found = path.stat()
     except FileNotFoundError:
-        raise InputError(f"{where}: no such file; must be {wanted}") from None
+        raise InputError(f"{where}: no such file{leads_nowhere(path)}; must be {wanted}") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{where}: cannot be read ({reason})") from error
-    check_limit(name, size, path, "bytes", hint)
-    return size
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{where}: is {kind_of(path)}; must be {wanted}")
+    check_limit(name, found.st_size, path, "bytes", hint)
+    return found.st_size
 
 
 @lru_cache(maxsize=4)
@@ -134,7 +134,9 @@ def _limits(text: str) -> dict[str, int]:
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = (piece.strip() for piece in part.partition("="))
         if name not in DEFAULTS:
-            raise InputError(f"{VARIABLE}: {shown(name)}: unknown limit; allowed: {', '.join(DEFAULTS)}")
+            raise InputError(
+                f"{VARIABLE}: {shown(name)}: unknown limit; allowed: {', '.join(DEFAULTS)}{suggestion(name, DEFAULTS)}"
+            )
         try:
             number = float(value)
         except ValueError:

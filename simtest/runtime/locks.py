@@ -19,6 +19,7 @@ from typing import IO
 
 from simtest.errors import InputError
 from simtest.runtime.files import make_folder, refuse_file
+from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown
 
 LOCK = ".lock"
@@ -73,7 +74,7 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
         file = _open(lock)
     except OSError as error:
         # Where nothing can be written nobody writes; a finished run can still be looked at.
-        _require_without_locks(error, what)
+        _require_without_locks(error, what, lock)
         yield
         return
     with file:
@@ -81,7 +82,7 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
             taken = _taken(lock, file)
         except OSError as error:
             # A file system without locks refuses nobody.
-            _require_without_locks(error, what)
+            _require_without_locks(error, what, lock)
             taken = True
         if not taken:
             raise InputError(f"{what}: is in use by {_holder(lock)}; wait until it ends, or name another")
@@ -98,10 +99,10 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
                 lock.unlink(missing_ok=True)
 
 
-def _require_without_locks(error: OSError, what: str) -> None:
-    """Raise `InputError` unless an error says that nothing can be locked, or written, at this place."""
+def _require_without_locks(error: OSError, what: str, lock: Path) -> None:
+    """Raise what tells the user, unless an error says that nothing can be locked, or written, at this place."""
     if error.errno not in _WITHOUT_LOCKS:
-        raise InputError(f"{what}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, what, lock.parent) from error
 
 
 def _open(lock: Path) -> IO[bytes]:

@@ -50,6 +50,23 @@ def write_error(error: OSError, out: str | Path, kept: str = "") -> SimtestError
     return kind(f"--out {shown(out)}: cannot be written ({told}){kept and f'; {kept}'}")
 
 
+def cannot_write(error: OSError, what: str, near: Path) -> SimtestError:
+    """Return the error, for a user, that a path cannot be written: a plain one where its disk is full or fails.
+
+    Parameters
+    ----------
+    error : OSError
+        What the system said.
+    what : str
+        Option and path, as the message names them.
+    near : Path
+        The path, by which the disk is found.
+    """
+    full = is_disk_full(error)
+    told = disk_problem(error, near) if full else error.strerror
+    return (SimtestError if full else InputError)(f"{what}: cannot be written ({told})")
+
+
 def is_disk_full(error: BaseException) -> bool:
     """Return whether an error says that a disk is full, or fails."""
     return _number(error) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)

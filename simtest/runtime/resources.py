@@ -1,10 +1,19 @@
 """Shipped scenes, experiments and mesh recipes found by name, in a checkout or an installed wheel."""
 
+import os
+import stat
+from collections.abc import Iterable
 from pathlib import Path
 
 from simtest.errors import InputError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+
+_ALIKE = 0.6
+"""Of two names that are taken for one mistyped: twice the letters in common over those of both."""
+
+_LONGEST_NAME = 80
+"""Of what may be a mistyped name; comparing takes time with its square."""
 
 
 def data_root(kind: str) -> Path:
@@ -26,6 +35,34 @@ def shown(text: object, limit: int = 300) -> str:
     if not line or not line.isprintable():
         line = repr(line)
     return line if len(line) <= limit else line[: limit - 3] + "..."
+
+
+def kind_of(path: Path) -> str:
+    """Return what a path that is no plain file is, in words."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        return "a folder"
+    # What a shell's pipe hands on as /dev/stdin has no size and can be read but once.
+    pipe = stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
+    return "no plain file but a pipe (write it to a file first)" if pipe else "no plain file but a device"
+
+
+def leads_nowhere(path: Path) -> str:
+    """Return where a link leads that leads nowhere, for a message; nothing for what is no link."""
+    try:
+        return f" (a link to {shown(os.readlink(path))}, which does not exist)" if path.is_symlink() else ""
+    except OSError:
+        return ""
+
+
+def suggestion(name: object, known: Iterable[str]) -> str:
+    """Return " (did you mean NAME?)" for the known name closest to a wrong one; nothing where none is close."""
+    import difflib  # slow to import
+
+    wrong, names = str(name)[:_LONGEST_NAME], list(known)
+    # A name that was cut short, or written without its suffix, is meant more likely than one of like letters.
+    close = [n for n in names if wrong and n.startswith(wrong)] or difflib.get_close_matches(wrong, names, 1, _ALIKE)
+    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...] = (".toml",)) -> Path:
@@ -59,7 +96,8 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
         for suffix in suffixes:
             if (shipped := root / f"{path.name}{suffix}").is_file():
                 return shipped
-    if path.is_dir():
-        raise InputError(f"{shown(name)}: is a folder; a file is needed")
-    names = ", ".join(sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")}))
-    raise InputError(f"{shown(name)}: no such file; shipped by name: {names}")
+    if path.exists():
+        raise InputError(f"{shown(name)}: is {kind_of(path)}; must be a file")
+    names = sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")})
+    meant = suggestion(path.name, names)
+    raise InputError(f"{shown(name)}: no such file{leads_nowhere(path)}; shipped by name: {', '.join(names)}{meant}")

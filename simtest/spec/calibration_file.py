@@ -69,10 +69,11 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         raise InputError(f"{shown(path)}: a calibration is TOML, not {path.suffix}; name it .toml")
     # Imported on demand: reading needs neither.
     from simtest.runtime.files import write_atomically
+    from simtest.runtime.machine_errors import cannot_write
     from simtest.spec.calibration_tables import calibration_toml
 
     text = calibration_toml(calibration)
     try:
         write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, shown(path), path) from error

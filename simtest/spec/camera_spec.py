@@ -243,6 +243,7 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
     # Imported on demand, as in `load_camera`.
     from simtest.runtime.files import write_atomically
+    from simtest.runtime.machine_errors import cannot_write
     from simtest.spec.camera_formats.opencv import opencv_text, ros_text
 
     suffixes = {"toml": (".toml",), "opencv": OPENCV_SUFFIXES, "ros": (".yml", ".yaml")}
@@ -258,4 +259,4 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     try:
         write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, shown(path), path) from error

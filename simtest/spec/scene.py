@@ -19,8 +19,9 @@ from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surface import Surface
 from simtest.spec.tissue_colour import TissueColour
-from simtest.spec.toml_files import apply_settings, read_toml, source_name
+from simtest.spec.toml_files import read_toml, source_name
 from simtest.spec.translucency import Translucency
+from simtest.spec.type_change import replace_values
 
 MOST_INSTRUMENTS = 8
 """More than a patient has ports for."""
@@ -193,7 +194,7 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     name : str or Path
         A path, or the name of a shipped scene.
     settings : mapping, optional
-        Values that replace those of the file, by key path.
+        Values that replace those of the file, by key path; a new type of a table drops the keys of the former one.
 
     Raises
     ------
@@ -201,6 +202,6 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
         If the file is missing or malformed.
     """
     path = find(name, "scenes")
-    data = apply_settings(read_toml(path), settings or {}, str(path))
+    data = replace_values(Scene, read_toml(path), settings or {}, str(path))
     data.setdefault("name", path.stem[:80])
     return scene_from_dict(data, source_name(path, settings))

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import shown, suggestion
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
@@ -116,8 +116,8 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
 
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
-    location = [shown(part, 60) for part in _without_tags(error["loc"], data)]
     kind, value = error["type"], error.get("input")
+    location = [shown(part, 60) for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
@@ -131,7 +131,8 @@ def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> st
     if kind == "union_tag_not_found":
         return f"{path}.type: missing; allowed: {_allowed_types(error['loc'], model)}"
     if kind == "union_tag_invalid":
-        return f"{path}.type = {_short(value['type'])}: unknown; allowed: {_allowed_types(error['loc'], model)}"
+        allowed = _allowed_types(error["loc"], model, value["type"])
+        return f"{path}.type = {_short(value['type'])}: unknown; allowed: {allowed}"
     # validators of our models, then the ranges of fields
     if kind == "value_error":
         shown_value = "" if isinstance(value, Mapping) else f" = {_short(value)}"
@@ -154,20 +155,26 @@ def _demand(error: Any) -> str:
     return f"be {error['msg'].removeprefix('Input should be ')}"
 
 
-def _without_tags(location: tuple[Any, ...], data: Any) -> list[Any]:
-    """Drop the tags that pydantic puts into the location for each tagged union."""
+def _without_tags(location: tuple[Any, ...], data: Any, missing: bool) -> list[Any]:
+    """Drop what pydantic puts into the location for each union: the type of a tagged one, a name of its own else.
+
+    `missing` says that the last part is a key that is not there.
+    """
     path: list[Any] = []
     tagged: Any = None
-    for part in location:
+    for i, part in enumerate(location):
         # The tag comes first; after it the same word is a key (type = "gamma" has a key gamma).
         if isinstance(data, Mapping) and data is not tagged and part == data.get("type"):
             tagged = data
             continue
-        path.append(part)
         try:
             data = data[part]
         except (KeyError, IndexError, TypeError):
+            # Of a plain union, such as a number or a table, no user knows the name.
+            if not (missing and i == len(location) - 1):
+                continue
             data = None
+        path.append(part)
     return path
 
 
@@ -177,13 +184,14 @@ def _allowed_keys(location: tuple[Any, ...], model: type[BaseModel]) -> str:
     known = list(next((node["properties"] for node in nodes if "properties" in node), ()))
     close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
     ordered = close + [k for k in known if k not in close]
-    return f"; allowed: {', '.join(ordered)}" if ordered else ""
+    return f"; allowed: {', '.join(ordered)}{suggestion(location[-1], known)}" if ordered else ""
 
 
-def _allowed_types(location: tuple[Any, ...], model: type[BaseModel]) -> str:
-    """List the types that a tagged union allows."""
+def _allowed_types(location: tuple[Any, ...], model: type[BaseModel], given: object = None) -> str:
+    """List the types that a tagged union allows, and the one that may be meant."""
     nodes = nodes_at(model.model_json_schema(), location)
-    return ", ".join(next((node["discriminator"]["mapping"] for node in nodes if "discriminator" in node), ()))
+    known = list(next((node["discriminator"]["mapping"] for node in nodes if "discriminator" in node), ()))
+    return ", ".join(known) + ("" if given is None else suggestion(given, known))
 
 
 def _short(value: Any) -> str:

@@ -13,10 +13,11 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
 from simtest.runtime.limits import check_file, check_limit
-from simtest.runtime.machine_errors import write_error
+from simtest.runtime.machine_errors import cannot_write, write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
+from simtest.surfaces.ply_polygons import read_mixed_polygons
 from simtest.surfaces.repair import Repairs, repair
 from simtest.surfaces.vtk_file import check_indices, read_vtk
 
@@ -40,6 +41,10 @@ EXTENT_RANGE_MM = (1.0, 1e5)
 
 ORGAN_RANGE_MM = (60.0, 2000.0)
 """Largest extent of a liver, a colon or a large piece of one: for a guess at another unit."""
+
+
+_ZERO_INDEX = re.compile(rb"^[ \t]*f[ \t](?:[^\r\n#]*[ \t])?0+(?=[/ \t\r\n]|\Z)", re.MULTILINE)
+"""Beginning of a face's line in an OBJ file, up to a vertex 0."""
 
 
 def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
@@ -68,7 +73,8 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     announced = _check_file(path, suffix)
     try:
         with _quiet():
-            vertices, faces = read_vtk(path) if suffix == ".vtk" else _load_trimesh(path)
+            mixed = read_mixed_polygons(path) if suffix == ".ply" else None
+            vertices, faces = mixed or (read_vtk(path) if suffix == ".vtk" else _load_trimesh(path))
     except SimtestError:
         raise
     except Exception as error:
@@ -122,11 +128,13 @@ def _check_file(path: Path, suffix: str) -> tuple[int, int]:
             announced = check_ply(path, size)
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    if suffix == ".stl" and size >= 84 and size == 84 + 50 * (count := int.from_bytes(head[80:84], "little")):
-        check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
+    if suffix == ".stl":
+        _check_stl(path, head, size)
     # OBJ is text, which its reader would make a hundred million words of before it finds nothing in them.
     if suffix == ".obj" and b"\0" in head:
         raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+    if suffix == ".obj":
+        _check_obj(path)
     if suffix == ".vtk":
         _check_vtk(path, head, size)
     is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * int.from_bytes(head[80:84], "little"))
@@ -152,6 +160,33 @@ def _check_large_text(path: Path, size: int, word: bytes) -> None:
         raise InputError(
             f"{shown(path)}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most"
         )
+
+
+def _check_stl(path: Path, head: bytes, size: int) -> None:
+    """Raise `InputError` where an STL file ends before its last face, or announces too many of them."""
+    count = int.from_bytes(head[80:84], "little")
+    if size >= 84 and size == 84 + 50 * count:
+        check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
+    elif head[:5].lower() == b"solid":
+        with path.open("rb") as file:
+            file.seek(max(0, size - len(head)))
+            end = file.read().lower()
+        # A header of a binary file may begin so too.
+        if b"facet" in head.lower() and b"endsolid" not in end:
+            raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
+    elif size < 84 + 50 * count:
+        held = max(0, (size - 84) // 50)
+        raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
+
+
+def _check_obj(path: Path) -> None:
+    """Raise `InputError` where a face names vertex 0, which its reader takes for the last one."""
+    with path.open("rb") as file:
+        # By pieces that end with a line.
+        while piece := file.read(2**20) + file.readline():
+            if wrong := _ZERO_INDEX.search(piece):
+                line = wrong[0].decode("latin-1").strip()
+                raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
 
 
 def _check_vtk(path: Path, head: bytes, size: int) -> None:
@@ -241,7 +276,7 @@ def check_target(path: Path) -> None:
         if not path.parent.is_dir():
             raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
     except OSError as error:
-        raise InputError(f"--out {shown(path)}: cannot be written ({error.strerror})") from error
+        raise cannot_write(error, f"--out {shown(path)}", path) from error
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:

@@ -9,16 +9,18 @@ from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import shown
 
 HEADER_BYTES = 65536
-SIZES = {
-    "char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8,
-    "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8,
+NUMPY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
 }  # fmt: skip
+SIZES = {name: int(kind[1]) for name, kind in NUMPY_TYPES.items()}
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 _MOST_DIGITS = 18
 
 
 @dataclass
-class _Element:
+class Element:
     """An element: its name, how many there are, its properties by name, and the bytes that each takes at least."""
 
     name: str
@@ -50,12 +52,7 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
         ends before the announced ones.
     """
     where = shown(path)
-    with path.open("rb") as file:
-        head = file.read(HEADER_BYTES)
-    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
-    if not head.startswith(b"ply") or end is None:
-        raise InputError(f"{where}: no PLY file; it must begin with ply, and its header end with end_header")
-    kind, elements = _parse(head[: end.start()].decode("latin-1"), where)
+    kind, elements, start = read_header(path)
     found = {element.name: element for element in elements}
     # what a mesh needs
     for name, properties in (("vertex", ("x", "y", "z")), ("face", ())):
@@ -79,16 +76,27 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     # A number of a text takes two bytes at least, with what separates it from the next.
     each = {e.name: (2 * e.words if kind == "ascii" else e.bytes) for e in elements}
     least = sum(element.count * each[element.name] for element in elements)
-    held = size - end.end()
+    held = size - start
     if held + 1 < least:
         announced = " and ".join(f"{found[name].count} {name} elements" for name in ("vertex", "face"))
         raise InputError(f"{where}: {held} bytes follow the header; {announced} take {least} at least: it is cut short")
     return found["vertex"].count, found["face"].count
 
 
-def _parse(text: str, where: str) -> tuple[str, list[_Element]]:
+def read_header(path: Path) -> tuple[str, list[Element], int]:
+    """Return format, elements and length in bytes of a PLY file's header; raise `InputError` if it is malformed."""
+    where = shown(path)
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    if not head.startswith(b"ply") or end is None:
+        raise InputError(f"{where}: no PLY file; it must begin with ply, and its header end with end_header")
+    return *_parse(head[: end.start()].decode("latin-1"), where), end.end()
+
+
+def _parse(text: str, where: str) -> tuple[str, list[Element]]:
     """Return the format and the elements that a header announces."""
-    kind, elements = "", list[_Element]()
+    kind, elements = "", list[Element]()
     # Not by splitlines: in Latin-1 it also ends lines at bytes of UTF-8 text, such as 0x85 of a capital A with a ring.
     for line in (line.rstrip("\r") for line in text.split("\n")[1:]):
         words = line.split()
@@ -98,7 +106,7 @@ def _parse(text: str, where: str) -> tuple[str, list[_Element]]:
             case ["element"]:
                 if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MOST_DIGITS:
                     raise InputError(f"{where}: header line {shown(line, 60)!r}: must be element NAME COUNT")
-                elements.append(_Element(words[1], int(words[2])))
+                elements.append(Element(words[1], int(words[2])))
             case ["property"]:
                 _add_property(elements, words, line, where)
             case ["comment"] | ["obj_info"] | []:
@@ -110,7 +118,7 @@ def _parse(text: str, where: str) -> tuple[str, list[_Element]]:
     return kind, elements
 
 
-def _add_property(elements: list[_Element], words: list[str], line: str, where: str) -> None:
+def _add_property(elements: list[Element], words: list[str], line: str, where: str) -> None:
     """Add a line's property to the last element."""
     is_list = words[1:2] == ["list"]
     types = words[2:4] if is_list else words[1:2]

@@ -17,6 +17,7 @@ from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
+from simtest.spec.type_change import replace_values
 from simtest.surfaces.recipe import load_recipe
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ def _check(case: Case, experiment: Experiment, recipes: set[str]) -> None:
 
 def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
     path = find(group.scene, "scenes")
-    base = apply_settings(read_toml(path), group.set, str(path))
+    base = replace_values(Scene, read_toml(path), group.set, str(path))
     base.setdefault("name", path.stem)
     count = experiment.realisations if group.realisations is None else group.realisations
     cases = []

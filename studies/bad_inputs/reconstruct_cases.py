@@ -164,86 +164,90 @@ def _cameras() -> Iterator[Case]:
     yield _case("camera, XML that grows when it is read", "--camera", "c.xml", c__xml=laughs, says="c.xml")
 
 
+SQUARE = [[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]
+
+YAML_FAULTS = {
+    "dt: u": files.OPENCV_YAML.replace("dt: d", "dt: u", 1),
+    "dt: a number": files.OPENCV_YAML.replace("dt: d", "dt: 5", 1),
+    "dt of several": files.OPENCV_YAML.replace("dt: d", 'dt: "3d"', 1),
+    "4 rows": files.OPENCV_YAML.replace("rows: 3", "rows: 4"),
+    "2 columns": files.OPENCV_YAML.replace("cols: 3", "cols: 2"),
+    "rows as a text": files.OPENCV_YAML.replace("rows: 3", "rows: three"),
+    "9 rows of 1": files.OPENCV_YAML.replace("rows: 3", "rows: 9").replace("cols: 3", "cols: 1"),
+    "5 coefficients in 4 columns": files.OPENCV_YAML.replace("cols: 5", "cols: 4"),
+    "no width": files.OPENCV_YAML.replace("image_width", "w"),
+    "principal point far outside": files.OPENCV_YAML.replace("31.5", "31500."),
+    "NaN": files.OPENCV_YAML.replace("31.5", ".nan"),
+    "endless focal length": files.OPENCV_YAML.replace("60.", ".inf", 1),
+    "width 0": files.OPENCV_YAML.replace("width: 64", "width: 0"),
+    "width 65500": files.OPENCV_YAML.replace("width: 64", "width: 65500"),
+    "focal length 0": files.OPENCV_YAML.replace("60.", "0.", 1),
+    "focal length -60": files.OPENCV_YAML.replace("60.", "-60.", 1),
+    "an alias": files.OPENCV_YAML.replace("dt: d", "dt: &a d", 1),
+    "lens that folds": files.OPENCV_YAML.replace("-0.1,", "-100.,"),
+    "lens of 1e300": files.OPENCV_YAML.replace("-0.1,", "1e300,"),
+    "an object of Python": files.OPENCV_YAML + 'x: !!python/object/apply:os.system ["true"]\n',
+}
+
+XML_FAULTS = {
+    "dt u": files.OPENCV_XML.replace("<dt>d", "<dt>u", 1),
+    "4 rows": files.OPENCV_XML.replace("<rows>3", "<rows>4"),
+    "text in a matrix": files.OPENCV_XML.replace("60. 0.", "sixty 0."),
+    "matrix cut": files.OPENCV_XML.replace(" 0. 0. 1.<", "<"),
+    "K twice": files.OPENCV_XML.replace("<opencv_storage>", "<opencv_storage><K>1</K>"),
+    "no K": files.OPENCV_XML.replace("camera_m", "m"),
+}
+
+TOML_FAULTS = {
+    "principal point far outside": files.CAMERA + "cx = 5000.0\n",
+    "principal point far above": files.CAMERA + "cy = -3000.0\n",
+    "principal point endless": files.CAMERA + "cx = inf\n",
+    "focal length tiny": files.CAMERA.replace("fx = 60.0", "fx = 1e-300"),
+    "focal length of 1e5 widths": files.CAMERA.replace("fx = 60.0", "fx = 6.4e6"),
+    "fx 1e-3": files.CAMERA.replace("60.0", "1e-3"),
+    "width 65500": files.CAMERA.replace("64", "65500"),
+    "width 1e30": files.CAMERA.replace("64", "1e30"),
+    "another size": files.CAMERA.replace("64", "32"),
+    "fx true": files.CAMERA.replace("60.0", "true"),
+    "skew": files.CAMERA + "skew = 9e5\n",
+    "unknown key": files.CAMERA + "fov = 60\n",
+    "mask that shows nothing": files.CAMERA + "view_mask = {radius = 1, cx = 9e5}\n",
+    "noise": files.CAMERA + "[sensor]\nnoise_sigma = -1\n",
+    "response": files.CAMERA + '[response]\ntype = "gamma"\ngamma = 0\n',
+    "response unknown": files.CAMERA + '[response]\ntype = "log"\n',
+    "focal lengths apart": files.CAMERA.replace("60.0", "6e5", 1),
+    "distance NaN": files.CAMERA + "[surface]\ndistance_mm = nan\n",
+    "light": files.CAMERA + "[rig]\nlights = []\n",
+}
+
+MATLAB_FAULTS: dict[str, dict[str, Any]] = {
+    "K of 2 rows": {"K": SQUARE[:2]},
+    "K of 4": {"K": np.eye(4)},
+    "K of text": {"K": "K"},
+    "K of 9 in a row": {"K": np.ravel(SQUARE)},
+    "K of NaN": {"K": np.full((3, 3), NAN)},
+    "K of complex numbers": {"K": np.array(SQUARE) * 1j},
+    "no size": {"ImageSize": None},
+    "size 0": {"ImageSize": [0, 0]},
+    "size huge": {"ImageSize": [48, 65500]},
+    "size of 3": {"ImageSize": [48, 64, 3]},
+    "1 radial coefficient": {"RadialDistortion": [0.1]},
+    "lens of text": {"RadialDistortion": "none"},
+    "lens of NaN": {"RadialDistortion": [NAN, 0.0]},
+    "principal point far outside": {"K": [[60.0, 0, 1e5], [0, 60.0, 24], [0, 0, 1]]},
+    "K of structs": {"K": {"a": 1}},
+    "fisheye": {"MappingCoefficients": [1.0]},
+    "empty K": {"K": np.empty((0, 0))},
+}
+
+
 def _camera_values() -> Iterator[Case]:
-    yaml, xml, good = files.OPENCV_YAML, files.OPENCV_XML, files.CAMERA
-    spoilt = {
-        "dt: u": yaml.replace("dt: d", "dt: u", 1),
-        "dt: a number": yaml.replace("dt: d", "dt: 5", 1),
-        "dt of several": yaml.replace("dt: d", 'dt: "3d"', 1),
-        "4 rows": yaml.replace("rows: 3", "rows: 4"),
-        "2 columns": yaml.replace("cols: 3", "cols: 2"),
-        "rows as a text": yaml.replace("rows: 3", "rows: three"),
-        "9 rows of 1": yaml.replace("rows: 3", "rows: 9").replace("cols: 3", "cols: 1"),
-        "5 coefficients in 4 columns": yaml.replace("cols: 5", "cols: 4"),
-        "no width": yaml.replace("image_width", "w"),
-        "principal point far outside": yaml.replace("31.5", "31500."),
-        "NaN": yaml.replace("31.5", ".nan"),
-        "endless focal length": yaml.replace("60.", ".inf", 1),
-        "width 0": yaml.replace("width: 64", "width: 0"),
-        "width 65500": yaml.replace("width: 64", "width: 65500"),
-        "focal length 0": yaml.replace("60.", "0.", 1),
-        "focal length -60": yaml.replace("60.", "-60.", 1),
-        "an alias": yaml.replace("dt: d", "dt: &a d", 1),
-        "lens that folds": yaml.replace("-0.1,", "-100.,"),
-        "lens of 1e300": yaml.replace("-0.1,", "1e300,"),
-        "an object of Python": yaml + 'x: !!python/object/apply:os.system ["true"]\n',
-    }
-    for name, text in spoilt.items():
-        yield _case(f"camera .yaml, {name}", "--camera", "c.yaml", c__yaml=text, says="c.yaml")
-    spoilt = {
-        "dt u": xml.replace("<dt>d", "<dt>u", 1),
-        "4 rows": xml.replace("<rows>3", "<rows>4"),
-        "text in a matrix": xml.replace("60. 0.", "sixty 0."),
-        "matrix cut": xml.replace(" 0. 0. 1.<", "<"),
-        "K twice": xml.replace("<opencv_storage>", "<opencv_storage><K>1</K>"),
-        "no K": xml.replace("camera_m", "m"),
-    }
-    for name, text in spoilt.items():
-        yield _case(f"camera .xml, {name}", "--camera", "c.xml", c__xml=text, says="c.xml")
-    values = {
-        "principal point far outside": good + "cx = 5000.0\n",
-        "principal point far above": good + "cy = -3000.0\n",
-        "principal point endless": good + "cx = inf\n",
-        "focal length tiny": good.replace("fx = 60.0", "fx = 1e-300"),
-        "focal length of 1e5 widths": good.replace("fx = 60.0", "fx = 6.4e6"),
-        "fx 1e-3": good.replace("60.0", "1e-3"),
-        "width 65500": good.replace("64", "65500"),
-        "width 1e30": good.replace("64", "1e30"),
-        "another size": good.replace("64", "32"),
-        "fx true": good.replace("60.0", "true"),
-        "skew": good + "skew = 9e5\n",
-        "unknown key": good + "fov = 60\n",
-        "mask that shows nothing": good + "view_mask = {radius = 1, cx = 9e5}\n",
-        "noise": good + "[sensor]\nnoise_sigma = -1\n",
-        "response": good + '[response]\ntype = "gamma"\ngamma = 0\n',
-        "response unknown": good + '[response]\ntype = "log"\n',
-        "focal lengths apart": good.replace("60.0", "6e5", 1),
-        "distance NaN": good + "[surface]\ndistance_mm = nan\n",
-        "light": good + "[rig]\nlights = []\n",
-    }
-    for name, text in values.items():
-        yield _case(f"camera .toml, {name}", "--camera", "c.toml", c__toml=text, says="")
-    square = [[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]
-    fields: dict[str, dict[str, Any]] = {
-        "K of 2 rows": {"K": square[:2]},
-        "K of 4": {"K": np.eye(4)},
-        "K of text": {"K": "K"},
-        "K of 9 in a row": {"K": np.ravel(square)},
-        "K of NaN": {"K": np.full((3, 3), NAN)},
-        "K of complex numbers": {"K": np.array(square) * 1j},
-        "no size": {"ImageSize": None},
-        "size 0": {"ImageSize": [0, 0]},
-        "size huge": {"ImageSize": [48, 65500]},
-        "size of 3": {"ImageSize": [48, 64, 3]},
-        "1 radial coefficient": {"RadialDistortion": [0.1]},
-        "lens of text": {"RadialDistortion": "none"},
-        "lens of NaN": {"RadialDistortion": [NAN, 0.0]},
-        "principal point far outside": {"K": [[60.0, 0, 1e5], [0, 60.0, 24], [0, 0, 1]]},
-        "K of structs": {"K": {"a": 1}},
-        "fisheye": {"MappingCoefficients": [1.0]},
-        "empty K": {"K": np.empty((0, 0))},
-    }
-    for name, given in fields.items():
+    """Yield cases of camera files that can be read and make no sense."""
+    told = {"yaml": (YAML_FAULTS, "c.yaml"), "xml": (XML_FAULTS, "c.xml"), "toml": (TOML_FAULTS, "")}
+    for suffix, (faults, says) in told.items():
+        for name, text in faults.items():
+            yield _case(f"camera .{suffix}, {name}", "--camera", f"c.{suffix}", says=says, **{f"c__{suffix}": text})
+    for name, given in MATLAB_FAULTS.items():
         yield _case(f"camera .mat, {name}", "--camera", "c.mat", c__mat=files.matlab(**given), says="c.mat")
 
 

@@ -1,4 +1,4 @@
-"""Draw docs/images/detection.png: rendered frames with their true masks and what is detected.
+"""Draw docs/images/detection.jpg: rendered frames with their true masks and what is detected.
 
 python -m studies.detection.figure FIGURE
 """
@@ -25,12 +25,13 @@ def panel(frame: StudyFrame) -> np.ndarray:
     found = detect_in_picture(frame.picture.astype(np.float32) / 255).detection
     plain = np.ascontiguousarray(frame.picture[:, :, ::-1])
     drawn = plain.copy()
-    contours, _ = cv2.findContours(truth.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(drawn, contours, -1, TRUE, 1)
     for highlight in found.highlights:
         colour = ISOLATED if highlight.is_isolated else OTHER
         if len(highlight.outline):
-            cv2.polylines(drawn, [np.rint(highlight.outline - 0.5).astype(np.int32)], True, colour, 1)
+            cv2.polylines(drawn, [np.rint(highlight.outline - 0.5).astype(np.int32)], True, colour, 4)
+    # On top, and thinner, so that both outlines show.
+    contours, _ = cv2.findContours(truth.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, contours, -1, TRUE, 1)
     return np.hstack([plain, drawn])
 
 

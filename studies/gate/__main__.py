@@ -1,4 +1,4 @@
-"""Print the tables of docs/concepts/gate.md: `python -m studies.gate [SECTION]...`, all sections by default."""
+"""Print the tables of docs/gallery/gate_measured.md: `python -m studies.gate [SECTION]...`, all sections by default."""
 
 import sys
 from collections.abc import Callable

@@ -1,4 +1,6 @@
-"""Print the table of docs/concepts/gate.md: `python -m studies.mutants [--out FILE] [--only NAME...] [--workers N]`.
+"""Print the table of faults in docs/gallery/gate_measured.md.
+
+`python -m studies.mutants [--out FILE] [--only NAME...] [--workers N]`
 
 Canaries are asked first, and the gate about those faults alone that they do not name; with --canaries it is not asked.
 What --out holds from an earlier call on the same code and profile is not asked again.

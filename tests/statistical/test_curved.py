@@ -46,6 +46,10 @@ def saddle(first, second):
     return {"type": "quadric", "k1_per_mm": first / D, "k2_per_mm": second / D, "spin_deg": 30.0}
 
 
+DRIFTING = 0.99
+"""Most that `bisector` may cover. A light beside the camera makes the isophotes' axis drift, even on a plane. A share
+of the drift's square stands in the budget, for what a straight line to the peak misses, which is nothing here."""
+
 AROUND_PX = 24
 """Margin of a crop around the region of interest: more than smoothing and noise's estimate reach."""
 
@@ -237,7 +241,8 @@ def check_covariances(bench, shape, count, low, high):
     for each, truth in ((made, true), (beside, true_beside)):
         for key in each[0]:
             share = covered(each, truth, key).mean()
-            assert low <= share <= high, (key, share)
+            most = max(high, DRIFTING) if key == "bisector" else high
+            assert low <= share <= most, (key, share)
             rms = np.sqrt(np.mean([float(angle_deg(e[key].normal, truth.normal)) ** 2 for e in each]))
             # The RMS angle is that of two components.
             semi = [np.degrees(np.sqrt(np.linalg.eigvalsh(e[key].covariance))) for e in each]

@@ -12,7 +12,7 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.dataset.maker import colour_variant
-from simtest.errors import BackendError
+from simtest.errors import BackendError, InputError
 from simtest.rendering import backend
 from simtest.rendering.backend import Candidate, candidates, choose_library, probe, requested_variant
 
@@ -309,10 +309,11 @@ def test_no_other_module_names_a_variant_or_a_device():
 def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
     for given in (name, None):
         monkeypatch.setenv(backend.VARIANT_VARIABLE, name)
-        with pytest.raises(BackendError) as error:
+        with pytest.raises(InputError) as error:
             backend.load(given)
         text = str(error.value)
-        assert text.startswith(f"variant '{name}': cannot be used; allowed: ")
+        named = "variant" if given else backend.VARIANT_VARIABLE
+        assert text.startswith(f"{named} '{name}': cannot be used; allowed: ")
         assert "llvm_ad_mono" in text
         assert "cuda_ad_mono" in text
         assert "\n" not in text

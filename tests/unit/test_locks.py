@@ -138,8 +138,13 @@ def test_a_file_system_without_locks_refuses_nobody(tmp_path, monkeypatch, numbe
     entered(exclusive_folder(tmp_path / "a"))
     entered(exclusive_file(tmp_path / "m.ply"))
     assert list(tmp_path.iterdir()) == []
+    number = errno.ENOTDIR
+    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (Not a directory)")
+    # A disk that fails is no bad input: exit 1 in place of 2.
     number = errno.EIO
-    refused(lambda: entered(exclusive_folder(tmp_path)), "cannot be written (Input/output error)")
+    with pytest.raises(SimtestError, match=r"cannot be written \(.*Input/output error\)") as caught:
+        entered(exclusive_folder(tmp_path))
+    assert not isinstance(caught.value, InputError)
 
 
 def test_a_file_in_place_of_a_folder_is_refused_with_its_option(tmp_path):
@@ -154,7 +159,7 @@ def test_termination_is_answered_as_ctrl_c_is():
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     presses = []
     try:
-        with Termination() as stop:
+        with Termination() as stop, stop.working():
             signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
             signal.raise_signal(signal.SIGTERM)
             assert (presses, stop.came) == (["press"], True)

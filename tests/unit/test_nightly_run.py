@@ -462,7 +462,7 @@ def test_the_record_says_what_ran(parts, tmp_path):
     assert first.record.definitions != more.record.definitions
 
 
-def test_a_definition_is_that_of_scene_and_files_and_not_of_place_or_source(small, tmp_path, monkeypatch):
+def test_a_definition_is_that_of_scene_and_files_and_not_of_place_source_or_prose(small, tmp_path, monkeypatch):
     def hashes(profile):
         return {own.name: definition(own, expand(own)) for own in experiments_of(load_profile(profile))}
 
@@ -473,6 +473,10 @@ def test_a_definition_is_that_of_scene_and_files_and_not_of_place_or_source(smal
     first = hashes(small)
     monkeypatch.setattr("simtest.runtime.provenance.source_hash", lambda: "another")
     assert hashes(small) == first
+    own = planes.read_text()
+    planes.write_text(f'title = "Planes, told anew"\n{own}')
+    assert hashes(small) == first
+    planes.write_text(own)
     text = scene.read_text()
     scene.write_text(text + "\n# Another file.\n")
     assert hashes(small)["planes"] != first["planes"]

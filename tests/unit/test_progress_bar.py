@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich import progress as rich
 
+from simtest.cli import progress
 from simtest.cli.progress import progress_bar
 from simtest.validation.runner import _told as told
 
@@ -21,6 +22,7 @@ def bars(monkeypatch):
             made.append(self)
 
     monkeypatch.setattr(rich, "Progress", Recorded)
+    monkeypatch.setattr(progress, "at_terminal", lambda: True)
     return made
 
 

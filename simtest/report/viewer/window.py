@@ -15,6 +15,8 @@ from typing import Any
 from simtest.errors import InputError
 from simtest.report.viewer.content import CAMERA, TRUE, Content
 from simtest.runtime.files import write_atomically
+from simtest.runtime.machine_errors import cannot_write
+from simtest.runtime.resources import shown
 
 OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 """VTK's ways to draw without a display: libegl1, libosmesa6."""
@@ -64,7 +66,7 @@ def save_screenshot(content: Content, path: Path) -> None:
                 try:
                     write_atomically(path, functools.partial(shutil.copyfile, picture))
                 except OSError as error:
-                    raise InputError(f"--screenshot {path}: cannot be written ({error.strerror})") from error
+                    raise cannot_write(error, f"--screenshot {shown(path)}", path) from error
                 return
     raise InputError(
         "--screenshot: nothing here draws without a display; install libegl1 (with libgl1-mesa-dri) or libosmesa6"

@@ -1,0 +1,46 @@
+"""The application and its sub-commands, which are imported when they are called: `simtest --help` answers at once."""
+
+from cyclopts import App
+
+APP = App(
+    name="simtest",
+    help="Simulation testbed for 3D reconstruction from specular highlights in endoscopy.",
+    # Plain, since the modules that lay out Markdown take longer to load than all the rest.
+    help_format="plaintext",
+    help_epilogue="Every command takes --quiet (neither progress nor warnings), --verbose (every step, every row) and "
+    "--traceback.",
+    version_flags=["--version"],
+    version=lambda: _version(),
+    # `main` reports what is kept.
+    suppress_keyboard_interrupt=False,
+)
+# Stated here, since a sub-command's own text is loaded with its module.
+COMMANDS = {
+    "doctor": "Check the rendering backend.",
+    "list": "List what is shipped and installed: scenes, experiments, datasets, estimators, presets.",
+    "schema": "Print the JSON schema of a scene, experiment, dataset, camera, calibration or profile file.",
+    "render": "Render a scene with its ground truth.",
+    "views": "Pick viewpoints of an anatomy that show isolated highlights.",
+    "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
+    "export": "Write a scene as files that Mitsuba itself loads.",
+    "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
+    "realism": "Measure how far generated frames are from real ones.",
+    "fit": "Fit the ranges of a dataset recipe to real frames.",
+    "validate": "Run an experiment and write its report.",
+    "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
+    "dataset": "Make a labelled dataset for learning, check it, look at it.",
+    "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
+    "completion": "Print or install the completion of commands, options and names for a shell.",
+}
+_MODULES = {"list": "listing"}
+"""Where a command's name is not its module's; `list` would hide Python's own."""
+
+for _name, _help in COMMANDS.items():
+    _module = _MODULES.get(_name, _name)
+    APP.command(f"simtest.cli.{_module}:{_module}", name=_name, help=_help)
+
+
+def _version() -> str:
+    from simtest.runtime.provenance import version
+
+    return version()

@@ -1,0 +1,93 @@
+"""What flags, kinds of highlights, reasons of failure and parts of the uncertainty mean, in a sentence each.
+
+The pages show these sentences where the names appear; docs/reference/estimators.md and docs/concepts/uncertainty.md
+define the names.
+"""
+
+FLAGS = {
+    "ambiguous": "the two candidates of the circle pose are hardly told apart: a margin below 2 standard deviations",
+    "ambiguous_light": "the data do not tell which of several lights made the highlight; their mean position is used",
+    "anisotropic_or_curved": "the cloud is longer than wide: the base is curved, or the relief has a direction",
+    "base_doubted": "the diffuse light says that the base is likely turned away from the lights at the cloud's centre",
+    "base_unverified": "too little diffuse light is seen to check the cloud's centre against it",
+    "clouds_refused": "another cloud of this picture got no answer",
+    "cut": "a part of the cloud is out of view",
+    "dim": "darker than the clipped highlights of the picture: the normal may only come near the bisector of light and "
+    "camera",
+    "light_offset": "a known light is not at the camera, as the estimator takes it to be; no error is stated",
+    "misfit": "the modelled lobe does not explain the pixels of the highlight",
+    "missing_isovalues": "some isovalues gave no ellipse, or enclose other highlights too; they were left out",
+    "near_degenerate": "the peak fits neither candidate of the circle pose: the two-fold model does not apply",
+    "not_elliptic": "an isophote is no ellipse, as where two highlights touch or the curvature changes under one",
+    "partial_arc": "an isophote runs into a border, where the highlight may be cut; it was left out, or fitted in part",
+    "round": "noise hides the principal directions",
+    "saturated": "the isophotes enclose clipped pixels",
+    "small": "found by colour, with a radius at half height below 3 smoothing widths: smoothing makes it rounder",
+    "streak": "more than ten times as long as wide: the centre is hardly determined along it",
+    "unresolved": "a radius below 3 px at half height: the normal is that of the spot's centre, without axis ratio or "
+    "curvature",
+    "vignetted": "the isophotes reach to where too little light is left to correct the falloff",
+    "wide": "the cloud is too long for one normal of its base",
+}
+"""By flag of an estimate."""
+
+KINDS = {
+    "isolated": "a highlight of its own, with nested elliptic isophotes",
+    "clipped": "a highlight whose peak is clipped by the sensor",
+    "small": "too few pixels to judge its shape",
+    "cluster": "several highlights that touch; they carry no single normal",
+    "elongated": "a streak, as on an instrument or a fold",
+    "merged": "two highlights grown together",
+    "border": "cut by the border of the view",
+    "inter_reflection": "coloured light: reflected by tissue before",
+    "unclear": "its shape or its surroundings are not those of a highlight",
+}
+"""By kind of a highlight that was found by colour (docs/concepts/detection.md)."""
+
+REASONS = {
+    "no_light": "no light reached the sensor",
+    "no_peak": "the region has no value above the others",
+    "cluster": "several highlights touch, so that none has isophotes of its own",
+    "no_closed_isophote": "no isophote at the isovalue closes around the peak",
+    "too_few_points": "the isophote has too few points for an ellipse",
+    "not_an_ellipse": "no ellipse fits the isophote",
+    "degenerate_conic": "the fitted ellipse is nearly a line",
+    "not_finite": "the estimator gave values that are not finite",
+    "not_converged": "the fit did not converge",
+    "streak": "the spot is so long that its centre along it is not determined",
+    "unresolved": "the spot is too small to have a shape",
+    "not_known": "the estimator needs what the calibration does not tell, such as the lights' positions",
+    "no_estimate": "the estimator found nothing that it could answer for",
+    "estimator_error": "the estimator stopped with an error",
+}
+"""By reason of a failure."""
+
+PARTS = {
+    "noise": "the sensor's noise",
+    "resolution": "pixel size, smoothing, blur and coding, as seen in the fit's residuals",
+    "shape": "drift of the centre over the isovalues, where the curvature changes inside the highlight",
+    "light_offset": "the light's unknown position beside the camera",
+    "camera": "focal length, principal point and distortion, where they are guesses",
+    "distance": "the unknown distance of the surface",
+    "response": "unknown response, sharpening and falloff",
+    "relief": "slope of the fine relief, where the normal of the smooth base is wanted",
+    "stated": "the estimator states one covariance without parts",
+}
+"""By part of the budget of an uncertainty (docs/concepts/uncertainty.md)."""
+
+TERMS = {
+    "best": "The best normal of a highlight has the smallest stated error. Normals that state none come last.",
+    "tilt": "Tilt is the angle between the normal and the camera's optical axis: 0° faces the camera.",
+    "deviation": "± is the stated standard deviation of the normal's direction, all parts of its budget together. The "
+    "error should stay below 1.7 to 2 times this figure for 95 % of the normals.",
+    "arrow": "An arrow shows the part of the normal across the view. It points to the side that the surface faces; a "
+    "steep surface has a long arrow, and one that faces the camera has a dot alone.",
+    "cloud": "Rough tissue breaks one highlight into a cloud of glints. The cloud's centre carries the normal of the "
+    "smooth base surface; each glint alone carries the normal of the relief.",
+}
+"""Terms that the page of a picture uses."""
+
+
+def known(table: dict[str, str], name: str) -> str:
+    """Return the sentence of a name; that of another package is told as such."""
+    return table.get(name, "defined by another package")

@@ -1,0 +1,71 @@
+"""What becomes of a table whose type a setting replaces: the keys of the former type go."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from simtest.spec.json_schema import nodes_at
+from simtest.spec.toml_files import apply_settings
+
+
+def replace_values(
+    model: type[BaseModel], data: Mapping[str, Any], settings: Mapping[str, Any], where: str
+) -> dict[str, Any]:
+    """Replace values at key paths as `apply_settings` does, and drop what a table's new type does not have.
+
+    Setting ``reflectance.type`` to another type leaves no key of the former one behind, unless it is set as well: then
+    it is refused by its name. Keys that both types have stay.
+
+    Parameters
+    ----------
+    model : type
+        Of the tables.
+    data : mapping
+        The tables.
+    settings : mapping
+        Values by key path.
+    where : str
+        Name of the file, for messages.
+
+    Raises
+    ------
+    InputError
+        As `apply_settings` does.
+    """
+    result = apply_settings(data, settings, where)
+    for path, value in settings.items():
+        *parents, last = path.split(".")
+        if last != "type" or not isinstance(value, str):
+            continue
+        before, table = _at(data, parents), _at(result, parents)
+        if not isinstance(before, Mapping) or not isinstance(table, dict) or before.get("type", value) == value:
+            continue
+        allowed = _keys(model, parents, value)
+        if allowed is None:
+            # An unknown type is refused with the rest.
+            continue
+        head = ".".join(parents)
+        given = {key.removeprefix(f"{head}.").partition(".")[0] for key in settings if key.startswith(f"{head}.")}
+        for key in set(before) - allowed - given:
+            table.pop(key, None)
+    return result
+
+
+def _at(data: Any, path: list[str]) -> Any:
+    """Return what stands at a key path; None where nothing does."""
+    for part in path:
+        try:
+            data = data[int(part)] if isinstance(data, list) else data[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return None
+    return data
+
+
+def _keys(model: type[BaseModel], path: list[str], kind: str) -> set[str] | None:
+    """Return the keys of a type of the tagged union at a path; None where there is no such type."""
+    schema = model.model_json_schema()
+    tagged = (node for node in nodes_at(schema, path) if kind in node.get("discriminator", {}).get("mapping", {}))
+    if next(tagged, None) is None:
+        return None
+    return {key for node in nodes_at(schema, [*path, kind]) for key in node.get("properties", {})}

@@ -1,0 +1,165 @@
+"""Run the manual's blocks as a reader would: page by page, in order, in a copy of the checkout."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TextIO
+
+from studies.manual.blocks import ROOT, Block, blocks_of, manual_pages
+
+SLOW = ("simtest nightly", "simtest validate", "simtest fit", "simtest realism", "simtest dataset endoscopy",
+        "simtest dataset learning", "simtest dataset smooth", "-m studies.", "-m benchmarks")  # fmt: skip
+"""What takes minutes, as it stands in a command: left out of a quick run."""
+
+NEVER = ("make ", "pip install", "docker ", "apptainer ", "crontab", "systemctl", "git clone", "-m venv", "activate")
+"""What installs something, or changes the machine: run by CI's own steps, or by nobody."""
+
+NAMESPACE = """
+import json, sys, traceback
+names = {"__name__": "__main__"}
+for line in sys.stdin:
+    try:
+        exec(compile(json.loads(line), "<block>", "exec"), names)
+        done = True
+    except BaseException:
+        traceback.print_exc(file=sys.stdout)
+        done = False
+    print(f"\\n{json.dumps({'done': done})}", flush=True)
+"""
+"""A Python that runs the blocks of a page one after another, so that names live on."""
+
+
+def run_pages(pages: list[Path] | None, quick: bool, timeout_s: float, log: Path | None) -> int:
+    """Run all blocks of the pages; print a line for each, and return 1 if one failed."""
+    failed = 0
+    with ExitStack() as stack:
+        output = stack.enter_context(log.open("w", encoding="utf-8")) if log else None
+        for page in pages or manual_pages():
+            blocks = [block for block in blocks_of(page) if block.runs]
+            if blocks:
+                scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="manual-")))
+                failed += _run_page(blocks, scratch, quick, timeout_s, output)
+    print(f"{failed} failed" if failed else "all ran")
+    return 1 if failed else 0
+
+
+def _run_page(blocks: list[Block], scratch: Path, quick: bool, timeout_s: float, log: TextIO | None) -> int:
+    """Run the blocks of a page in a copy of the checkout; return how many failed."""
+    _copy_checkout(scratch)
+    failed = 0
+    with _Python(scratch) as python:
+        for block in blocks:
+            for command in _pieces(block):
+                # What installs is run by CI's steps.
+                if any(word in command for word in NEVER + (SLOW if quick else ())):
+                    _tell(f"{'left out':>8}         {block.place}: {_first(command)}", log)
+                    continue
+                started = time.monotonic()
+                run = python.run if block.language == "python" else _shell
+                ok, text = run(command, scratch, timeout_s)
+                spent = time.monotonic() - started
+                failed += not ok
+                _tell(f"{'ok' if ok else 'FAILED':>8} {spent:6.1f} s {block.place}: {_first(command)}", log)
+                if log:
+                    log.write(f"{command}\n{text}\n")
+                elif not ok:
+                    print(text[-2000:])
+    return failed
+
+
+def _pieces(block: Block) -> Iterator[str]:
+    """Yield what is run at once: a Python block, or a line of a shell block."""
+    if block.language == "python":
+        yield block.code
+    else:
+        yield from block.lines
+
+
+def _copy_checkout(scratch: Path) -> None:
+    """Copy the files that are in git, or would be."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    for name in listed.split("\0"):
+        if name and (ROOT / name).is_file():
+            (scratch / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, scratch / name)
+
+
+def _environment(scratch: Path) -> dict[str, str]:
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    return {**os.environ, "PATH": programs, "PYTHONPATH": str(scratch)}
+
+
+def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
+    """Run a line in a shell; return whether it succeeded, and what it printed."""
+    child = subprocess.Popen(
+        ["bash", "-c", command], cwd=scratch, env=_environment(scratch), stdin=subprocess.DEVNULL, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    )  # fmt: skip
+    try:
+        text, _ = child.communicate(timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        os.killpg(child.pid, 15)
+        return False, f"{child.communicate()[0]}\nstopped after {timeout_s:g} s"
+    return child.returncode == 0, text
+
+
+class _Python:
+    """A Python process for the blocks of one page, started with the first of them."""
+
+    def __init__(self, scratch: Path) -> None:
+        self._scratch = scratch
+        self._child: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> "_Python":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._child and self._child.stdin:
+            self._child.stdin.close()
+            self._child.wait(timeout=60)
+
+    def run(self, code: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
+        """Run a block among the names of those before it."""
+        if ">>> " in code:
+            code = "\n".join(line[4:] for line in code.splitlines() if line.startswith((">>> ", "... ")))
+        if self._child is None or self._child.poll() is not None:
+            self._child = subprocess.Popen(
+                [sys.executable, "-c", NAMESPACE], cwd=scratch, env=_environment(scratch), text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+        assert self._child.stdin
+        assert self._child.stdout
+        self._child.stdin.write(f"{json.dumps(code)}\n")
+        self._child.stdin.flush()
+        text = ""
+        watch = threading.Timer(timeout_s, self._child.kill)
+        watch.start()
+        try:
+            for line in self._child.stdout:
+                if line.startswith('{"done": '):
+                    return bool(json.loads(line)["done"]), text
+                text += line
+        finally:
+            watch.cancel()
+        return False, f"{text}\nended, or stopped after {timeout_s:g} s"
+
+
+def _first(command: str) -> str:
+    lines = [line for line in command.splitlines() if line.strip()]
+    return lines[0] + (" ..." if len(lines) > 1 else "")
+
+
+def _tell(line: str, log: TextIO | None) -> None:
+    print(line, flush=True)
+    if log:
+        log.write(f"{line}\n")
+        log.flush()

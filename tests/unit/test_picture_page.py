@@ -1,0 +1,184 @@
+"""The page and the overlay of a picture: the best normals by default, all rows, budgets and flags in words."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.calibration import Uniform
+from simtest.detection.blobs import Kind
+from simtest.detection.view_mask import View
+from simtest.errors import Failure, Reason
+from simtest.estimators.budget import PARTS
+from simtest.estimators.cloud_shape import CloudShape, Slope
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Camera
+from simtest.reconstruction import explanations
+from simtest.reconstruction.description import Drawing, PictureRecord, SpecularityRecord, members
+from simtest.reconstruction.overlay import ISOPHOTE, draw_overlay
+from simtest.reconstruction.result_page import write_picture_page
+
+WIDTH, HEIGHT = 320, 240
+PACKAGE = Path(explanations.__file__).parents[1]
+NORMAL = np.array([0.28, 0.0, -0.96])
+RING = [[10.0, 10.0], [20.0, 10.0], [20.0, 20.0], [10.0, 10.0]]
+
+
+def estimate(look, degrees=2.0, **more):
+    part = np.eye(2) * np.radians(degrees) ** 2 / 2
+    return Estimate(
+        NORMAL, NORMAL[None], np.array(look, float), budget={"noise": part / 4, "camera": part * 3 / 4}, **more
+    )
+
+
+def spot(i, at, estimates, best, drawings=None):
+    peak = np.array(at, float)
+    return SpecularityRecord(
+        i, (int(at[0]) - 5, int(at[1]) - 5, 10, 10), peak, None, "isolated", 0.5, best, estimates,
+        drawings=drawings or {name: Drawing([], []) for name in estimates}, best_because="smallest expected error",
+    )  # fmt: skip
+
+
+def cloud_spot(i, points, look):
+    shape = CloudShape(
+        np.array(points, float), np.diag([1e-3, 2e-3]), 4.0, 1.0, Uniform(0.0, 1e-3), Slope(0.05, 0.02, 0.08, False)
+    )
+    made = spot(i, look, {"cloud": estimate(look, target="base", cloud=shape, flags=("cut",))}, "cloud")
+    return replace(made, peak_px=None, kind=None, score=None, drawings={"cloud": Drawing([], [RING])})
+
+
+def record_of(spots):
+    camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
+    return PictureRecord("a/frame.png", camera, "srgb", "colour", View(None), ["no calibration"], spots, [])
+
+
+def page_of(spots, tmp_path):
+    write_picture_page(tmp_path / "index.html", record_of(spots), np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    return text, json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.S)[1])
+
+
+def many(count):
+    places = np.random.default_rng(3).uniform(20, 220, (count, 2))
+    return [spot(i, at, {"cone_axis": estimate(at, flags=("saturated",)),
+                         "circle_pose": Failure(Reason.STREAK, "long")}, "cone_axis")
+            for i, at in enumerate(places.round(1).tolist())]  # fmt: skip
+
+
+def test_budget_tilt_and_flags_stand_in_the_data(tmp_path):
+    text, data = page_of(many(3), tmp_path)
+    row, failed = data["spots"][0]["rows"]
+    assert row["deviation"] == pytest.approx(2.0)
+    assert row["tilt"] == pytest.approx(np.degrees(np.arccos(0.96)), abs=0.01)
+    assert row["parts"] == pytest.approx({"noise": 1.0, "camera": np.sqrt(3.0)}, abs=1e-3)
+    assert failed == {"name": "circle_pose", "status": "streak", "detail": "long"}
+    assert data["words"]["flags"][row["flags"][0]] == "the isophotes enclose clipped pixels"
+    assert "3 of 3 highlights have a normal" in text
+    assert "± 2° (median), mostly of camera (1.7°) and noise (1°)" in text
+
+
+def test_the_covariance_across_the_view_is_foreshortened(tmp_path):
+    _, data = page_of(many(1), tmp_path)
+    xx, xy, yy = data["spots"][0]["rows"][0]["across"]
+    # The normal leans in x: its x moves by cos(tilt) per rad.
+    assert yy == pytest.approx(np.radians(2.0) ** 2 / 2, rel=1e-3)
+    assert xx == pytest.approx(yy * 0.96**2, rel=1e-3)
+    assert xy == pytest.approx(0, abs=1e-9)
+
+
+def test_glints_belong_to_their_cloud(tmp_path):
+    spots = [*many(2), cloud_spot(2, [many(2)[1].peak_px, (100, 100)], (120.0, 110.0))]
+    assert members(spots) == {1: 2}
+    text, data = page_of(spots, tmp_path)
+    assert [s["cloud"] for s in data["spots"]] == [None, 2, None]
+    cloud = data["spots"][2]["rows"][0]["cloud"]
+    assert len(cloud["points"]) == 2
+    assert cloud["slope"] == pytest.approx(np.degrees([0.05, 0.02, 0.08]), abs=0.01)
+    assert explanations.TERMS["cloud"].split(".")[0] in text
+
+
+def test_lines_that_estimators_share_are_kept_once(tmp_path):
+    both = {name: estimate((15, 15)) for name in ("cone_axis", "curved")}
+    drawings = {name: Drawing([(0.3, RING[::-1]), (0.6, RING)], [RING]) for name in both}
+    _, data = page_of([spot(0, (15, 15), both, "curved", drawings)], tmp_path)
+    first = data["spots"][0]
+    assert len(first["lines"]) == 2
+    # Nearest to half height first.
+    assert [first["lines"][i] for i in first["rows"][0]["isophotes"]] == [RING, RING[::-1]]
+
+
+def test_a_picture_without_highlights_has_a_page(tmp_path):
+    text, data = page_of([], tmp_path)
+    assert data["spots"] == []
+    assert "No highlight was found" in text
+
+
+def test_the_overlay_draws_the_best_estimate_alone():
+    both = {"cone_axis": estimate((60, 60)), "circle_pose": estimate((200, 120))}
+    drawings = {
+        "cone_axis": Drawing([(0.5, RING)], [RING]),
+        "circle_pose": Drawing([(0.1, [[200, 200], [230, 200]])], []),
+    }
+    blank = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    drawn = draw_overlay(blank, [spot(0, (60, 60), both, "cone_axis", drawings)])
+    scale = drawn.shape[1] // WIDTH
+    frame = drawn[: HEIGHT * scale]
+    assert frame[10 * scale : 20 * scale, 10 * scale : 20 * scale].any()
+    assert not frame[100 * scale :, 150 * scale :].any()
+    assert (drawn == ISOPHOTE).all(axis=-1).any()
+
+
+def test_the_overlay_draws_a_cloud_as_a_cloud():
+    spots = [cloud_spot(0, [(200, 60), (250, 180), (150, 200)], (210.0, 150.0))]
+    drawn = draw_overlay(np.zeros((HEIGHT, WIDTH), np.float32), spots)
+    scale = drawn.shape[1] // WIDTH
+    for x, y in spots[0].estimates["cloud"].cloud.points_px.astype(int):
+        assert drawn[y * scale - 2 : y * scale + 2, x * scale - 2 : x * scale + 2].any()
+        # half-way along the ray
+        x, y = (x + 210) // 2, (y + 150) // 2
+        assert drawn[y * scale - 4 : y * scale + 4, x * scale - 4 : x * scale + 4].any()
+
+
+def test_a_narrow_overlay_wraps_its_legend():
+    names = ["brightest_point", "cone_axis", "curved", "photometric", "bisector", "inverse_rendering"]
+    spots = [spot(i, (20 + 10 * i, 30), {name: estimate((20, 30))}, name) for i, name in enumerate(names)]
+    drawn = draw_overlay(np.zeros((1000, 300), np.float32), spots)
+    assert drawn.shape[0] > 1000 + 30
+    assert cv2.imencode(".png", drawn)[0]
+
+
+# Words ------------------------------------------------------------------------------------------------------------
+
+
+def flags_in_code():
+    """Flags that the package's estimators and pipeline may set, read from the sources' tuples and conditions."""
+    told = re.compile(
+        r'flags=\(.*?"([a-z_]+)"|flags\.append\("([a-z_]+)"|^ +"([a-z_]+)": (?:bool\(|missing|self\.axis|pose\.)|'
+        r'flags = \("([a-z_]+)",\) if |flags, "([a-z_]+)"\)|^UNRESOLVED = "([a-z_]+)"|'
+        r'masks\["([a-z_]+)"\]|masks = \{"([a-z_]+)"',
+        re.M,
+    )
+    files = [*(PACKAGE / "estimators").glob("*.py"), PACKAGE / "reconstruction" / "pipeline.py"]
+    return {name for file in files for found in told.findall(file.read_text("utf-8")) for name in found if name}
+
+
+def test_every_flag_kind_reason_and_part_is_explained():
+    found = flags_in_code()
+    assert {"saturated", "vignetted", "base_doubted", "streak", "misfit", "dim", "unresolved", "round"} <= found
+    assert found - set(explanations.FLAGS) == set()
+    assert set(explanations.KINDS) == {str(kind) for kind in Kind}
+    assert set(explanations.REASONS) == {str(reason) for reason in Reason}
+    assert set(explanations.PARTS) >= set(PARTS)
+
+
+def test_documented_flags_are_explained():
+    manual = PACKAGE.parent / "docs" / "reference" / "estimators.md"
+    if not manual.is_file():
+        pytest.skip("no manual beside the package")
+    table = manual.read_text("utf-8").split("## Flags and reasons")[1].split("\n\n")[1]
+    named = {name.strip() for line in table.splitlines()[2:] for name in line.split("|")[1].split(",")}
+    assert named - set(explanations.FLAGS) == set()
