@@ -1,4 +1,4 @@
-"""The verdict for machines and readers without the page: JSON, JUnit XML, Markdown, a badge (docs/howto/nightly.md)."""
+"""The verdict without the page: JSON, JUnit XML, Markdown, a badge (docs/howto/run_in_ci.md)."""
 
 import math
 from pathlib import Path
