@@ -19,6 +19,7 @@ ON_REQUEST = (
     "history",
     "dataset_memory",
     "nightly_page",
+    "run_page",
 )
 """The same, run where they are named: they take minutes, or need what is not always there."""
 

@@ -1,7 +1,5 @@
 """The nightly page with a history of 1,000 nights: its size, how long it takes to make, how soon it can be used."""
 
-import os
-import shutil
 import tempfile
 import time
 from dataclasses import replace
@@ -10,6 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
+from benchmarks.browser import OPENINGS, openings
 from benchmarks.measuring import Figure
 from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.ladder import ladder_figures
@@ -25,8 +24,6 @@ FIGURES_A_NIGHT = 3000
 
 STARTED = datetime(2026, 11, 1, 2, 30, tzinfo=UTC)
 MB = 1e6
-OPENINGS = 5
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 FILTERED = """
 () => {
@@ -75,35 +72,11 @@ def _judged(folder: Path) -> JudgedRun:
 
 
 def _opened(page: Path) -> list[Figure]:
-    """Open the page in the system's Chromium; without one the benchmark fails, for its figures would be missing."""
-    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if browser is None:
-        raise SystemExit(f"benchmark nightly_page: no browser; install one of {', '.join(BROWSERS)}")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        raise SystemExit("benchmark nightly_page: needs playwright; install simtest[bench]") from None
-    times, processor, used = [], [], []
-    with sync_playwright() as driver:
-        # The sandbox does not start under root.
-        options = ["--no-sandbox"] if os.geteuid() == 0 else []
-        chromium = driver.chromium.launch(executable_path=browser, args=options)
-        for _ in range(OPENINGS):
-            tab = chromium.new_page()
-            meter = tab.context.new_cdp_session(tab)
-            meter.send("Performance.enable", {"timeDomain": "threadTicks"})
-            started = time.monotonic()
-            tab.goto(page.as_uri(), wait_until="commit")
-            tab.wait_for_selector("#trend-chart .main-svg")
-            times.append(time.monotonic() - started)
-            measured = {entry["name"]: entry["value"] for entry in meter.send("Performance.getMetrics")["metrics"]}
-            processor.append(measured["TaskDuration"])
-            used.append(tab.evaluate(FILTERED) / 1e3)
-            tab.close()
-        chromium.close()
+    """Open the page, and use it."""
+    times, processor, used = openings(page, "#trend-chart .main-svg", FILTERED)
     middle = OPENINGS // 2
-    about = f"of {OPENINGS} openings; the page's thread {sorted(processor)[middle]:.2f} s of processor"
+    about = f"of {OPENINGS} openings; the page's thread {processor[middle]:.2f} s of processor"
     return [
-        Figure("nightly page: until it can be used", sorted(times)[middle], 3.0, unit="s", about=about),
-        Figure("nightly page: a filter and another trend", sorted(used)[middle], 0.5, unit="s", about=""),
+        Figure("nightly page: until it can be used", times[middle], 3.0, unit="s", about=about),
+        Figure("nightly page: a filter and another trend", used[middle], 0.5, unit="s", about=""),
     ]

@@ -30,16 +30,11 @@ def main() -> None:
 
 def _run(stop: Termination) -> int:
     """Run the command and return its exit code."""
-    import warnings
-
     from simtest.cli.manners import MANNERS, take_flags
 
     sys.argv[1:], wants_traceback = take_flags(sys.argv[1:])
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
-    if MANNERS.quiet:
-        warnings.showwarning = lambda *_, **__: None
-    elif not wants_traceback:
-        warnings.showwarning = _warn
+    _answer_warnings(MANNERS.quiet, wants_traceback)
 
     from cyclopts import CycloptsError
 
@@ -74,6 +69,11 @@ def _run(stop: Termination) -> int:
     except BrokenPipeError:
         _discard_output()
         return 0
+    except SystemExit as ended:
+        # So ends the printer of help, whose own code for it is 1.
+        if isinstance(ended.__context__, BrokenPipeError):
+            return 0
+        raise
     except Exception as error:
         return _report(_problem(error), failed)
 
@@ -91,8 +91,11 @@ def _problem(error: Exception) -> str:
 
 def _output_fails() -> bool:
     """Return whether what is printed cannot be written; then it is given up, or Python would say so at its end."""
+    import os
+
     try:
-        sys.stdout.flush()
+        # What failed once is lost from the buffers, so flushing them again tells nothing.
+        os.write(sys.stdout.fileno(), b"\n")
     except (OSError, ValueError, AttributeError):
         _discard_output()
         return True
@@ -120,6 +123,16 @@ def _require_folder() -> None:
     except FileNotFoundError:
         if not {"--help", "-h", "--version"} & set(sys.argv):
             raise InputError("the working folder was deleted; change to another one") from None
+
+
+def _answer_warnings(quiet: bool, plain: bool) -> None:
+    """Have warnings printed in one line, or not at all where `quiet`, or as Python does where `plain`."""
+    import warnings
+
+    if quiet:
+        warnings.showwarning = lambda *_, **__: None
+    elif not plain:
+        warnings.showwarning = _warn
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:

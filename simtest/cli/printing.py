@@ -21,10 +21,10 @@ def print_json(value: Any) -> None:
     print(json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2, allow_nan=False))
 
 
-def print_run(folder: Path) -> None:
-    """Print a run as one JSON document: its page, its results, and what its summary.json holds."""
+def print_run(folder: Path, **told: Any) -> None:
+    """Print a run as one JSON document: its page, its results, what its summary.json holds, and what else is told."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    print_json({"page": folder / "index.html", "results": folder / "results.parquet", **summary})
+    print_json({"page": folder / "index.html", "results": folder / "results.parquet", **told, **summary})
 
 
 def print_files(files: Iterable[object], as_json: bool, **told: Any) -> None:

@@ -80,8 +80,10 @@ class Termination:
         raise KeyboardInterrupt
 
     def _again(self, number: int, frame: FrameType | None) -> None:
-        answer = self._terminate if self.came else self._interrupt
-        answer(number, frame)
+        # Ctrl-C may by now be answered by someone else, such as a progress bar.
+        answer = self._terminate if self.came else signal.getsignal(signal.SIGINT)
+        if callable(answer):
+            answer(number, frame)
 
     def _lost(self, what: Any) -> None:
         """Try again where an exception was raised in a place that cannot raise, such as the end of an object."""

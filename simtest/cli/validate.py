@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -57,18 +58,25 @@ def validate(
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_experiment, parse_settings
+    from simtest.validation.mesh_verdicts import mesh_verdicts
 
     values = parse_settings(settings or [])
     own = {"realisations": realisations, "seed": seed, "estimators": estimators}
     values |= {key: value for key, value in own.items() if value is not None}
     described = load_experiment(experiment, values)
+    meshes = mesh_verdicts(described)
+    for mesh in meshes:
+        if not mesh.usable:
+            # Before the work: it takes long, and its figures may mean nothing.
+            warnings.warn(str(mesh), stacklevel=1)
     command = shlex.join(["simtest", *sys.argv[1:]])
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
     if as_json:
-        print_run(folder)
+        print_run(folder, meshes=meshes)
         return
+    print(*meshes, sep="\n", end="\n" * bool(meshes))
     print_guide(folder)
     print(folder / "index.html")

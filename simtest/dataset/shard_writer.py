@@ -1,5 +1,6 @@
 """Writes a dataset shard by shard: never half of one under its final name, and continued after any interruption."""
 
+import errno
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -211,6 +212,8 @@ def _write_shard(folder: Path, maker: Maker, shard: Shard, on_step: OnStep) -> F
     # begun, or not yet
     # A writer whose parent was killed may live for another moment.
     with waiting_for(part) as file:
+        if not file.writable():
+            raise PermissionError(errno.EACCES, "is another user's, who has not finished it", str(part))
         count = _keep_whole(file, shard)
         for _ in range(count):
             on_step()

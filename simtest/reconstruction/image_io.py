@@ -32,9 +32,19 @@ VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpe
 def read_picture(path: Path) -> Image:
     """Read a picture of 8 or 16 bits as values in [0, 1], as they are encoded; shape (H, W) or (H, W, 3), RGB.
 
-    Grey, RGB and RGBA are read; alpha is ignored. Raises `InputError` as `read_raw` does, and for other depths.
+    Grey, RGB and RGBA are read; alpha is ignored, with a warning where pixels are transparent. Raises
+    `InputError` as `read_raw` does, and for other depths.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
+    if (
+        picture.ndim == 3
+        and picture.shape[2] == 4
+        and (clear := float((picture[..., 3] < picture[..., 3].max()).mean()))
+    ):
+        warnings.warn(
+            f"{shown(path)}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent",
+            stacklevel=3,
+        )
     scaled = scale_picture(picture, shown(path))
     if scaled is None:
         raise InputError(f"{shown(path)}: pixels are {picture.dtype}; must be 8 or 16 bits")
@@ -107,7 +117,10 @@ def _tiff_size(path: Path) -> tuple[int, int, int]:
             else:
                 tags = TiffImagePlugin.ImageFileDirectory_v2(head[:8])
             file.seek(tags.next)
-            tags.load(file)
+            # It warns of what it does not find; whoever decodes the picture tells that it cannot be read.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                tags.load(file)
             width, height = int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH])
             return width, height, sum(tags.get(TiffImagePlugin.BITSPERSAMPLE, (1,)))
     except Exception:
@@ -134,6 +147,8 @@ class Source:
     path: Path
     count: int
     files: tuple[Path, ...] = ()
+    is_cut: bool = False
+    """Whether a video's file is shorter than its header says."""
 
     @property
     def is_video(self) -> bool:
@@ -203,7 +218,8 @@ def open_source(path: Path) -> Source:
     size = check_file(path, "film_bytes", "a film, a picture or a folder of pictures")
     # FFmpeg takes whatever it can make sense of, playlists of other files among it.
     with path.open("rb") as file:
-        if not _is_film(file.read(16)):
+        head = file.read(16)
+        if not _is_film(head):
             raise InputError(f"{shown(path)}: no video that can be read ({size} bytes, of no known container)")
     capture = _capture(path)
     # OpenCV opens some files that hold no frame, so the first is fetched.
@@ -213,7 +229,9 @@ def open_source(path: Path) -> Source:
     width, height, count = (int(capture.get(key)) for key in keys)
     capture.release()
     check_picture_size(path, width, height)
-    return Source(path, max(count, 1))
+    # Only an AVI file tells its length at its beginning.
+    is_cut = head[:4] == b"RIFF" and size < 8 + int.from_bytes(head[4:8], "little")
+    return Source(path, max(count, 1), is_cut=is_cut)
 
 
 def _is_film(head: bytes) -> bool:

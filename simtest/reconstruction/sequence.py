@@ -83,9 +83,11 @@ def _reconstruct(
     # A run that read nothing is an error; one that ended early keeps what it has.
     if not run.frames:
         raise InputError(f"{shown(path)}: no frame could be read ({run.first_error or 'it has none'})")
-    if source.is_video and run.taken < source.count - 1:
+    # The count of a whole film may be off by one.
+    if source.is_video and (run.taken < source.count - 1 or source.is_cut):
+        how = "its file is cut short; " if source.is_cut else ""
         warnings.warn(
-            f"{shown(path)}: ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
+            f"{shown(path)}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
     tracks = tracks_of(run.frames)
     files = _write(out, run.frames, tracks)

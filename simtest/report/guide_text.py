@@ -125,9 +125,12 @@ def _broken(name: str, own: Sequence[Advice]) -> str:
     texts = [f"{each.situation.title} ({_why(each.methods[name])})" for each in (ranked[0], ranked[-1])]
     if len(ranked) == 1:
         return f"1 of {len(own)}: {texts[0]}"
-    return f"{len(ranked)} of {len(own)}, from {texts[0]} to {texts[1]}"
+    return f"{len(ranked)} of {len(own)}; least in {texts[0]}, most in {texts[1]}"
 
 
 def shared_sentence(guide: Guide) -> str:
-    """Say what holds in all situations; empty where nothing does."""
-    return f"In every situation: {', '.join(guide.shared)}." if guide.shared else ""
+    """Say what holds in all situations, and what ε/d is where one names it; empty where there is nothing to say."""
+    told = [f"In every situation: {', '.join(guide.shared)}."] if guide.shared else []
+    if any("ε/d" in text for text in (*guide.shared, *(each.situation.circumstances for each in guide.advice))):
+        told.append("ε/d is the light's distance from the camera over that of the surface.")
+    return " ".join(told)

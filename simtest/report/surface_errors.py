@@ -77,7 +77,7 @@ def _apart(results: pl.DataFrame) -> pl.DataFrame:
     beside = (pl.col("eps_over_d").mean().over("surface", "setting") > CO_LOCATED).fill_null(False)
     results = results.with_columns(beside=beside)
     both = pl.col("beside").any().over("surface") & ~pl.col("beside").all().over("surface")
-    name = pl.when(both & pl.col("beside")).then(pl.col("surface") + ", light beside").otherwise("surface")
+    name = pl.when(both & pl.col("beside")).then(pl.col("surface") + ", offset").otherwise("surface")
     return results.with_columns(surface=name)
 
 

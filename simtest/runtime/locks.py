@@ -77,6 +77,12 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
         _require_without_locks(error, what, lock)
         yield
         return
+    except KeyboardInterrupt:
+        # Just made, perhaps; what nobody holds may go.
+        if not is_held(lock):
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
+        raise
     with file:
         try:
             taken = _taken(lock, file)
@@ -164,13 +170,18 @@ def is_held(lock: Path) -> bool:
 def waiting_for(path: Path) -> Iterator[IO[bytes]]:
     """Open a file to append to, made if need be, once no other process holds it.
 
-    The holder may meanwhile have renamed or removed the file: then the one that has its name now is taken.
+    The holder may meanwhile have renamed or removed the file: then the one that has its name now is taken. Another
+    user's file is opened to read alone, which is enough to hold it; where the file system has no locks nobody waits.
+    Raises `OSError` if the file cannot be opened.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        path.touch()
-        with path.open("r+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with _open(path) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in _WITHOUT_LOCKS:
+                    raise
             if is_same(path, file):
                 yield file
                 return

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import blender, cores, cost, growth, memory, nightly_page, ray_nodes
+from benchmarks import blender, browser, cores, cost, growth, memory, nightly_page, ray_nodes
 from benchmarks.__main__ import NAMES, ON_REQUEST, main
 from benchmarks.measuring import Figure, print_markdown
 from benchmarks.scheduler import shard_times, simulate
@@ -181,7 +181,7 @@ def test_tables_are_printed_as_the_manual_holds_them(capsys):
 
 
 def test_a_missing_browser_fails(monkeypatch, tmp_path):
-    monkeypatch.setattr(nightly_page.shutil, "which", lambda name: None)
+    monkeypatch.setattr(browser.shutil, "which", lambda name: None)
     with pytest.raises(SystemExit, match="no browser; install one of chromium"):
         nightly_page._opened(tmp_path / "index.html")
 

@@ -20,7 +20,7 @@ from simtest.cli.stopping import Termination
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.engines import local
 from simtest.runtime.files import write_atomically, write_json
-from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held
+from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held, waiting_for
 from simtest.runtime.machine_errors import machine_problem, write_error
 from simtest.surfaces.mesh_file import write_mesh
 from simtest.surfaces.model import TriangleMesh
@@ -373,3 +373,37 @@ def test_a_worker_hands_on_errors_of_the_disk(raised, kind):
     assert state == "error"
     assert type(error) is kind
     assert kind is OSError or str(error).startswith(("not enough memory; ", "a worker failed (KeyError"))
+
+
+def test_another_user_s_lock_can_be_waited_for(tmp_path, monkeypatch):
+    """It is opened to read alone; `touch` would be denied."""
+    lock = tmp_path / LOCK
+    lock.write_bytes(b"left behind")
+    permission_denied(monkeypatch, lambda flags: flags & os.O_RDWR)
+    with waiting_for(lock) as file:
+        assert not file.writable()
+        assert is_held(lock)
+    assert not is_held(lock)
+    monkeypatch.undo()
+    with waiting_for(lock) as file:
+        assert file.writable()
+
+
+def test_where_there_are_no_locks_nobody_waits(tmp_path, monkeypatch):
+    def without(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    with waiting_for(tmp_path / "x.part") as file:
+        file.write(b"data")
+
+
+def test_a_stop_while_a_lock_is_made_leaves_no_file(tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fdopen", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        entered(exclusive_folder(tmp_path / "out"))
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,124 @@
+"""Mesh files that are cut, count from 0, or mix polygons: read as what they are, or refused with the cause."""
+
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from simtest.spec import Experiment, Group
+from simtest.surfaces.mesh_file import read_mesh
+from simtest.surfaces.ply_polygons import read_mixed_polygons
+from simtest.validation.mesh_verdicts import mesh_verdicts
+from tests.refusals import refused
+
+CORNERS = np.array([[x, y, z] for x in (0, 10) for y in (0, 10) for z in (0, 10)], dtype=float)
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4)]
+TRIANGLES = [(1, 5, 7), (1, 7, 3)]
+
+
+def ball():
+    return trimesh.creation.icosphere(subdivisions=2, radius=20)
+
+
+def ply(faces, order="<", count="uchar", before="", after=""):
+    """Return a binary PLY file of the cube; `before` and `after` are types of further properties of a face."""
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    lines = [f"ply\nformat {name} 1.0\nelement vertex 8\nproperty float x\nproperty double y\nproperty float z"]
+    lines += [f"element face {len(faces)}", *(f"property {kind} a{i}" for i, kind in enumerate(before.split()))]
+    lines += [f"property list {count} int vertex_indices", *(f"property {kind} b" for kind in after.split())]
+    data = ("\n".join(lines) + "\nend_header\n").encode()
+    data += b"".join(struct.pack(f"{order}fdf", *corner) for corner in CORNERS)
+    letter = {"uchar": "B", "int": "i"}[count]
+    for face in faces:
+        data += struct.pack(f"{order}{'h' * len(before.split())}", *([7] * len(before.split())))
+        data += struct.pack(f"{order}{letter}{len(face)}i", len(face), *face)
+        data += struct.pack(f"{order}{'f' * len(after.split())}", *([0.5] * len(after.split())))
+    return data
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    "given", [{}, {"count": "int"}, {"before": "short short"}, {"before": "short", "after": "float"}]
+)
+def test_binary_ply_files_of_mixed_polygons_are_read(tmp_path, order, given):
+    path = tmp_path / "cube.ply"
+    path.write_bytes(ply([*QUADS, *TRIANGLES], order, **given))
+    vertices, faces, _ = read_mesh(path)
+    assert (len(vertices), len(faces)) == (8, 12)
+    cube = trimesh.Trimesh(vertices, faces, process=False)
+    assert cube.is_watertight
+    assert cube.volume == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize("faces", [QUADS, TRIANGLES, [*QUADS, (1, 5, 7, 3)]])
+def test_faces_of_one_kind_are_left_to_the_usual_reader(tmp_path, faces):
+    path = tmp_path / "cube.ply"
+    path.write_bytes(ply(faces))
+    assert read_mixed_polygons(path) is None
+
+
+def test_a_cut_file_of_mixed_polygons_is_refused(tmp_path):
+    path = tmp_path / "cube.ply"
+    whole = ply([*QUADS, *TRIANGLES])
+    for cut in (3, 30):
+        path.write_bytes(whole[:-cut])
+        refused(lambda: read_mesh(path), "cube.ply: ")
+
+
+def test_vertex_0_of_an_obj_file_is_refused(tmp_path):
+    mesh, path = ball(), tmp_path / "ball.obj"
+    points = "".join(f"v {x} {y} {z}\n" for x, y, z in mesh.vertices)
+    for form, first, good in (
+        ("{}", 0, False),
+        ("{}//{}", 0, False),
+        ("{}", 1, True),
+        ("{}", -len(mesh.vertices), True),
+    ):
+        corners = [[form.replace("{}", str(index + first)) for index in face] for face in mesh.faces.tolist()]
+        path.write_text(points + "# f 0 0 0\n" + "".join(f"f {' '.join(face)}\n" for face in corners))
+        if good:
+            assert len(read_mesh(path)[1]) == len(mesh.faces)
+        else:
+            refused(lambda: read_mesh(path), "ball.obj: f ", ": vertex 0; the first vertex of an OBJ file is 1")
+    # Ten and a hundred are no zero.
+    path.write_text(points + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in mesh.faces if 9 in (a, b, c)))
+    read_mesh(path)
+
+
+def test_cut_stl_files_are_told(tmp_path):
+    mesh, path = ball(), tmp_path / "ball.stl"
+    whole = mesh.export(file_type="stl")
+    path.write_bytes(whole[: len(whole) // 2])
+    refused(lambda: read_mesh(path), "holds 159 of the 320 faces that it announces: it is cut short")
+    text = trimesh.exchange.stl.export_stl_ascii(mesh)
+    path.write_text(text[: len(text) // 2])
+    refused(lambda: read_mesh(path), "ball.stl: has no line endsolid: it is cut short")
+    for good in (whole, text.encode(), b"solid by a binary writer".ljust(80) + whole[80:]):
+        path.write_bytes(good)
+        assert len(read_mesh(path)[1]) == 320
+
+
+# The verdict in an experiment ------------------------------------------------------------------------------------
+
+
+def experiment(**values):
+    return Experiment(name="x", groups=(Group(scene="anatomy", set=values), Group(scene="plane")))
+
+
+def test_an_experiment_judges_its_mesh_files_once(tmp_path):
+    path = tmp_path / "ball.ply"
+    ball().export(path)
+    assert mesh_verdicts(experiment()) == []
+    assert mesh_verdicts(experiment(**{"surface.path": "liver"})) == []
+    (coarse,) = mesh_verdicts(experiment(**{"surface.path": str(path)}))
+    assert not coarse.usable
+    assert str(coarse).startswith(f"mesh {path}: too coarse: edges of 0.")
+    assert str(coarse).endswith(" mm are needed (surface.edge_mm)")
+    assert coarse.to_json() == {"file": str(path), "usable": False, "verdict": coarse.text}
+    (refined,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
+    assert (refined.usable, refined.text) == (True, "refined to what it needs by surface.edge_mm = auto")
+    # A wide lobe needs no fine mesh.
+    trimesh.creation.icosphere(subdivisions=5, radius=20).export(path)
+    (fine,) = mesh_verdicts(experiment(**{"surface.path": str(path), "reflectance.exponent": 2.0}))
+    assert (fine.usable, fine.text) == (True, "fine enough")

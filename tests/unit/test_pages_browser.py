@@ -1,0 +1,198 @@
+"""Run, nightly, realism and picture pages in a real browser: nothing overflows, phones get short pages, axe is content.
+
+axe-core comes with the package axe-playwright-python (extra ci), which bundles axe.min.js.
+"""
+
+import importlib.util
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_nightly_page import rows_of
+from test_realism_page import frames
+from test_report import make_item, make_run
+
+from benchmarks.nights import history_of, run_of, verdict_of
+from simtest.api import reconstruct_picture
+from simtest.nightly.page import write_nightly_page
+from simtest.nightly.records import JudgedRun
+from simtest.realism.comparison import compare
+from simtest.realism.page import write_comparison
+from simtest.reconstruction.picture import Options
+from simtest.report import write_report
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = [
+    pytest.mark.extra,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
+]
+
+PAGES = ("run", "nightly", "realism", "picture")
+WIDTHS = (1400, 1000, 390)
+SCHEMES = ("light", "dark")
+PHONE_HEIGHT = 844
+MOST_SCREENS = 8
+"""Screens of a phone that a page takes before the reader opens a section."""
+
+# What sticks out of the page, or out of its own box without scrolling there. Plotly clips what it draws itself, and
+# what lies within a box that scrolls is reached by scrolling.
+OVERFLOWS = """() => {
+  const width = document.documentElement.clientWidth, found = [];
+  for (const part of document.body.querySelectorAll("*")) {
+    const box = part.getBoundingClientRect();
+    if (!box.width || !box.height || part.closest("svg, .js-plotly-plot, .skip")) continue;
+    const frame = part.parentElement.closest(".scroll, .strip, [data-scrolls]");
+    if (frame) continue;
+    const style = getComputedStyle(part), name = part.tagName + "." + part.className;
+    if (box.right > width + 1 || box.left < -1) found.push(`${name}: ${box.left} to ${box.right} of ${width}`);
+    const inside = style.overflowX === "visible" && style.display !== "inline" && part.clientWidth;
+    if (inside && part.scrollWidth > part.clientWidth + 1)
+      found.push(`${name}: ${part.scrollWidth} in ${part.clientWidth}`);
+  }
+  return found;
+}"""
+
+# A box that scrolls sideways says so, but for a strip of pictures.
+SILENT = """() => [...document.querySelectorAll(".scroll")].filter(box => {
+  const hint = box.previousElementSibling;
+  const wide = box.getClientRects().length && box.scrollWidth > box.clientWidth + 1;
+  return wide && !(hint?.classList.contains("hint") && !hint.hidden);
+}).map(box => box.getAttribute("aria-label"))"""
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """One page of each kind, by name."""
+    folder = tmp_path_factory.mktemp("pages")
+    made = {"run": write_report(make_run(folder / "run", items=3))}
+    run = run_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
+    make_item(folder / "worst-00.npz", detail=3)
+    judged = JudgedRun(run, verdict_of(run), history_of(run, 30), (folder / "worst-00.npz",))
+    made["nightly"] = write_nightly_page(folder / "nightly", judged)
+    made["realism"] = write_comparison(compare(frames(5), frames(5, first=9)), folder / "realism", "plain")
+    made["picture"] = picture_page(folder)
+    return made
+
+
+def picture_page(folder: Path) -> Path:
+    """The page of a picture with a dozen spots on tissue."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:240, :320]
+    picture = 0.3 + 0.02 * rng.standard_normal((240, 320))
+    for column, row in ((c, r) for c in range(40, 300, 70) for r in range(40, 220, 70)):
+        picture += 0.6 * np.exp(-((x - column) ** 2 + 1.4 * (y - row) ** 2) / 60)
+    cv2.imwrite(str(folder / "spots.png"), np.uint8(np.clip(255 * picture, 0, 254)))
+    with pytest.warns(UserWarning, match="no calibration"):
+        _, files = reconstruct_picture(folder / "spots.png", folder / "picture", Options(fov_deg=70.0))
+    return next(file for file in files if file.name == "index.html")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def opened(browser, pages):
+    contexts = []
+
+    def visit(name, width, scheme="light"):
+        size = {"width": width, "height": PHONE_HEIGHT}
+        contexts.append(browser.new_context(viewport=size, color_scheme=scheme, is_mobile=width < 600))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(60_000)
+        page.goto(pages[name].as_uri())
+        page.wait_for_load_state("networkidle")
+        return page
+
+    yield visit
+    for context in contexts:
+        context.close()
+
+
+def open_all(page):
+    """Open every section, and come by every chart, so that all are drawn."""
+    page.evaluate("document.querySelectorAll('details').forEach(box => { box.open = true; })")
+    for box in page.locator("[data-chart]:visible").all():
+        box.scroll_into_view_if_needed()
+        box.locator(".main-svg, canvas, img").first.wait_for()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", PAGES)
+def test_nothing_overflows(opened, name, width):
+    page = opened(name, width)
+    assert page.evaluate(OVERFLOWS) == []
+    open_all(page)
+    assert page.evaluate(OVERFLOWS) == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate(SILENT) == []
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_phone_shows_at_most_eight_screens_before_more(opened, name):
+    page = opened(name, 390)
+    assert page.evaluate("document.documentElement.scrollHeight") <= MOST_SCREENS * PHONE_HEIGHT
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("name", PAGES)
+def test_axe_finds_nothing_serious(opened, name, width, scheme):
+    found = importlib.util.find_spec("axe_playwright_python")
+    if found is None:
+        pytest.skip("axe-playwright-python is not installed: extra ci")
+    page = opened(name, width, scheme)
+    open_all(page)
+    page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
+    # Charts that plotly draws are described by their boxes' labels, captions and tables.
+    report = page.evaluate("axe.run({exclude: ['.js-plotly-plot .main-svg']}, {resultTypes: ['violations']})")
+    grave = [each for each in report["violations"] if each["impact"] in ("serious", "critical")]
+    assert [(each["id"], each["nodes"][0]["html"]) for each in grave] == []
+
+
+def test_axe_sees_a_planted_fault(opened):
+    found = importlib.util.find_spec("axe_playwright_python")
+    if found is None:
+        pytest.skip("axe-playwright-python is not installed: extra ci")
+    page = opened("realism", 1400)
+    page.evaluate("document.querySelector('img').removeAttribute('alt')")
+    page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
+    assert "image-alt" in [each["id"] for each in page.evaluate("axe.run()")["violations"]]
+
+
+def test_the_overflow_check_sees_a_planted_fault(opened):
+    page = opened("realism", 390)
+    page.evaluate("document.querySelector('h1').style.width = '600px'")
+    assert any(text.startswith("H1") for text in page.evaluate(OVERFLOWS))
+
+
+def test_a_link_opens_the_section_that_is_folded_on_a_phone(opened):
+    page = opened("run", 390)
+    chart = page.locator("#error_vs_curvature .chart")
+    assert not chart.is_visible()
+    page.locator("nav a[href='#error_vs_curvature']").click()
+    page.wait_for_selector("#error_vs_curvature .main-svg")
+    assert chart.is_visible()
+
+
+def test_paper_shows_what_is_folded_and_folds_it_again(opened):
+    page = opened("run", 390)
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert page.locator("details:not([open])").count() == 0
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.locator("details.fold:not([open])").count() > 3
+
+
+def test_the_run_page_is_small(pages):
+    assert pages["run"].stat().st_size <= 1_500_000

@@ -1,0 +1,223 @@
+"""Stops and broken surroundings: signals at any moment, readers that have gone, full disks, deleted folders."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from simtest.cli.main import main
+from simtest.cli.stopping import INTERRUPTED, TERMINATED
+from simtest.errors import InputError, SimtestError
+from simtest.runtime.files import make_folder, refuse_file
+from simtest.runtime.machine_errors import cannot_write
+from tests.refusals import refused
+
+MAIN = "from simtest.cli.main import main; main()"
+
+
+def script(code, *arguments, **options):
+    return subprocess.run([sys.executable, "-c", textwrap.dedent(code), *arguments], capture_output=True, text=True,
+                          timeout=60, check=False, **options)  # fmt: skip
+
+
+def shell(line, folder=None):
+    environment = {**os.environ, "SIMTEST": f"{sys.executable} -m simtest"}
+    return subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+                          env=environment)  # fmt: skip
+
+
+# Signals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGTERM", TERMINATED), ("SIGINT", INTERRUPTED)])
+def test_a_stop_before_a_command_begins_is_silent(number, code):
+    done = script(f"""
+        import signal
+        from simtest.cli.stopping import Termination
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with Termination():
+            signal.raise_signal(signal.{number})
+        print("not stopped")
+    """)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
+@pytest.mark.parametrize(("number", "came"), [("SIGTERM", True), ("SIGINT", False)])
+def test_a_stop_within_an_import_waits_for_its_end(tmp_path, number, came):
+    (tmp_path / "broken_off.py").write_text(
+        f"import signal\ntry:\n    signal.raise_signal(signal.{number})\n    x = sum(range(10**5))\n"
+        "except KeyboardInterrupt:\n    print('swallowed')\nprint('imported')\n"
+    )
+    done = script(f"""
+        import signal, sys, time
+        from simtest.cli.stopping import Termination
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.path.insert(0, {str(tmp_path)!r})
+        try:
+            with Termination() as stop, stop.working():
+                import broken_off
+                time.sleep(5)
+                print("not stopped")
+        except KeyboardInterrupt:
+            print("stopped", stop.came)
+    """)
+    assert (done.stdout.split(), done.stderr) == (["imported", "stopped", str(came)], "")
+
+
+def test_a_stop_that_a_destructor_swallows_is_tried_again():
+    done = script("""
+        import signal, time
+        from simtest.cli.stopping import Termination
+        class Thing:
+            def __del__(self):
+                signal.raise_signal(signal.SIGTERM)
+                len("")
+        try:
+            with Termination() as stop, stop.working():
+                Thing()
+                time.sleep(5)
+                print("not stopped")
+        except KeyboardInterrupt:
+            print("stopped")
+    """)
+    assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
+def test_a_stop_while_the_command_is_loaded_is_silent():
+    process = subprocess.Popen([sys.executable, "-X", "importtime", "-c", MAIN, "schema"], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    told = []
+    # The first module behind that which answers signals; nothing heavy is loaded yet.
+    for line in process.stderr:
+        told.append(line)
+        if line.rstrip().endswith("| simtest.cli.manners"):
+            process.send_signal(signal.SIGTERM)
+            break
+    output, rest = process.communicate(timeout=60)
+    assert process.returncode == TERMINATED
+    assert output == ""
+    assert not [line for line in (*told, *rest.splitlines()) if not line.startswith("import time:")]
+
+
+# The output ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["schema scene", "list", "doctor --help"])
+def test_a_reader_that_has_gone_is_no_error(command):
+    done = shell(f"$SIMTEST {command} | true; echo ${{PIPESTATUS[0]}}")
+    assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+def test_a_reader_of_a_table_that_has_gone_is_no_error(tmp_path):
+    (tmp_path / "table.py").write_text(
+        "import sys\nfrom simtest.cli import listing, main, printing\nprinting.MOST_ROWS = 10**6\n"
+        "listing.names_of = lambda _: printing.print_table(('a',), [['x']] * 5000) or {}\n"
+        "sys.argv = ['simtest', 'list']\nmain.main()\n"
+    )
+    done = shell(f"{sys.executable} {tmp_path}/table.py | true; echo ${{PIPESTATUS[0]}}")
+    assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("command", ["schema scene", "list scenes"])
+def test_an_output_that_is_full_is_told(command):
+    done = shell(f"$SIMTEST {command} >/dev/full")
+    assert done.returncode == 1
+    assert done.stderr == "simtest: the output cannot be written (No space left on device)\n"
+
+
+# Folders and disks -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["render plane --out {0}/x", "doctor", "schema scene", "list"])
+def test_a_deleted_working_folder_is_told(command, tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    line = f"cd {gone}; rmdir {gone}; {sys.executable} -P -m simtest {command.format(tmp_path)}"
+    done = shell(line)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "simtest: the working folder was deleted; change to another one\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_needs_no_folder(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    assert shell(f"cd {gone}; rmdir {gone}; {sys.executable} -P -m simtest --help").returncode == 0
+
+
+def test_a_link_that_leads_nowhere_is_told(tmp_path):
+    out = tmp_path / "out"
+    out.symlink_to(tmp_path / "nothing")
+    refused(lambda: make_folder(out), f"--out {out}: is a link to {tmp_path / 'nothing'}, which does not exist")
+    (tmp_path / "nothing").mkdir()
+    make_folder(out)
+
+
+def test_a_full_disk_is_no_bad_input(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("pathlib.Path.mkdir", full)
+    with pytest.raises(SimtestError, match=r"No space left on device; .* MB are free") as caught:
+        make_folder(tmp_path / "x")
+    assert not isinstance(caught.value, InputError)
+    refused(lambda: refuse_file(tmp_path / ("n" * 300)), "cannot be written (File name too long)")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG])
+def test_what_the_disk_cannot_do_is_told_from_what_the_user_may_change(tmp_path, number):
+    error = cannot_write(OSError(number, os.strerror(number)), "--screenshot x.png", tmp_path)
+    assert type(error) is SimtestError
+    assert str(error).startswith(f"--screenshot x.png: cannot be written ({os.strerror(number)}")
+    assert isinstance(cannot_write(OSError(errno.EACCES, "Permission denied"), "x", tmp_path), InputError)
+
+
+def saved_calibration(path):
+    from simtest import Calibration, Camera, save_calibration
+
+    save_calibration(Calibration(Camera.from_fov(60.0, 64, 48)), path)
+
+
+def saved_camera(path):
+    from simtest import Camera, save_camera
+
+    save_camera(Camera.from_fov(60.0, 64, 48), path)
+
+
+@pytest.mark.parametrize("save", [saved_calibration, saved_camera])
+def test_files_that_are_saved_tell_a_full_disk(tmp_path, monkeypatch, save):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    with pytest.raises(SimtestError, match=r"c\.toml: cannot be written") as caught:
+        save(tmp_path / "c.toml")
+    assert not isinstance(caught.value, InputError)
+
+
+def test_a_wrong_variable_is_bad_input(monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SIMTEST_VARIANT", "lvm")
+    for line in ("render plane --out x", "doctor", "validate overview --out x"):
+        monkeypatch.setattr(sys, "argv", ["simtest", *line.split()])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        errors = capfd.readouterr().err
+        assert stop.value.code == 2, line
+        assert "SIMTEST_VARIANT 'lvm': cannot be used; allowed: llvm, cuda, " in errors
+        assert "(did you mean llvm?)" in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_standard_input_is_a_pipe(tmp_path):
+    for command in ("reconstruct /dev/stdin --fov 60", "render /dev/stdin", "realism /dev/stdin --against plane"):
+        done = shell(f"cat /dev/null | $SIMTEST {command} --out {tmp_path}/x")
+        assert done.returncode == 2
+        assert done.stderr.startswith("simtest: /dev/stdin: is no plain file but a pipe (write it to a file first); ")
+        assert done.stderr.count("/dev/stdin") == 1
+    assert list(tmp_path.iterdir()) == []
