@@ -39,6 +39,29 @@ class Reason(StrEnum):
     NO_ESTIMATE = "no_estimate"
     ESTIMATOR_ERROR = "estimator_error"
 
+    @property
+    def meaning(self) -> str:
+        """The reason in words."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Reason.NO_LIGHT: "no light reached the sensor",
+    Reason.NO_PEAK: "the region has no value above the others",
+    Reason.CLUSTER: "several highlights touch, so that none has isophotes of its own",
+    Reason.NO_CLOSED_ISOPHOTE: "no isophote at the isovalue closes around the peak",
+    Reason.TOO_FEW_POINTS: "the isophote has too few points for an ellipse",
+    Reason.NOT_AN_ELLIPSE: "no ellipse fits the isophote",
+    Reason.DEGENERATE_CONIC: "the fitted ellipse is nearly a line",
+    Reason.NOT_FINITE: "the estimator gave values that are not finite",
+    Reason.NOT_CONVERGED: "the fit did not converge",
+    Reason.STREAK: "the spot is so long that its centre along it is not determined",
+    Reason.UNRESOLVED: "the spot is too small to have a shape",
+    Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
+    Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
+    Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
@@ -57,3 +80,15 @@ class Failure:
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.detail}" if self.detail else str(self.reason)
+
+    def __repr__(self) -> str:
+        # The detail may quote a whole message of an estimator.
+        detail = self.detail if len(self.detail) <= 200 else self.detail[:197] + "..."
+        return f"Failure({str(self.reason)!r}, {detail!r})"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the reason, its meaning and the numbers of this case."""
+        from html import escape
+
+        meaning = self.reason.meaning if isinstance(self.reason, Reason) else ""
+        return f"<div><b>No normal: {escape(str(self.reason))}</b><br>{escape(meaning)}<br>{escape(self.detail)}</div>"

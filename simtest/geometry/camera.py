@@ -11,6 +11,7 @@ from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.distortion import Distortion
 from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.short_repr import short_repr
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""
@@ -51,6 +52,8 @@ class ViewMask:
     radius: float
     corner: float | None = None
     half_height: float | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name in ("cx", "cy", "radius", "corner", "half_height"):
@@ -129,6 +132,8 @@ class Camera:
     skew: float = 0.0
     distortion: Distortion | None = None
     view_mask: ViewMask | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         self._check_numbers()

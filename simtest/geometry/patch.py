@@ -11,6 +11,7 @@ from simtest.geometry import pixel_sets
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.level_sets import Crossings, LevelSet
 from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.short_repr import short_repr
 
 MIN_PLATEAU_PX = 12
 """Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
@@ -63,6 +64,8 @@ class Patch:
     others_px: tuple[tuple[float, float], ...] = ()
     tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.

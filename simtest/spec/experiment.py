@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.resources import find
+from simtest.runtime.short_repr import short_repr
 from simtest.spec.spec_model import Name, Spec, load
 
 LawName = Literal[
@@ -52,6 +53,9 @@ class Group(Spec):
         description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V",
     )
 
+    __repr__ = short_repr
+    __str__ = short_repr
+
     @model_validator(mode="after")
     def _equal_lengths(self) -> "Group":
         for table in (*self.sweep, *self.pool):
@@ -75,6 +79,9 @@ class Experiment(Spec):
     seed: int = Field(0, ge=0, lt=2**63)
     estimators: tuple[str, ...] = Field(("circle_pose", "brightest_point", "cone_axis"), min_length=1)
     groups: tuple[Group, ...] = Field(min_length=1)
+
+    __repr__ = short_repr
+    __str__ = short_repr
 
 
 _EXPERIMENT_KEYS = frozenset({"realisations", "seed", "estimators", "title", "description"})

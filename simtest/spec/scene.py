@@ -11,6 +11,7 @@ from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find
+from simtest.runtime.short_repr import short_repr
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.instrument import Instrument
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
@@ -80,6 +81,9 @@ class Scene(Spec):
     instruments: tuple[Instrument, ...] = Field(
         (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
     )
+
+    __repr__ = short_repr
+    __str__ = short_repr
 
     @property
     def shown_instruments(self) -> dict[int, Instrument]:
