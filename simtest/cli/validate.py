@@ -48,6 +48,7 @@ def validate(
         mesh, paper, paper_limits.
     """
     from simtest.api import validate as run
+    from simtest.cli.guide_table import print_guide
     from simtest.cli.progress import progress_bar
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
@@ -61,5 +62,6 @@ def validate(
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
-        page = run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
-    print(page)
+        run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
+    print_guide(folder)
+    print(folder / "index.html")

@@ -26,7 +26,12 @@ def environment() -> "Environment":
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    made.filters |= {"degrees": style.degrees, "number": style.number, "breakable": breakable}
+    made.filters |= {
+        "degrees": style.degrees,
+        "number": style.number,
+        "breakable": breakable,
+        "capitalize_first": capitalize_first,
+    }
     return made
 
 
@@ -37,6 +42,11 @@ def write_page(path: Path, template: str, data: Any, **values: Any) -> None:
     # Escaped as JSON within a script is: `script_json` leaves no "<".
     html = environment().get_template(template).render(data=Markup(script_json(data)), **values)  # nosec B704
     path.write_text(html, encoding="utf-8")
+
+
+def capitalize_first(text: str) -> str:
+    """Return a text with a capital at its start, and else as it is."""
+    return text[:1].upper() + text[1:]
 
 
 def breakable(name: str) -> "Markup":

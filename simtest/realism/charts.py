@@ -6,16 +6,17 @@ import numpy as np
 
 from simtest.pages.axes import Axis, finite, log_range
 from simtest.pages.chart import NOTHING, Chart, Line, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, number, symbols
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.style import Symbol, number, symbols
 from simtest.realism.comparison import Comparison, Quartiles, SetOfFrames, statistic_of
 from simtest.realism.distance import NEAR, VERDICTS, StatisticDistance, mean_distribution
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.runtime.arrays import Array
 
-REAL, GENERATED = "#0072B2", "#D55E00"
+REAL, GENERATED = SERIES[:2]
 """Colours of the two sides; their lines differ too: solid and dashed."""
 
-VERDICT_COLOURS = dict(zip(VERDICTS, ("#009E73", "#E69F00", "#D55E00", NEUTRAL), strict=True))
+VERDICT_COLOURS = dict(zip(VERDICTS, (SERIES[2], SERIES[5], SERIES[1], NEUTRAL), strict=True))
 VERDICT_SYMBOLS = symbols(VERDICTS)
 
 LEAST_DISTANCE, MOST_DISTANCE = 0.1, 100.0

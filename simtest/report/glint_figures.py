@@ -9,7 +9,8 @@ import polars as pl
 from simtest.geometry import student_t
 from simtest.pages.axes import Axis, finite, log_range
 from simtest.pages.chart import Bars, Chart, Mark, Panel
-from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, Symbol, number, symbols
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.style import Symbol, number, symbols
 from simtest.report.relief_figures import KD, LEVEL, ReliefFigure, larger_kd, sweep_axis, sweep_key, sweep_name, sweeps
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
@@ -19,8 +20,7 @@ from simtest.validation.statistics import mean_interval
 LEAST_RADIUS_PX = 2.0
 """Below this radius a visible highlight is measured in too few pixels to judge the law."""
 
-_COLOURS = (*ESTIMATOR_COLOURS.values(),)
-_BLUE, _ORANGE = _COLOURS[:2]
+_BLUE, _ORANGE = SERIES[:2]
 _GLINTS, _VISIBLE = Symbol("o", "circle", "●"), Symbol("^", "triangle-up", "▲")
 _COLUMNS = {
     "cloud", "pool", "radius_px", "radius_law_px", "cloud_glints", "cloud_glints_law", "cloud_visible",
@@ -127,7 +127,7 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
         return
     labels = symbols(rows["label"].to_list())
     marks, measured, independent = [], [], float(relief_laws.independent_centroid_error(1.0, 1.0))
-    for (name, symbol), colour in zip(labels.items(), cycle(_COLOURS), strict=False):
+    for (name, symbol), colour in zip(labels.items(), cycle(SERIES), strict=False):
         groups, own = [], rows.filter(pl.col("label") == name)
         for _, part in own.group_by("setting", maintain_order=True):
             expected = float(part["cloud_error_law_deg"].to_numpy().mean()) / independent
@@ -178,7 +178,7 @@ def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     if sum(len(own) for own in points.values()) < 2:
         return
     shapes, marks = symbols(points), []
-    for (name, own), colour in zip(points.items(), cycle(_COLOURS), strict=False):
+    for (name, own), colour in zip(points.items(), cycle(SERIES), strict=False):
         x, y, half_widths = np.array(sorted(own)).T
         marks.append(Mark(x, y, colour, name, symbol=shapes[name], bars=Bars(y - half_widths, y + half_widths, 1.2),
                           hover=f"{name}\nk d = {{x}}: {{y}}"))  # fmt: skip
@@ -238,7 +238,7 @@ def _radii(spots: pl.DataFrame) -> Iterator[ReliefFigure]:
     if rows.height < 2:
         return
     marks, measured, labels = [], [], symbols(rows["label"].to_list())
-    for (name, symbol), colour in zip(labels.items(), cycle(_COLOURS), strict=False):
+    for (name, symbol), colour in zip(labels.items(), cycle(SERIES), strict=False):
         own = rows.filter(pl.col("label") == name)
         law, seen = own["radius_law_px"].to_numpy(), own["radius_px"].to_numpy()
         marks.append(Mark(law, seen, colour, name, symbol=symbol, size=5, opacity=0.7,

@@ -6,10 +6,11 @@ import numpy as np
 
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, symbols
+from simtest.pages.palette import FURTHER, NEUTRAL, SERIES
+from simtest.pages.style import symbols
 from simtest.report.error_laws import SLOPE, LawResult
 
-_COLOURS = (*ESTIMATOR_COLOURS.values(), "#A6761D", "#7A8B99")
+_COLOURS = (*SERIES, *FURTHER)
 _LEAST_SHARE = 1e-4  # departures over what is allowed: smaller ones are drawn here on the logarithmic axis
 
 

@@ -1,10 +1,12 @@
 """Draws the page of a run: figures as PNG, and one HTML file that needs nothing else."""
 
+import itertools
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from simtest.estimators.descriptions import DESCRIPTIONS
 from simtest.pages import chart_web, pixels, style
 from simtest.pages.html import environment
 from simtest.report import sentences
@@ -13,12 +15,13 @@ from simtest.report.error_laws import is_tested, law_results, sentence
 from simtest.report.figure_files import THREADS, FigureFiles
 from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
+from simtest.report.guide_text import RULES, WORDS, guide_rows, method_rows, shared_sentence
 from simtest.report.heat_maps import heat_charts, heat_maps
 from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
-from simtest.report.run_folder import ExperimentSummary, GalleryItem, Run
+from simtest.report.run_folder import GalleryItem, Run
 from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
@@ -93,6 +96,17 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _guide(run: Run) -> dict[str, Any]:
+    """Return what the guide's template needs."""
+    guide = run.guide
+    groups = itertools.groupby(guide_rows(guide), lambda row: row.circumstances)
+    return {
+        "guide": [(circumstances, list(rows)) for circumstances, rows in groups],
+        "methods": method_rows(guide, DESCRIPTIONS | run.summary.estimators),
+        "shared": shared_sentence(guide), "left_out": guide.left_out, "rules": RULES, "words": WORDS,
+    }  # fmt: skip
+
+
 def _draw_frame(figures: FigureFiles, index: int, item: GalleryItem, colours: Mapping[str, str]) -> Shown:
     shown, content = draw_shown(item, colours)
     figures.write(file_name(index), content)
@@ -107,7 +121,7 @@ def _draw_view(figures: FigureFiles, view: View3D) -> str:
 
 def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
     """Fill in the page's template."""
-    summary = run.experiments.get(run.experiment) or ExperimentSummary()
+    summary = run.summary
     cards, still = sections["cards"], sections["still"]
     return environment().get_template("run.html.j2").render(
         {
@@ -116,7 +130,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
             "realism": summary.realism,
             "gallery": [card.result() for card in cards], "still": still.result() if still else "",
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
-            "columns": HEADINGS,
+            "columns": HEADINGS, **_guide(run),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
             "figures": figures.packed(), "plotly": chart_web.packed_plotly() if figures.json else None,
         }

@@ -8,10 +8,9 @@ import polars as pl
 
 from simtest.pages.style import estimator_order, number
 from simtest.report.run_folder import Run
+from simtest.validation.guide import side_by_side
 from simtest.validation.statistics import student_interval
 
-ALL = "all settings"
-KEYS = ("experiment", "setting", "realisation", "true_id")  # a true highlight of a frame
 NONE = "–"
 
 
@@ -19,7 +18,7 @@ NONE = "–"
 class Pair:
     """Two estimators over the highlights that both answered; errors in deg."""
 
-    label: str  # which curve's highlights, or `ALL`
+    label: str  # which curve's highlights
     first: str
     second: str
     n: int  # highlights that both answered
@@ -48,30 +47,20 @@ class Pair:
 def pairs(run: Run) -> list[Pair]:
     """Compare each two estimators by the errors of their proposed normals.
 
-    The pairs over all settings come first, then label by label where there are several; a single estimator has none.
+    Each label is counted apart, since labels differ in kind; a single estimator has no pairs.
     """
     true = run.results.filter(pl.col("true_id").is_not_null())
     names = estimator_order(true["estimator"].drop_nulls().to_list())
     if len(names) < 2:
         return []
-    wide = _side_by_side(true, names)
+    wide, _ = side_by_side(true)
     labels = wide["label"].unique(maintain_order=True).to_list()
-    groups = [(ALL, wide)]
-    if len(labels) > 1:
-        groups += [(str(label), wide.filter(pl.col("label") == label)) for label in labels]
+    groups = [(str(label), wide.filter(pl.col("label") == label)) for label in labels]
     return [
         _pair(label, first, second, part)
         for label, part in groups
         for first, second in itertools.combinations(names, 2)
     ]
-
-
-def _side_by_side(true: pl.DataFrame, names: list[str]) -> pl.DataFrame:
-    """Return a row for each true highlight with each estimator's error; null where it did not answer."""
-    error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
-    # A highlight may be found twice; the first detection counts for all estimators alike.
-    columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]
-    return true.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns)
 
 
 def _pair(label: str, first: str, second: str, wide: pl.DataFrame) -> Pair:

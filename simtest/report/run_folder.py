@@ -16,6 +16,7 @@ from simtest.pages.style import degrees
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.paper import PaperSetting
+from simtest.validation.guide import Guide, guide_of
 
 MAX_GALLERY = 24  # gallery items that a page shows; of a longer gallery, evenly spaced ones
 _TEXT = ("experiment", "surface", "reflectance", "setting", "label", "estimator", "status")
@@ -33,6 +34,10 @@ Vector = tuple[float, float, float]
 
 def _listed(value: object) -> object:
     return value or ()
+
+
+def _table(value: object) -> object:
+    return value or {}
 
 
 class KeptTruth(BaseModel):
@@ -165,6 +170,8 @@ class ExperimentSummary(BaseModel):
     title: Text = ""
     description: Text = ""
     realism: Annotated[tuple[SceneRealism, ...], BeforeValidator(_listed)] = ()
+    estimators: Annotated[dict[str, Text], BeforeValidator(_table)] = {}  # what each does, in one line
+    conditions: Annotated[dict[str, dict[str, Any]], BeforeValidator(_table)] = {}  # by setting
     settings: dict[str, dict[str, EstimatorFigures | None] | None] | None = None
 
     @property
@@ -202,6 +209,16 @@ class Run:
         return str(names[0]) if names else "run"
 
     @property
+    def summary(self) -> ExperimentSummary:
+        """Its entry in summary.json."""
+        return self.experiments.get(self.experiment) or ExperimentSummary()
+
+    @property
+    def guide(self) -> Guide:
+        """Which method to use, and where it breaks."""
+        return guide_of(self.results, self.summary.conditions)
+
+    @property
     def estimators(self) -> list[str]:
         """Estimator names in order of first appearance, from all three sources."""
         names = [str(n) for n in self.results["estimator"].drop_nulls().unique(maintain_order=True)]
@@ -231,6 +248,12 @@ def read_run(path: Path) -> Run:
     results, summary = _read_results(path / "results.parquet"), _read_summary(path / "summary.json")
     gallery = varied([read_item(file) for file in chosen])
     return Run(path, results, summary.experiments or {}, flattened(summary.run or {}), gallery, len(files))
+
+
+def read_guide(path: Path) -> Guide:
+    """Read which method to use from a run folder, without its gallery; raises `InputError` as `read_run`."""
+    results, summary = _read_results(path / "results.parquet"), _read_summary(path / "summary.json")
+    return Run(path, results, summary.experiments or {}).guide
 
 
 def varied(items: list[GalleryItem]) -> tuple[GalleryItem, ...]:

@@ -2,18 +2,18 @@
 
 import polars as pl
 
-from simtest.pages.style import degrees, estimator_order, labelled, number
+from simtest.pages.style import degrees, number
 from simtest.report.heat_maps import HeatMap
 from simtest.report.run_folder import Run
 from simtest.report.series import LineFigure, law_misses
 
 
 def headline(run: Run, figures: list[LineFigure]) -> list[str]:
-    """Sum up what a run measured in a few sentences; laws are compared with the measurements of the figures."""
+    """Say in a few sentences what a run counted, and how many points the closed-form laws predict."""
     rows = run.results
     if rows.is_empty():
         return ["The run has no rows: nothing was measured."]
-    sentences = [*_errors(rows), _counts(rows)]
+    sentences = [_counts(rows)]
     for figure in figures:
         misses = law_misses(figure).values()
         met, total = sum(miss.met for miss in misses), sum(miss.total for miss in misses)
@@ -22,37 +22,6 @@ def headline(run: Run, figures: list[LineFigure]) -> list[str]:
             predicted = f"predicts {met} of {total} measured points to within {figure.rule}"
             sentences.append(f"{figure.title}: the closed-form law, which knows no noise, {predicted}.")
     return [s for s in sentences if s]
-
-
-def _errors(rows: pl.DataFrame) -> list[str]:
-    """State how far the estimators are off, apart for a light at the camera and beside it."""
-    hits = rows.filter((pl.col("status") == "ok") & pl.col("true_id").is_not_null())
-    hits = hits.filter(pl.col("error_oracle_deg").is_not_null())
-    if hits.is_empty():
-        return ["No row has a normal that could be compared with the truth."]
-    beside = (pl.col("eps_over_d") > 1e-6).fill_null(False)
-    parts = [
-        (hits.filter(~beside), "with the light at the camera"),
-        (hits.filter(beside), "with the light beside the camera"),
-    ]
-    both = all(part.height for part, _ in parts)
-    return [_means(part, f", {where}" if both else "") for part, where in parts if part.height]
-
-
-def _means(hits: pl.DataFrame, where: str) -> str:
-    table = hits.group_by("estimator").agg(
-        mean=pl.col("error_oracle_deg").mean(),
-        p95=pl.col("error_oracle_deg").quantile(0.95, "linear"),
-    )
-    texts = {
-        row["estimator"]: f"{row['estimator']} by {degrees(row['mean'])} on average (95 % of its rows within "
-        f"{degrees(row['p95'])})"
-        for row in table.iter_rows(named=True)
-    }
-    answers = labelled([texts[name] for name in estimator_order(texts)])
-    settings = hits["setting"].n_unique()
-    over = f"Over {settings} {_plural('setting', settings)}{where}"
-    return f"{over}, the better candidate misses the true normal: {answers}."
 
 
 def _plural(word: str, count: int) -> str:

@@ -156,7 +156,8 @@ def line_chart(data: LineFigure, colours: Mapping[str, str]) -> Chart:
     """Describe a figure of curves: colour is the estimator, the symbol is the label, dashes are the law."""
     shapes = symbols(curve.label for curve in data.curves)
     laws = [_law_mark(data, curve, colours) for curve in data.curves if _has_law(curve, data.y)]
-    marks = [*laws, *(_points_mark(data, curve, colours, shapes[curve.label]) for curve in data.curves)]
+    joins = [_join_mark(curve, colours) for curve in data.curves if curve.joined and not _has_law(curve, data.y)]
+    marks = [*laws, *joins, *(_points_mark(data, curve, colours, shapes[curve.label]) for curve in data.curves)]
     if laws:
         marks.append(Mark(NOTHING, NOTHING, NEUTRAL, "law", line="dash", width=1.5))
     # Laws may leave the range of what was measured.
@@ -178,6 +179,16 @@ def _law_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str]) -> Mar
     )  # fmt: skip
 
 
+def _join_mark(curve: Curve, colours: Mapping[str, str]) -> Mark:
+    """Join the points of a sweep, where no law runs between them.
+
+    A gap stands where x changes sign or leaves 0: convex and concave, with and without an offset or noise are unlike.
+    """
+    gaps = np.flatnonzero(np.diff(np.sign(curve.x))) + 1
+    x, y = (np.insert(values.astype(float), gaps, np.nan) for values in (curve.x, curve.y))
+    return Mark(x, y, colours[curve.estimator], curve.estimator, listed=False, line="solid", width=0.7)
+
+
 def _points_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str], symbol: Symbol) -> Mark:
     columns = (curve.names, curve.x, curve.y, curve.low, curve.high, curve.law_at, curve.counts)
     hover = [
@@ -186,6 +197,6 @@ def _points_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str], sym
         for name, x, y, low, high, law, count in zip(*columns, strict=True)
     ]
     return Mark(
-        curve.x, curve.y, colours[curve.estimator], curve.estimator, line="solid" if curve.joined else "", width=0.7,
-        symbol=symbol, bars=Bars(curve.low, curve.high, 1.2), hover=hover,
+        curve.x, curve.y, colours[curve.estimator], curve.estimator, symbol=symbol,
+        bars=Bars(curve.low, curve.high, 1.2), hover=hover,
     )  # fmt: skip

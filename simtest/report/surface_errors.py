@@ -12,6 +12,7 @@ from simtest.pages.style import Symbol, degrees, estimator_order
 from simtest.report.coverage import is_anatomical
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
+from simtest.validation.situations import CO_LOCATED
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
 STRIP_POINTS = 120  # points drawn beside a box: evenly spaced order statistics where there are more values
@@ -49,12 +50,13 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
     """
     if run.results.is_empty() or (has_figures and not is_anatomical(run)):
         return None
-    surfaces = [str(s) for s in run.results["surface"].unique(maintain_order=True)]
+    results = _apart(run.results)
+    surfaces = [str(s) for s in results["surface"].unique(maintain_order=True)]
     names = estimator_order(run.results["estimator"].to_list())
     ok, missed = ((pl.col("status") == which).fill_null(False) for which in ("ok", "missed"))
     true = pl.col("true_id").is_not_null()
     errors = pl.col("error_oracle_deg").filter(ok & true).drop_nulls()
-    table = run.results.group_by("surface", "estimator").agg(
+    table = results.group_by("surface", "estimator").agg(
         n=true.sum(), ok=(true & ok).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
         false=(~true).sum(), mean=errors.mean(), median=errors.median(), p95=errors.quantile(0.95, "linear"),
         max=errors.max(), errors=errors.sort(),
@@ -68,6 +70,15 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
         middle = surfaces.index(surface) + (names.index(name) - (len(names) - 1) / 2) * width
         boxes += [_box(np.array(held), surface, name, middle, 0.8 * width)] if held else []
     return SurfaceErrors(surfaces, boxes, table.drop("errors"))
+
+
+def _apart(results: pl.DataFrame) -> pl.DataFrame:
+    """Name a surface twice where it is lit from the camera and from beside it: their errors differ in kind."""
+    beside = (pl.col("eps_over_d").mean().over("surface", "setting") > CO_LOCATED).fill_null(False)
+    results = results.with_columns(beside=beside)
+    both = pl.col("beside").any().over("surface") & ~pl.col("beside").all().over("surface")
+    name = pl.when(both & pl.col("beside")).then(pl.col("surface") + ", light beside").otherwise("surface")
+    return results.with_columns(surface=name)
 
 
 def _box(errors: Array, surface: str, estimator: str, middle: float, width: float) -> Box:

@@ -8,14 +8,15 @@ from pydantic import BaseModel
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.pages.axes import Axis, log_range
 from simtest.pages.chart import Chart, Mark, Panel, label_keys
-from simtest.pages.style import NEUTRAL, symbols
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.style import symbols
 
 DATA = Path(__file__).with_name("triangle_cost.json")
 
 SHADINGS = {
-    "flat": ("#D55E00", "flat triangles"),
-    "estimated": ("#0072B2", "normals from the triangles"),
-    "exact": ("#009E73", "exact vertex normals"),
+    "flat": (SERIES[1], "flat triangles"),
+    "estimated": (SERIES[0], "normals from the triangles"),
+    "exact": (SERIES[2], "exact vertex normals"),
 }
 """Colour and name of each way to shade, by its name in the data."""
 

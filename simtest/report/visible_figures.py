@@ -8,7 +8,8 @@ import polars as pl
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import ESTIMATOR_COLOURS, NEUTRAL, Symbol, number
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.style import Symbol, number
 from simtest.report.relief_figures import ReliefFigure
 from simtest.report.run_folder import Run
 
@@ -31,13 +32,12 @@ def visible_figures(run: Run) -> list[ReliefFigure]:
     )
     frames = rows.unique(_FRAME, maintain_order=True).select(*_FRAME, "frame_visible")
     frames = frames.join(found, on=_FRAME, how="left").with_columns(pl.col("found", "none").fill_null(0))
-    colours = (*ESTIMATOR_COLOURS.values(),)
     x = frames["frame_visible"].to_numpy().astype(float)
     marks = [
         Mark(x, frames[column].to_numpy().astype(float), colour, name, symbol=symbol,
              hover=f"{{x}} visible, {{y}} {name}")
         for column, name, colour, symbol in (
-            ("found", "found", colours[0], _FOUND), ("none", "detections of nothing visible", colours[1], _FALSE),
+            ("found", "found", SERIES[0], _FOUND), ("none", "detections of nothing visible", SERIES[1], _FALSE),
         )
     ]  # fmt: skip
     ends = np.array([0.0, max(float(x.max()), 1.0)])

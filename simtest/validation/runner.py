@@ -217,34 +217,17 @@ def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
     """Join the parts of an experiment, and write its results and summary."""
     import polars as pl
 
+    from simtest.validation.run_summary import run_summary
+
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
     write_atomically(folder / RESULTS, results.write_parquet)
     record = replace(record, results=provenance.file_hash(folder / RESULTS))
-    write_json(folder / "summary.json", _summary(job, results, record))
+    summary = run_summary(job.experiment, job.cases, results)
+    write_json(folder / "summary.json", {"run": record.to_json(), **summary})
     # The parts go last: until the summary stands, a run that is stopped can go on.
     _remove(parts)
     return Run(folder, resumed, results)
-
-
-def _summary(job: _Job, results: "pl.DataFrame", record: RunRecord) -> Json:
-    """Return the content of summary.json."""
-    from simtest.validation.realism import realism_of
-    from simtest.validation.statistics import summarise
-
-    experiment = job.experiment
-    settings: dict[str, Json] = {
-        setting: {estimator: figures.to_json() for estimator, figures in by_estimator.items()}
-        for setting, by_estimator in summarise(results).items()
-    }
-    title = experiment.title or experiment.name
-    content: Json = {
-        "title": title,
-        "description": experiment.description,
-        "realism": realism_of(job.cases),
-        "settings": settings,
-    }
-    return {"run": record.to_json(), "experiments": {experiment.name: content}}
 
 
 def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: Progress | None) -> dict[Path, int]:

@@ -10,7 +10,7 @@ from simtest.errors import InputError
 from simtest.pages import chart_png
 from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
 from simtest.report.law_charts import law_charts
-from simtest.report.pairs import ALL, NONE, pairs
+from simtest.report.pairs import NONE, pairs
 from simtest.spec import load_experiment
 from simtest.validation import laws
 from simtest.validation.cases import expand
@@ -131,7 +131,7 @@ def test_pairs_are_over_the_highlights_that_both_answered():
     rows += [answer("cone_axis", None, 4, "no_peak"), answer("curved", 9.0, 4)]
     rows += [answer("cone_axis", 50.0, 5, true_id=None), answer("curved", 0.0, 5, true_id=None)]
     (pair,) = pairs(run_of(*rows))
-    assert (pair.label, pair.first, pair.second) == (ALL, "cone_axis", "curved")
+    assert (pair.label, pair.first, pair.second) == ("a", "cone_axis", "curved")
     assert (pair.n, pair.only_first, pair.only_second, pair.first_better) == (4, 0, 1, 4)
     assert pair.difference == pytest.approx(-1.025)
     # Student's t with 3 degrees of freedom; the differences' standard deviation is 0.05.
@@ -148,8 +148,8 @@ def test_pairs_say_so_where_chance_may_decide():
     assert (single.n, single.low, single.interval, single.better) == (1, None, NONE, NONE)
 
 
-def test_pairs_come_label_by_label_too():
+def test_pairs_come_label_by_label():
     rows = [answer(name, 1.0, label=label) for label in "ab" for name in ("cone_axis", "curved", "bisector")]
     made = pairs(run_of(*rows))
-    assert [pair.label for pair in made] == [ALL] * 3 + ["a"] * 3 + ["b"] * 3
+    assert [pair.label for pair in made] == ["a"] * 3 + ["b"] * 3
     assert pairs(run_of(answer("curved", 1.0))) == []

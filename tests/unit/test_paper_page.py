@@ -22,7 +22,7 @@ from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from tests.isocurve_formulas import cosine_beta
 
-COLOURS = {"circle_pose": "#D55E00", "cone_axis": "#0072B2"}
+COLOURS = {"circle_pose": "#CA5C12", "cone_axis": "#15628C"}
 
 MEANS = {
     "sigma": {0.0: 0.2, 0.05: 0.4, 0.1: 0.8},
@@ -260,9 +260,9 @@ def small(tmp_path_factory):
 def test_the_pages_sections_and_files(small):
     html = write_report(small.folder).read_text(encoding="utf-8")
     wanted = {"statements", "isocurves", "pipeline", "error_vs_paper_sigma", "gallery"}
-    assert wanted <= set(re.findall(r'<section id="(\w+)"', html))
+    assert wanted <= set(re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html))
     assert "error_vs_curvature" not in html
-    assert "surfaces" not in re.findall(r'<section id="(\w+)"', html)
+    assert "surfaces" not in re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html)
     assert "at the article&#39;s defaults" in html or "at the article's defaults" in html
     files = {file.name for file in (small.folder / "figures").iterdir()}
     assert {"isocurves.png", "pipeline.png", "pipeline_6.png", "error_vs_paper_sigma.png", "gallery_000.png"} <= files

@@ -254,7 +254,15 @@ def test_overview_page_has_its_sections(overview):
     assert wanted <= page.ids()
     assert not {"heatmap", "surfaces"} & page.ids()
     text = " ".join(page.text)
-    parts = ("Title of overview", "circle_pose by", "gave no normal", "0123abc", "ab" * 32, "simtest render cylinder")
+    parts = (
+        "Title of overview",
+        "Which method, and where does it break?",
+        "outside of a tube",
+        "gave no normal",
+        "0123abc",
+        "ab" * 32,
+        "simtest render cylinder",
+    )
     for part in parts:
         assert part in text, part
     assert {"viewport"} <= {attrs.get("name") for tag, attrs in page.tags if tag == "meta"}
@@ -373,7 +381,7 @@ def test_no_ok_row_at_all(tmp_path):
     blank = dict.fromkeys(("error_deg", "error_oracle_deg", "axis_ratio"))
     rows = [row | blank | {"status": "no_peak"} for row in make_rows("overview")]
     page = read_page(write_report(make_run(tmp_path, "overview", rows, items=0)))
-    assert "No row has a normal" in " ".join(page.text)
+    assert "no method answered" in " ".join(page.text)
     assert {"surfaces", "summary"} <= page.ids()
     assert "gallery" not in page.ids()
 
@@ -462,7 +470,7 @@ def test_surface_without_truth_or_pixels(tmp_path):
 def test_style():
     shades = colours(["new", "cone_axis", "circle_pose", "also new"])
     assert len(set(shades.values())) == 4
-    assert shades["cone_axis"] == "#0072B2"
+    assert shades["cone_axis"] == "#15628C"
     texts = [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)]
     assert texts == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
     axis = Axis("x", "stretched")

@@ -8,7 +8,8 @@ from skimage.measure import find_contours
 from simtest.geometry.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, symbols
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.style import Symbol, symbols
 from simtest.runtime.arrays import Array
 
 KAPPA = 0.55  # the article's value
@@ -16,7 +17,7 @@ OFFSET_LIGHT = (1.2, 0.0, 1.0)  # a light beside the camera, abs(V_Z)
 REACH = 3.6  # half-width of the drawn part of the plane, abs(V_Z)
 _SAMPLES, _POINTS, _CURVE = 721, 241, 200
 _LIMITS = (1e-3, 0.999)
-_ISOPHOTE, _BRANCH, _FOOT = "#0072B2", "#D55E00", "#B8860B"
+_ISOPHOTE, _BRANCH, _FOOT = SERIES[0], SERIES[1], SERIES[5]
 _CROSS, _STAR = Symbol("+", "cross-thin-open", "+"), Symbol("*", "star", "★")
 _TILTED = Symbol("x", "x-thin-open", "×")
 

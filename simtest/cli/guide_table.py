@@ -1,0 +1,65 @@
+"""Prints which method to use, and where it breaks, at the end of `simtest validate`."""
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+MOST_ROWS = 20
+"""Situations that are printed; the page holds all."""
+
+WIDTH = 80
+_WIDTHS = (16, 17, 15, 10)  # of all columns but the last
+
+
+def print_guide(run: Path, console: "Console | None" = None) -> None:
+    """Print the guide of a run folder as a table, without colours or frames where nobody looks on at a terminal.
+
+    Parameters
+    ----------
+    run : Path
+        Folder with results.parquet and summary.json.
+    console : rich.console.Console, optional
+        Where to; default the standard output, as wide as the terminal, else `WIDTH` columns.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from simtest.report.guide_text import HEADS, guide_rows, shared_sentence
+    from simtest.report.run_folder import read_guide
+
+    if console is None:
+        console = Console(emoji=False, highlight=False)
+        if not console.is_terminal:
+            console = Console(emoji=False, highlight=False, width=WIDTH)
+    guide = read_guide(run)
+    rows = guide_rows(guide)
+    if not rows:
+        console.print("No true highlight: there is nothing to compare the methods by.")
+        return
+    room = max(console.width, WIDTH) - sum(_WIDTHS) - len(_WIDTHS)
+
+    def table(show_header: bool) -> Table:
+        made = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_header=show_header)
+        for head, width in zip(HEADS, (*_WIDTHS, room), strict=True):
+            made.add_column(head, width=width, overflow="fold", header_style="bold")
+        return made
+
+    console.print(table(True))
+    for circumstances, group in itertools.groupby(rows[:MOST_ROWS], lambda row: row.circumstances):
+        if circumstances:
+            console.print(f"[bold]{escape(circumstances)}[/bold]")
+        # A table of its own for each kind of light, noise and relief, all with the same columns.
+        part = table(False)
+        for row in group:
+            tied = f"tied: {', '.join(row.ties)}" if row.ties else ""
+            best = "\n".join(text for text in (row.best or "none", tied) if text)
+            part.add_row(*map(escape, (row.surface, best, row.error.replace(" (", "\n("), row.answered, row.breaks)))
+        console.print(part)
+    if len(rows) > MOST_ROWS:
+        console.print(f"and {len(rows) - MOST_ROWS} more situations, on the page")
+    if shared := shared_sentence(guide):
+        console.print(escape(shared))

@@ -1,0 +1,37 @@
+"""What each estimator does, in one line for a reader who chooses one."""
+
+import inspect
+from collections.abc import Sequence
+
+from simtest.estimators.registry import load_estimators
+
+DESCRIPTIONS: dict[str, str] = {
+    "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",
+    "circle_pose": "The published method: takes one isophote for a circle and solves for its pose; two candidates.",
+    "brightest_point": "The line of sight through the brightest pixel.",
+    "bisector": "The cone's axis, corrected for a light beside the camera whose place is told.",
+    "curved": "The centre of the isophotes carries the normal, their shape the surface's curvature.",
+    "photometric": "A fit of the reflectance model to all pixels of the highlight.",
+    "inverse_rendering": "A curved patch, rendered and adjusted until it looks like the highlight.",
+    "cloud": "The normal of the base surface, from the cloud of glints that its relief makes of one highlight.",
+}
+"""Of this package's estimators, by name."""
+
+
+def describe_estimators(names: Sequence[str]) -> dict[str, str]:
+    """Describe estimators by name: this package's own, and others by the first line of their docstring.
+
+    A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description.
+    """
+    described = {}
+    for name in names:
+        described[name] = DESCRIPTIONS.get(name) or _first_line(load_estimators([name])[name])
+    return described
+
+
+def _first_line(estimator: object) -> str:
+    """Return the first line of an estimator's own docstring; of a wrapped function, that function's."""
+    given = getattr(estimator, "function", estimator)
+    # An instance without a docstring of its own has its class's; `inspect.getdoc` would go on to object's.
+    own = given.__doc__ if inspect.isroutine(given) else type(given).__doc__
+    return (inspect.cleandoc(own).splitlines() or [""])[0] if own else ""

@@ -1,0 +1,118 @@
+"""Under which conditions a setting's frames are made: what a reader asks before choosing an estimator.
+
+They are read from the scenes, so they hold what no column of results tells, and stand in summary.json by setting.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+from simtest.runtime.files import Json
+from simtest.spec import Scene, scene_from_dict
+from simtest.validation.cases import Case
+
+LOW_NOISE = 0.02
+"""White noise up to this share of full scale is called low."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of a setting, in words; lengths of the camera and the lobe as numbers.
+
+    Parameters
+    ----------
+    told : str
+        What the estimators are told of the lights: "place and distance told", "place told" or "place not told".
+    relief : str
+        Relief and film of the surface.
+    sensor : str
+        Noise, and what else the sensor does that estimators suffer from.
+    render : str
+        Light beside the direct highlight: a diffuse base, bounces.
+    camera : str
+        Projection and distortion.
+    half_width_rad : float or None
+        Angle between normal and sightline at which the lobe falls to half.
+    focal_px : float or None
+        Focal length, px.
+    """
+
+    told: str = ""
+    relief: str = ""
+    sensor: str = ""
+    render: str = ""
+    camera: str = ""
+    half_width_rad: float | None = None
+    focal_px: float | None = None
+
+    def to_json(self) -> Json:
+        """Return the entry of summary.json."""
+        return asdict(self)
+
+
+def conditions_of(cases: Iterable[Case]) -> dict[str, Conditions]:
+    """Return the conditions of each setting; its first part counts, and computed cases have none."""
+    found: dict[str, Conditions] = {}
+    for case in cases:
+        if not case.is_paper and case.setting not in found:
+            found[case.setting] = conditions(scene_from_dict(case.data, case.where))
+    return found
+
+
+def conditions(scene: Scene) -> Conditions:
+    """Return the conditions of a scene."""
+    half_width = getattr(scene.reflectance, "half_width", None)
+    return Conditions(
+        _told(scene), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
+        None if half_width is None else float(half_width), float(scene.camera.fx),
+    )  # fmt: skip
+
+
+def _told(scene: Scene) -> str:
+    if not scene.known.lights:
+        return "place not told"
+    has_distance = scene.known.distance_mm is not None or scene.known.distance_error is not None
+    return "place and distance told" if has_distance else "place told"
+
+
+def _relief(scene: Scene) -> str:
+    relief = scene.surface.relief
+    parts = [] if relief is None else ["relief"]
+    if scene.film_level is not None:
+        parts.append("liquid in its valleys")
+    return " with ".join(parts) or "smooth surface"
+
+
+def _sensor(scene: Scene) -> str:
+    sensor = scene.sensor
+    sigma = sensor.noise_sigma
+    parts = []
+    if sigma > 0:
+        parts.append("noise up to 2 %" if sigma <= LOW_NOISE else "noise above 2 %")
+    parts += [
+        words
+        for words, applies in (
+            ("shot noise", sensor.full_well is not None),
+            ("blur", sensor.point_spread_px > 0),
+            ("clipping", sensor.saturation),
+            (f"{sensor.bits} bits", sensor.bits is not None),
+            ("encoded values" + ("" if sensor.response_known else ", not told"), sensor.response.type != "linear"),
+            ("vignetting not told", not sensor.vignetting_known),
+            ("lossy coding", sensor.coding is not None),
+            ("colour mosaic", sensor.mosaic is not None),
+        )
+        if applies
+    ]
+    return ", ".join(parts) or "no noise"
+
+
+def _render(scene: Scene) -> str:
+    parts = ["diffuse base"] if getattr(scene.reflectance, "diffuse", 0.0) else []
+    parts += ["bounced light"] if scene.render.path_depth > 2 else []
+    parts += ["instruments"] if scene.shown_instruments else []
+    return ", ".join(parts) or "direct highlight alone"
+
+
+def _camera(scene: Scene) -> str:
+    kind = getattr(scene.camera.distortion, "type", None) if scene.camera.distortion is not None else None
+    return {None: "pinhole camera", "none": "pinhole camera", "brown_conrady": "distorted lens",
+            "kannala_brandt": "fisheye"}.get(kind, str(kind))  # fmt: skip

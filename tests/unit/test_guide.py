@@ -1,0 +1,234 @@
+"""Which method a run recommends, and where it breaks: situations, figures, words, terminal."""
+
+import io
+import json
+from itertools import groupby
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.stats import binom
+from test_report import make_run
+
+from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
+from simtest.report.guide_text import guide_rows, method_rows
+from simtest.report.run_folder import read_guide
+from simtest.spec import load_experiment, load_scene
+from simtest.validation.cases import expand
+from simtest.validation.conditions import conditions, conditions_of
+from simtest.validation.guide import guide_of, median_interval
+from simtest.validation.run_summary import run_summary
+
+FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
+TUBE = FLAT | {"kd_max": 1.0, "surface": "cylinder"}
+
+
+def rows_of(estimator, errors, setting="a", label="one", first=0, **more):
+    """Rows of one estimator: an error for each realisation, None for a failure, "missed" for a miss."""
+    return [
+        {
+            "experiment": "made", "setting": setting, "label": label, "realisation": first + index, "true_id": 0,
+            "estimator": estimator, "n_lights": 1,
+            "status": "missed" if error == "missed" else "no_peak" if error is None else "ok",
+            "error_deg": error if isinstance(error, float) else None, **(FLAT | more),
+        }
+        for index, error in enumerate(errors)
+    ]  # fmt: skip
+
+
+def guide_from(*parts, **told):
+    return guide_of(pl.DataFrame([row for part in parts for row in part], infer_schema_length=None), **told)
+
+
+def noisy(mean, count=20, seed=0, spread=0.1):
+    return [float(value) for value in mean + spread * np.random.default_rng(seed).standard_normal(count)]
+
+
+def test_the_best_method_has_the_lowest_mean_with_failures_as_90_degrees():
+    steady, refusing = noisy(2.0), [*noisy(0.1, 19, seed=1, spread=0.01), None]
+    (advice,) = guide_from(rows_of("cone_axis", steady), rows_of("curved", refusing)).advice
+    # 19 answers of 0.1 deg and a failure: 4.6 deg on average.
+    assert advice.methods["curved"].mean_penalised_deg == pytest.approx(np.mean(refusing[:19]) * 0.95 + 4.5)
+    assert advice.methods["curved"].median_deg < 0.2
+    assert advice.best == "cone_axis"
+    assert (advice.methods["curved"].answered, advice.n) == (19, 20)
+
+
+def test_a_method_that_chance_may_have_put_second_is_tied_and_a_worse_one_is_not():
+    same = noisy(1.0, seed=1)
+    close = [error + float(delta) for error, delta in zip(same, np.tile([0.05, -0.04], 10), strict=True)]
+    worse = [error + 0.3 for error in same]
+    parts = (rows_of("cone_axis", same), rows_of("curved", close), rows_of("brightest_point", worse))
+    (advice,) = guide_from(*parts).advice
+    assert (advice.best, advice.ties) == ("cone_axis", ("curved",))
+
+
+def test_highlights_of_one_frame_count_once():
+    """Ten highlights with the same difference in each of two frames are two differences, which tell nothing."""
+    one, other = [], []
+    for realisation, delta in ((0, 0.05), (1, 0.4)):
+        for true_id in range(10):
+            one += [row | {"true_id": true_id} for row in rows_of("cone_axis", [1.0], first=realisation)]
+            other += [row | {"true_id": true_id} for row in rows_of("curved", [1.0 + delta], first=realisation)]
+    (advice,) = guide_from(one, other).advice
+    assert (advice.best, advice.ties, advice.n) == ("cone_axis", ("curved",), 20)
+    # As frames of their own, the same 20 differences decide.
+    apart = [[row | {"realisation": 10 * row["realisation"] + row["true_id"]} for row in rows] for rows in (one, other)]
+    (advice,) = guide_from(*apart).advice
+    assert (advice.best, advice.ties) == ("cone_axis", ())
+
+
+def test_settings_that_differ_in_kind_never_share_a_situation():
+    parts = [
+        rows_of("cone_axis", [1.0], "flat"), rows_of("cone_axis", [1.0], "tube", **TUBE),
+        rows_of("cone_axis", [1.0], "tube, twice as curved", **TUBE | {"kd_max": 2.0}),
+        rows_of("cone_axis", [1.0], "beside", **FLAT | {"eps_over_d": 0.05}),
+        rows_of("cone_axis", [1.0], "far", **FLAT | {"eps_over_d": 0.2}),
+        rows_of("cone_axis", [1.0], "dome", **TUBE | {"kd_min": 0.5}),
+        rows_of("cone_axis", [1.0], "saddle", **TUBE | {"kd_min": -0.5}),
+        rows_of("cone_axis", [1.0], "bowl", kd_min=-0.5, kd_max=-0.4),
+        rows_of("cone_axis", [1.0], "hollow", kd_min=-0.5),
+    ]  # fmt: skip
+    found = {each.situation.title: each.situation.settings for each in guide_from(*parts).advice}
+    assert found == {
+        "flat, light at the camera": ("flat",),
+        "outside of a tube, light at the camera": ("tube", "tube, twice as curved"),
+        "dome, light at the camera": ("dome",), "saddle, light at the camera": ("saddle",),
+        "bowl, light at the camera": ("bowl",), "inside of a tube, light at the camera": ("hollow",),
+        "flat, light beside the camera (ε/d up to 0.1)": ("beside",),
+        "flat, light beside the camera (ε/d above 0.1)": ("far",),
+    }  # fmt: skip
+
+
+def test_conditions_set_situations_apart_and_what_all_share_is_told_once():
+    told = {
+        "a": {"sensor": "no noise", "relief": "smooth surface"},
+        "b": {"sensor": "blur", "relief": "smooth surface"},
+    }
+    guide = guide_from(rows_of("cone_axis", [1.0], "a"), rows_of("cone_axis", [1.0], "b"), conditions=told)
+    assert [each.situation.circumstances for each in guide.advice] == ["no noise", "blur"]
+    assert guide.shared == ("light at the camera", "smooth surface")
+
+
+def test_a_small_spot_is_told_apart():
+    told = {"half_width_rad": 0.01, "focal_px": 400.0}
+    parts = (
+        rows_of("cone_axis", [1.0], "a"),
+        rows_of("cone_axis", [1.0], "b", **TUBE | {"kd_min": 1.0, "kd_max": 3.0}),
+    )
+    # 4 px on the plane; a quarter and a half of it on the dome.
+    guide = guide_from(*parts, conditions={"a": told, "b": told})
+    assert [each.situation.title for each in guide.advice] == ["flat", "dome, small spot (below 3 px)"]
+
+
+def test_tissue_of_mixed_curvature_is_named_by_its_surface():
+    rows = rows_of("cone_axis", [1.0], surface="colon") + rows_of(
+        "cone_axis", [1.0], first=1, **TUBE | {"surface": "colon"}
+    )
+    assert guide_from(rows).advice[0].situation.surface == "colon: mixed curvature"
+
+
+@pytest.mark.parametrize(
+    ("errors", "said", "is_broken"),
+    [
+        ({"a": [1.0] * 4, "b": [2.0] * 4}, "not here: at most 2°, b", False),
+        ({"a": [1.0] * 4, "b": [6.0] * 4}, "1 of 2 settings, b: mean 6°", True),
+        ({"a": [1.0] * 4, "b": [6.0] * 4, "c": [9.0] * 4}, "2 of 3 settings, b: mean 6°; worst 9°", True),
+        ({"a": [7.0] * 4, "b": [6.0] * 4}, "all 2 settings: mean 6° or more", True),
+        ({"a": [0.1, None, "missed", None]}, "here: 1 of 4 answered", True),
+        ({"a": [None, "missed"]}, "no method answered", True),
+    ],
+)
+def test_where_the_best_method_breaks(errors, said, is_broken):
+    guide = guide_from(*(rows_of("cone_axis", own, setting) for setting, own in errors.items()))
+    (row,) = guide_rows(guide)
+    assert (row.breaks, row.is_broken) == (said, is_broken)
+
+
+def test_false_detections_count_nowhere_and_settings_without_highlights_are_named():
+    false = [row | {"true_id": None} for row in rows_of("cone_axis", [80.0], "b")]
+    guide = guide_from(rows_of("cone_axis", [1.0]), false)
+    assert (guide.left_out, guide.advice[0].n) == (("b",), 1)
+    assert guide_of(pl.DataFrame(false)).advice == ()
+
+
+@pytest.mark.parametrize("count", [6, 7, 20, 101])
+def test_the_interval_of_a_median_holds_it_in_95_of_100_samples(count):
+    low, high = median_interval(np.arange(1.0, count + 1))
+    # Order statistics low and high hold the median unless fewer than `low`, or more than `high` - 1, lie below it.
+    held = binom.cdf(high - 1, count, 0.5) - binom.cdf(low - 1, count, 0.5)
+    narrower = binom.cdf(high - 2, count, 0.5) - binom.cdf(low, count, 0.5)
+    assert narrower < 0.95 <= held
+
+
+def test_five_values_have_no_interval():
+    assert median_interval(np.arange(5.0)) == (None, None)
+
+
+def test_methods_say_what_they_are_and_where_they_break():
+    parts = [rows_of("cone_axis", [1.0] * 4, "a"), rows_of("circle_pose", [2.0] * 4, "a"),
+             rows_of("cone_axis", [1.0] * 4, "b", **TUBE), rows_of("circle_pose", [60.0] * 4, "b", **TUBE)]  # fmt: skip
+    cone, pose = method_rows(guide_from(*parts), DESCRIPTIONS)
+    assert (cone.best, cone.breaks) == ("2 of 2", "in none as a whole")
+    assert (pose.best, pose.breaks) == ("0 of 2", "1 of 2: outside of a tube (mean 60°)")
+    assert pose.about == DESCRIPTIONS["circle_pose"]
+
+
+def test_every_estimator_of_this_package_is_described():
+    from simtest.pages.palette import ESTIMATOR_COLOURS
+
+    assert set(DESCRIPTIONS) == set(ESTIMATOR_COLOURS)
+    assert describe_estimators(["cone_axis"]) == {"cone_axis": DESCRIPTIONS["cone_axis"]}
+
+
+def test_conditions_come_from_the_scene():
+    plain = conditions(load_scene("plane"))
+    assert (plain.relief, plain.camera) == ("smooth surface", "pinhole camera")
+    assert plain.half_width_rad == pytest.approx(0.083063, abs=1e-6)  # n = 50
+    changed = {"sensor.noise_sigma": 0.01, "sensor.full_well": 1000, "known.lights": False, "render.path_depth": 3}
+    found = conditions(load_scene("plane", changed))
+    assert (found.told, found.sensor) == ("place not told", "noise up to 2 %, shot noise")
+    assert "bounced light" in found.render
+    told = load_scene("plane", {"known.distance_error": 0.0})
+    assert conditions(told).told == "place and distance told"
+
+
+def test_summary_json_holds_conditions_and_descriptions():
+    experiment = load_experiment("relief")
+    cases = expand(experiment)
+    rows = pl.DataFrame(rows_of("cone_axis", [1.0], cases[0].setting, mahalanobis2=None, error_oracle_deg=1.0))
+    (content,) = json.loads(json.dumps(run_summary(experiment, cases, rows)))["experiments"].values()
+    assert content["estimators"] == {name: DESCRIPTIONS[name] for name in experiment.estimators}
+    assert list(content["conditions"]) == list(conditions_of(cases))
+    assert content["conditions"][cases[0].setting]["relief"] == "relief"
+
+
+def printed(run, width, terminal):
+    from rich.console import Console
+
+    from simtest.cli.guide_table import print_guide
+
+    file = io.StringIO()
+    print_guide(run, Console(file=file, width=width, force_terminal=terminal, emoji=False, highlight=False))
+    return file.getvalue()
+
+
+def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_looks(tmp_path):
+    run = make_run(tmp_path, items=0)
+    text = printed(run, 80, terminal=False)
+    assert "\x1b" not in text
+    assert all(len(line.rstrip()) <= 80 for line in text.splitlines())
+    guide = read_guide(run)
+    for row in guide_rows(guide):
+        assert row.best in text
+    # A line a situation at least, and no line for each of the run's rows.
+    assert len(guide.advice) < len(text.splitlines()) < 60
+    assert [name for name, _ in groupby(line for line in text.splitlines() if line.startswith("light"))] == [
+        "light at the camera", "light beside the camera (ε/d up to 0.1)", "light beside the camera (ε/d above 0.1)"
+    ]  # fmt: skip
+    assert "\x1b[1m" in printed(run, 120, terminal=True)
+
+
+def test_a_run_without_true_highlights_says_so(tmp_path):
+    run = make_run(tmp_path, "noise", [row | {"true_id": None} for row in rows_of("cone_axis", [1.0])], items=0)
+    assert "nothing to compare" in printed(run, 80, terminal=False)
