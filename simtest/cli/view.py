@@ -16,16 +16,37 @@ def view(
         Path | None,
         Parameter(help="PNG to draw to, without a display, instead of opening a window.", converter=named_path),
     ] = None,
+    page: Annotated[
+        Path | None,
+        Parameter(help="HTML file with the scene to turn and zoom in a browser, offline.", converter=named_path),
+    ] = None,
     settings: Settings = None,
     variant: Variant = None,
 ) -> None:
     """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals."""
-    from simtest.report.viewer import check_target, make_content, save_screenshot, show
+    from simtest.report.viewer import (
+        check_page,
+        check_target,
+        make_content,
+        save_screenshot,
+        show,
+        write_scene_page,
+    )
+    from simtest.report.viewer.content import PAGE_GRID
     from simtest.runtime.locks import exclusive_file
     from simtest.spec import load_scene, parse_settings
 
     described = load_scene(scene, parse_settings(settings or []))
-    check_target(screenshot)
+    if page is not None:
+        check_page(page)
+    if screenshot is not None or page is None:
+        check_target(screenshot)
+    if page is not None:
+        with exclusive_file(page, "--page"):
+            write_scene_page(make_content(described, variant, PAGE_GRID), page, described.name)
+        print(page)
+        if screenshot is None:
+            return
     if screenshot is None:
         show(make_content(described, variant))
         return
