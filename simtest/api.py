@@ -244,8 +244,10 @@ def validate(
     Examples
     --------
     >>> import simtest, tempfile
-    >>> run = simtest.validate("laws", tempfile.mkdtemp(), realisations=1, width=96, height=96)  # doctest: +SKIP
-    >>> run.results.select("setting", "estimator", "error_deg")  # doctest: +SKIP
+    >>> out = tempfile.mkdtemp()
+    >>> run = simtest.validate("paper", out, realisations=1, size=64, estimators=["cone_axis"])
+    >>> run.page.name, run.results["estimator"].unique().to_list()
+    ('index.html', ['cone_axis'])
     """
     from simtest.report import write_report
     from simtest.report.run_results import RunResults

@@ -10,19 +10,53 @@ from enum import StrEnum
 
 
 class SimtestError(Exception):
-    """Base of every error that simtest raises on purpose; its text is one line for the user."""
+    """Base of every error that simtest raises on purpose; its text is one line for the user.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> try:
+    ...     simtest.load_scene("cilinder")
+    ... except simtest.SimtestError as error:
+    ...     print(type(error).__name__)
+    InputError
+    """
 
 
 class InputError(SimtestError, ValueError):
-    """Malformed input: the message names the file or key, the value got and what is allowed."""
+    """Malformed input: the message names the file or key, the value got and what is allowed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> try:
+    ...     simtest.load_scene("cylinder", {"surface.radius_mm": -1.0})
+    ... except simtest.InputError as error:
+    ...     print("surface.radius_mm" in str(error))
+    True
+    """
 
 
 class BackendError(SimtestError, RuntimeError):
-    """The rendering backend cannot be used; the message says how to repair it."""
+    """The rendering backend cannot be used; the message says how to repair it.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> issubclass(simtest.BackendError, simtest.SimtestError)
+    True
+    """
 
 
 class Reason(StrEnum):
-    """Why a reconstruction has no normal; the values are the `status` column of the results."""
+    """Why a reconstruction has no normal; the values are the `status` column of the results.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.Reason.STREAK.value, simtest.Reason.STREAK.meaning
+    ('streak', 'the spot is so long that its centre along it is not determined')
+    """
 
     NO_LIGHT = "no_light"
     NO_PEAK = "no_peak"
@@ -73,6 +107,12 @@ class Failure:
         The class of failure, counted in the reports.
     detail : str
         One line with the numbers of this case.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> print(simtest.Failure(simtest.Reason.TOO_FEW_POINTS, "4 points"))
+    too_few_points: 4 points
     """
 
     reason: Reason

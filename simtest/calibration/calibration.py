@@ -79,6 +79,15 @@ class Calibration:
     ------
     InputError
         If a part is of another type, or the saturation level is no finite number > 0.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> from simtest.calibration import Priors
+    >>> camera = simtest.Camera.from_fov(70.0, 640, 480)
+    >>> calibration = simtest.Calibration(camera, priors=Priors(lights_mm=((3.0, 0.0, 0.0),)))
+    >>> calibration.priors.lights_mm
+    ((3.0, 0.0, 0.0),)
     """
 
     camera: Camera

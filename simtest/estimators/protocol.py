@@ -76,6 +76,13 @@ class Estimate:
         section 7).
     cloud : CloudShape, optional
         The cloud of highlights that the estimate stands on, where it is not that of a single one.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> normal = np.array([0.0, 0.0, -1.0])
+    >>> simtest.Estimate(normal, normal[None], np.array([320.0, 240.0]), covariance=1e-4 * np.eye(2))
+    Estimate(normal=(0, 0, -1), look_px=(320, 240), deviation_deg=0.81)
     """
 
     normal: Array

@@ -45,6 +45,12 @@ class ViewMask:
     ------
     InputError
         If a number is not finite, the radius is not positive, or the cuts are longer than the sides.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.ViewMask(320.0, 240.0, 230.0)
+    ViewMask(cx=320, cy=240, radius=230)
     """
 
     cx: float
@@ -121,6 +127,13 @@ class Camera:
     InputError
         If the size is not positive, a number is not finite, K is singular, the view mask covers no pixel, or the lens
         folds over inside the image (inside the view mask, where there is one).
+
+    Examples
+    --------
+    >>> import simtest
+    >>> camera = simtest.Camera.from_fov(70.0, 640, 480)
+    >>> camera.unproject([[320.0, 240.0]])
+    array([[0., 0., 1.]])
     """
 
     width: int

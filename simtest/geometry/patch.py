@@ -49,6 +49,15 @@ class Patch:
         Made from the fields above, unless it is one that was.
     kept : dict
         What estimators have fitted to this patch, by a name, each with the camera; a copy starts without.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:40, :40] + 0.5
+    >>> lobe = np.exp(-((x - 20) ** 2 + (y - 18) ** 2) / 50)
+    >>> patch = simtest.Patch.cut(lobe, (5, 5, 30, 30))
+    >>> patch.peak_px.round(1)
+    array([20., 18.])
     """
 
     values: Image | Array

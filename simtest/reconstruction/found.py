@@ -23,6 +23,15 @@ class Specularity:
         The smoothed crop.
     estimates : dict
         `Estimate` or `Failure` by estimator name.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:120, :160] + 0.5
+    >>> frame = np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 200).astype(np.float32)
+    >>> spot = simtest.reconstruct(frame, simtest.Camera.from_fov(60.0, 160, 120))[0]
+    >>> spot.estimates["cone_axis"].normal.round(2) + 0.0
+    array([ 0.,  0., -1.])
     """
 
     region: Region

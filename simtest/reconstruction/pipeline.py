@@ -105,6 +105,15 @@ def reconstruct(
     InputError
         If the frame is no image, differs in size from the camera's calibration, or holds NaN, infinity or integers of
         another type, whose range nobody knows; if an argument is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:120, :160] + 0.5
+    >>> frame = np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 200).astype(np.float32)
+    >>> found = simtest.reconstruct(frame, 60.0)
+    >>> len(found), found.choices.detector
+    (1, 'peaks')
     """
     if isinstance(camera, int | float) and not isinstance(camera, bool):
         height, width = image_size(frame)

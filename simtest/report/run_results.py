@@ -24,6 +24,13 @@ class RunResults:
     ----------
     page : Path
         index.html of the run.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import simtest
+    >>> simtest.RunResults(Path("reports/runs/overview/index.html")).folder.name
+    'overview'
     """
 
     page: Path

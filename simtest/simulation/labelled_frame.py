@@ -46,6 +46,14 @@ class LabelledFrame:
         Mitsuba variant.
     calibration : Calibration
         What reconstruction is told of camera, sensor, lights, distance and lobe.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> frame = simtest.render("sphere", width=96, height=96)
+    >>> found = simtest.reconstruct(frame.image, frame.calibration)
+    >>> float(found[0].estimates["cone_axis"].normal @ frame.highlights[0].normal) > 0.999
+    True
     """
 
     scene: Scene

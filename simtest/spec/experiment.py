@@ -70,7 +70,15 @@ class Group(Spec):
 
 
 class Experiment(Spec):
-    """A validation experiment."""
+    """A validation experiment.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> experiment = simtest.load_experiment("overview")
+    >>> experiment.name, "cone_axis" in experiment.estimators
+    ('overview', True)
+    """
 
     name: Name
     title: str = ""
@@ -102,6 +110,12 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     ------
     InputError
         If the file is missing or malformed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.load_experiment("overview", {"realisations": 3}).realisations
+    3
     """
     path = find(name, "scenes", "experiments")
     # The experiment's own keys; all others are keys of the scenes.

@@ -68,7 +68,15 @@ class KnownSpec(Spec):
 
 
 class Scene(Spec):
-    """Everything that determines a rendered frame."""
+    """Everything that determines a rendered frame.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> scene = simtest.load_scene("cylinder")
+    >>> scene.surface.radius_mm, scene.reflectance.exponent
+    (10.0, 50.0)
+    """
 
     name: str = Field("scene", min_length=1, max_length=80)
     surface: Surface
@@ -203,6 +211,12 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     ------
     InputError
         If the file is missing or malformed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.load_scene("cylinder", {"surface.radius_mm": 5.0}).surface.radius_mm
+    5.0
     """
     path = find(name, "scenes")
     data = apply_settings(read_toml(path), settings or {}, str(path))

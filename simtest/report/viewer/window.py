@@ -36,7 +36,7 @@ ROUGH = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.5, "specular_power": 40
 
 CURVATURE = "curvature (1/mm): principal one\nof larger size, of the base,\nconvex to the camera positive"
 
-ZOOM = 1.4
+ZOOM = 1.3
 """Factor by which the scene is larger than VTK shows it."""
 
 DONE = "simtest view: drawn"
