@@ -27,7 +27,7 @@ from simtest import _renamed
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from simtest.api import LabelledFrame, export, render, validate
+    from simtest.api import LabelledFrame, RunResults, export, render, validate
     from simtest.calibration import Calibration
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     )
 
 _HOMES = {
-    "simtest.api": ("LabelledFrame", "export", "render", "validate"),
+    "simtest.api": ("LabelledFrame", "RunResults", "export", "render", "validate"),
     "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
@@ -71,6 +71,7 @@ __all__ = [
     "LabelledFrame",
     "Patch",
     "Reason",
+    "RunResults",
     "Scene",
     "SimtestError",
     "Specularity",

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from simtest.errors import InputError
 from simtest.runtime.lazy_names import lazy_names
 from simtest.runtime.limits import check_count
 
@@ -17,18 +18,24 @@ if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
     from simtest.reconstruction.description import PictureRecord
     from simtest.reconstruction.picture import Options
+    from simtest.report.run_results import RunResults
     from simtest.runtime.engines import Engine
     from simtest.simulation.labelled_frame import LabelledFrame
     from simtest.simulation.viewpoints import SampledViews
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
-_HOMES = {"simtest.simulation.labelled_frame": ("LabelledFrame",), "simtest.reconstruction": ("reconstruct",)}
+_HOMES = {
+    "simtest.simulation.labelled_frame": ("LabelledFrame",),
+    "simtest.reconstruction": ("reconstruct",),
+    "simtest.report.run_results": ("RunResults",),
+}
 __getattr__, _ = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "Extras",
     "LabelledFrame",
+    "RunResults",
     "export",
     "reconstruct",
     "reconstruct_picture",
@@ -36,6 +43,9 @@ __all__ = [
     "sample_views",
     "validate",
 ]
+
+OWN_KEYS = ("realisations", "seed", "estimators")
+"""Keys of an experiment that an override may name."""
 
 TRIES = 10
 """Viewpoints that are tried for each view wanted."""
@@ -46,6 +56,7 @@ def render(
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
     progress: "Progress | None" = None,
+    **overrides: Any,
 ) -> "LabelledFrame":
     """Render a scene with its ground truth.
 
@@ -54,11 +65,14 @@ def render(
     scene : Scene, str or Path
         A scene, a scene file, or the name of a shipped scene.
     settings : mapping, optional
-        Values that replace those of a scene file, by key path, such as ``{"surface.radius_mm": 5.0}``.
+        Values that replace those of the scene, by key path, such as ``{"surface.radius_mm": 5.0}``.
     variant : str, optional
         Mitsuba variant.
     progress : callable, optional
         Called with samples done, samples in all, and what is done; what it raises stops the frame.
+    **overrides
+        Values by the last name of a key, such as ``radius_mm=5.0``, where one key alone ends so. Keys that the scene's
+        file states come first, then those that it leaves at their defaults.
 
     Returns
     -------
@@ -67,13 +81,20 @@ def render(
     Raises
     ------
     InputError
-        If the scene is malformed or the camera sees no surface.
+        If the scene is malformed, the camera sees no surface, or several keys or none end in the name of an override.
     BackendError
         If the rendering backend cannot be used.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> frame = simtest.render("cylinder", radius_mm=5.0, width=96, height=96)
+    >>> frame.image.shape, [truth.isolated for truth in frame.highlights]
+    ((96, 96), [True])
     """
     from simtest.simulation.labelled_frame import make_frame
 
-    return make_frame(_scene(scene, settings), variant, progress)
+    return make_frame(_scene(scene, settings, overrides), variant, progress)
 
 
 def export(
@@ -81,12 +102,13 @@ def export(
     out: str | Path,
     settings: Mapping[str, Any] | None = None,
     variant: str | None = None,
+    **overrides: Any,
 ) -> list[Path]:
     """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh.
 
     Parameters
     ----------
-    scene, settings
+    scene, settings, **overrides
         As of `render`.
     out : str or Path
         Folder, made if need be.
@@ -104,12 +126,18 @@ def export(
         If the scene is malformed, its camera or a light has what Mitsuba cannot express, or `out` cannot be written.
     BackendError
         If the rendering backend cannot be used.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> [file.name for file in simtest.export("sphere", tempfile.mkdtemp())]
+    ['scene.xml']
     """
     from simtest.rendering.mitsuba_export import export_scene
     from simtest.runtime.locks import exclusive_folder
 
     with exclusive_folder(Path(out)):
-        return export_scene(_scene(scene, settings), Path(out), variant)
+        return export_scene(_scene(scene, settings, overrides), Path(out), variant)
 
 
 def sample_views(
@@ -157,7 +185,7 @@ def sample_views(
     from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
 
     check_count("views", count, "count")
-    described = _scene(scene, settings)
+    described = _scene(scene, settings, {})
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     with exclusive_folder(Path(out)):
         writer = ViewWriter(Path(out), film=along is not None)
@@ -176,7 +204,8 @@ def validate(
     progress: "Progress | None" = None,
     workers: int = 1,
     engine: "Engine | None" = None,
-) -> Path:
+    **overrides: Any,
+) -> "RunResults":
     """Run an experiment and write its report.
 
     Parameters
@@ -186,7 +215,7 @@ def validate(
     out : str or Path
         Folder of the run: results.parquet, summary.json, figures/, index.html. A stopped run goes on.
     settings : mapping, optional
-        Values that replace those of the file, by key path.
+        Values that replace those of the experiment's file and scenes, by key path.
     command : str
         How the run was called, for the report.
     variant : str, optional
@@ -197,11 +226,13 @@ def validate(
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
         What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+    **overrides
+        Values by the last name of a key of the experiment, such as ``realisations=5``, or of its scenes.
 
     Returns
     -------
-    Path
-        The page.
+    RunResults
+        The table, the summary and the page, read when they are asked for.
 
     Raises
     ------
@@ -209,20 +240,28 @@ def validate(
         If the experiment is malformed, an estimator unknown, or `out` holds something else than a run.
     BackendError
         If the rendering backend cannot be used.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> out = tempfile.mkdtemp()
+    >>> run = simtest.validate("paper", out, realisations=1, size=64, estimators=["cone_axis"])
+    >>> run.page.name, run.results["estimator"].unique().to_list()
+    ('index.html', ['cone_axis'])
     """
     from simtest.report import write_report
+    from simtest.report.run_results import RunResults
     from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
     from simtest.runtime.machine_errors import disk_problem, write_error
-    from simtest.spec import Experiment, load_experiment
     from simtest.validation.runner import run_experiment
 
-    described = experiment if isinstance(experiment, Experiment) else load_experiment(experiment, settings)
+    described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
     with exclusive_folder(Path(out)):
         try:
             run = run_experiment(described, Path(out), command, variant, progress, chosen)
-            return write_report(run.folder, progress)
+            return RunResults(write_report(run.folder, progress))
         except OSError as error:
             if disk_problem(error) is None:
                 raise
@@ -230,10 +269,46 @@ def validate(
             raise write_error(error, out, kept) from error
 
 
-def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None) -> "Scene":
+def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":
+    """Return the described scene with values replaced, by key path and by the last name of a key."""
     from simtest.spec import Scene, load_scene
+    from simtest.spec.scene import scene_from_dict
+    from simtest.spec.toml_files import apply_settings
 
-    return scene if isinstance(scene, Scene) else load_scene(scene, settings)
+    values = dict(settings or {})
+    described = scene if isinstance(scene, Scene) else load_scene(scene, values)
+    if overrides:
+        from simtest.spec.short_keys import full_keys
+
+        values |= full_keys([described], overrides)
+    elif not values or not isinstance(scene, Scene):
+        return described
+    if not isinstance(scene, Scene):
+        return load_scene(scene, values)
+    return scene_from_dict(apply_settings(described.model_dump(mode="json", exclude_unset=True), values, "scene"))
+
+
+def _experiment(
+    experiment: "Experiment | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]
+) -> "Experiment":
+    """Return the described experiment with values replaced; those of an `Experiment` are its own already."""
+    from simtest.spec import Experiment, load_experiment
+
+    if isinstance(experiment, Experiment):
+        if settings or overrides:
+            raise InputError("settings: the experiment is given as an object; change it, or name its file")
+        return experiment
+    values = dict(settings or {})
+    described = load_experiment(experiment, values)
+    if not overrides:
+        return described
+    # The experiment's own keys come before those of its scenes.
+    values |= {name: value for name, value in overrides.items() if name in OWN_KEYS}
+    if rest := {name: value for name, value in overrides.items() if name not in OWN_KEYS}:
+        from simtest.spec.short_keys import full_keys, scene_models
+
+        values |= full_keys(scene_models(described), rest)
+    return load_experiment(experiment, values)
 
 
 @dataclass(frozen=True)

@@ -10,19 +10,53 @@ from enum import StrEnum
 
 
 class SimtestError(Exception):
-    """Base of every error that simtest raises on purpose; its text is one line for the user."""
+    """Base of every error that simtest raises on purpose; its text is one line for the user.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> try:
+    ...     simtest.load_scene("cilinder")
+    ... except simtest.SimtestError as error:
+    ...     print(type(error).__name__)
+    InputError
+    """
 
 
 class InputError(SimtestError, ValueError):
-    """Malformed input: the message names the file or key, the value got and what is allowed."""
+    """Malformed input: the message names the file or key, the value got and what is allowed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> try:
+    ...     simtest.load_scene("cylinder", {"surface.radius_mm": -1.0})
+    ... except simtest.InputError as error:
+    ...     print("surface.radius_mm" in str(error))
+    True
+    """
 
 
 class BackendError(SimtestError, RuntimeError):
-    """The rendering backend cannot be used; the message says how to repair it."""
+    """The rendering backend cannot be used; the message says how to repair it.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> issubclass(simtest.BackendError, simtest.SimtestError)
+    True
+    """
 
 
 class Reason(StrEnum):
-    """Why a reconstruction has no normal; the values are the `status` column of the results."""
+    """Why a reconstruction has no normal; the values are the `status` column of the results.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.Reason.STREAK.value, simtest.Reason.STREAK.meaning
+    ('streak', 'the spot is so long that its centre along it is not determined')
+    """
 
     NO_LIGHT = "no_light"
     NO_PEAK = "no_peak"
@@ -39,6 +73,29 @@ class Reason(StrEnum):
     NO_ESTIMATE = "no_estimate"
     ESTIMATOR_ERROR = "estimator_error"
 
+    @property
+    def meaning(self) -> str:
+        """The reason in words."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Reason.NO_LIGHT: "no light reached the sensor",
+    Reason.NO_PEAK: "the region has no value above the others",
+    Reason.CLUSTER: "several highlights touch, so that none has isophotes of its own",
+    Reason.NO_CLOSED_ISOPHOTE: "no isophote at the isovalue closes around the peak",
+    Reason.TOO_FEW_POINTS: "the isophote has too few points for an ellipse",
+    Reason.NOT_AN_ELLIPSE: "no ellipse fits the isophote",
+    Reason.DEGENERATE_CONIC: "the fitted ellipse is nearly a line",
+    Reason.NOT_FINITE: "the estimator gave values that are not finite",
+    Reason.NOT_CONVERGED: "the fit did not converge",
+    Reason.STREAK: "the spot is so long that its centre along it is not determined",
+    Reason.UNRESOLVED: "the spot is too small to have a shape",
+    Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
+    Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
+    Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
@@ -50,6 +107,12 @@ class Failure:
         The class of failure, counted in the reports.
     detail : str
         One line with the numbers of this case.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> print(simtest.Failure(simtest.Reason.TOO_FEW_POINTS, "4 points"))
+    too_few_points: 4 points
     """
 
     reason: Reason
@@ -57,3 +120,15 @@ class Failure:
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.detail}" if self.detail else str(self.reason)
+
+    def __repr__(self) -> str:
+        # The detail may quote a whole message of an estimator.
+        detail = self.detail if len(self.detail) <= 200 else self.detail[:197] + "..."
+        return f"Failure({str(self.reason)!r}, {detail!r})"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the reason, its meaning and the numbers of this case."""
+        from html import escape
+
+        meaning = self.reason.meaning if isinstance(self.reason, Reason) else ""
+        return f"<div><b>No normal: {escape(str(self.reason))}</b><br>{escape(meaning)}<br>{escape(self.detail)}</div>"

@@ -14,6 +14,7 @@ from simtest.geometry import Array, Image, Mask
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number
+from simtest.runtime.short_repr import short_repr
 
 MIN_FALLOFF = 0.05
 """The correction divides by at least this share of the frame's largest falloff: below it there is little but noise."""
@@ -49,6 +50,8 @@ class CorrectedFrame:
     limited: Mask | None = None
     channels: int = 1
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -76,6 +79,15 @@ class Calibration:
     ------
     InputError
         If a part is of another type, or the saturation level is no finite number > 0.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> from simtest.calibration import Priors
+    >>> camera = simtest.Camera.from_fov(70.0, 640, 480)
+    >>> calibration = simtest.Calibration(camera, priors=Priors(lights_mm=((3.0, 0.0, 0.0),)))
+    >>> calibration.priors.lights_mm
+    ((3.0, 0.0, 0.0),)
     """
 
     camera: Camera
@@ -85,6 +97,8 @@ class Calibration:
     noise: NoiseModel = field(default_factory=NoiseModel)
     saturation_level: float | None = None
     priors: Priors = NO_PRIORS
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):

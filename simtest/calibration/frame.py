@@ -10,6 +10,7 @@ from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, 
 from simtest.calibration.response import Response
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
+from simtest.runtime.short_repr import short_repr
 
 FINEST_SHARE = 0.8
 """Of a told noise that nothing has correlated, the finest scale shows so much or more."""
@@ -43,6 +44,8 @@ class Frame:
     _patches: dict[tuple[Box, tuple[int, int] | None], Patch | Failure] = field(
         default_factory=dict, init=False, repr=False
     )
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.seen is None:

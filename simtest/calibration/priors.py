@@ -14,6 +14,7 @@ from simtest.calibration.distributions import Distribution, Uniform, check_distr
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.checks import check_kind, check_number
+from simtest.runtime.short_repr import short_repr
 
 MAX_LIGHTS = 32
 
@@ -104,6 +105,8 @@ class Priors:
     falloff_power: Distribution | None = UNTOLD_FALLOFF_POWER
     relief_slope: Distribution = UNTOLD_SLOPE_RAD
     plane: bool = False
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if len(self.lights_mm) > MAX_LIGHTS or not all(

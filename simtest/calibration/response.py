@@ -9,6 +9,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Image
 from simtest.geometry.checks import check_number, check_numbers
+from simtest.runtime.short_repr import short_repr
 
 _LEVELS = 2**16  # values that a picture has at most
 
@@ -48,6 +49,8 @@ class Response:
     gamma: float = 1.0
     light: tuple[float, ...] = ()
     value: tuple[float, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.kind not in ("linear", "gamma", "srgb", "table"):

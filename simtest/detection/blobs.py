@@ -21,6 +21,7 @@ from simtest.errors import Failure
 from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
 from simtest.runtime.arrays import Index
+from simtest.runtime.short_repr import short_repr
 
 Box = tuple[int, int, int, int]
 _Fitted = tuple[Array, FittedConic]
@@ -157,6 +158,8 @@ class Highlight:
     peaks: Index = field(default_factory=lambda: np.empty((0, 2), dtype=np.intp))
     clipped: float = 0.0
     dim: bool = False
+
+    __repr__ = short_repr
 
     @property
     def is_isolated(self) -> bool:

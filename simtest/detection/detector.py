@@ -11,6 +11,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.entry_points import EntryPointGroup
 from simtest.runtime.resources import shown
+from simtest.runtime.short_repr import short_repr
 
 DETECTORS = EntryPointGroup("simtest.detectors", "detector")
 
@@ -36,6 +37,8 @@ class Detection:
     highlights: tuple[Highlight, ...] = ()
     others: tuple[Highlight, ...] = ()
     view: View = WHOLE
+
+    __repr__ = short_repr
 
 
 @runtime_checkable

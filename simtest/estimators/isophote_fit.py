@@ -21,6 +21,7 @@ from simtest.geometry import (
 from simtest.geometry.arc_fit import MIN_ARC_RAD, angular_extent
 from simtest.geometry.ellipse_fit import MIN_POINTS
 from simtest.geometry.fitting_planes import FORWARD, fitting_planes
+from simtest.runtime.short_repr import short_repr
 
 MAX_ARC_RESIDUAL = 0.1
 """An arc that misses its ellipse by more, RMS over the radius, noise included, is no part of one."""
@@ -52,6 +53,8 @@ class FittedIsophote:
     cone: Array
     sightline: Array = field(default_factory=lambda: FORWARD)
     cut: bool = False
+
+    __repr__ = short_repr
 
     def pose(self) -> CirclePose | Failure:
         """Compute the poses of a circle with this cone (see `simtest.geometry.circle_pose`)."""

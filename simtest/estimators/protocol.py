@@ -13,6 +13,7 @@ from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.pose_region import PoseRegion
+from simtest.runtime.short_repr import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
 
@@ -75,6 +76,13 @@ class Estimate:
         section 7).
     cloud : CloudShape, optional
         The cloud of highlights that the estimate stands on, where it is not that of a single one.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> normal = np.array([0.0, 0.0, -1.0])
+    >>> simtest.Estimate(normal, normal[None], np.array([320.0, 240.0]), covariance=1e-4 * np.eye(2))
+    Estimate(normal=(0, 0, -1), look_px=(320, 240), deviation_deg=0.81)
     """
 
     normal: Array
@@ -96,6 +104,30 @@ class Estimate:
             object.__setattr__(self, "covariance", total(self.budget))
         elif self.budget is None and self.covariance is not None:
             object.__setattr__(self, "budget", {STATED: self.covariance})
+
+    @property
+    def deviation_deg(self) -> float | None:
+        """Standard deviation of the normal, deg: the square root of the covariance's trace, where one is stated."""
+        if self.covariance is None:
+            return None
+        return float(np.degrees(np.sqrt(max(np.trace(self.covariance), 0.0))))
+
+    def __repr__(self) -> str:
+        deviation = self.deviation_deg
+        parts = [f"normal={vector(self.normal)}", f"look_px={vector(self.look_px)}"]
+        parts += [] if deviation is None else [f"deviation_deg={deviation:.3g}"]
+        parts += [] if self.axis_ratio is None else [f"axis_ratio={self.axis_ratio:.3g}"]
+        parts += [f"{len(self.candidates)} candidates"] if len(self.candidates) > 1 else []
+        parts += ["target=base"] if self.target == "base" else []
+        parts += [f"cloud of {len(self.cloud.points_px)}"] if self.cloud is not None else []
+        parts += [f"flags={' '.join(self.flags)}"] if self.flags else []
+        return f"Estimate({clipped(', '.join(parts), LONGEST - 10)})"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the normal in the view with its 95 % ellipse, and the budget."""
+        from simtest.estimators.notebook import estimate_html
+
+        return estimate_html(self)
 
     def with_parts(self, **parts: Array) -> "Estimate":
         """Return the estimate with more parts in its budget, rad^2; one that is there already is added to."""

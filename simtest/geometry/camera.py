@@ -11,6 +11,7 @@ from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.distortion import Distortion
 from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.short_repr import short_repr
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""
@@ -44,6 +45,12 @@ class ViewMask:
     ------
     InputError
         If a number is not finite, the radius is not positive, or the cuts are longer than the sides.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.ViewMask(320.0, 240.0, 230.0)
+    ViewMask(cx=320, cy=240, radius=230)
     """
 
     cx: float
@@ -51,6 +58,8 @@ class ViewMask:
     radius: float
     corner: float | None = None
     half_height: float | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name in ("cx", "cy", "radius", "corner", "half_height"):
@@ -118,6 +127,13 @@ class Camera:
     InputError
         If the size is not positive, a number is not finite, K is singular, the view mask covers no pixel, or the lens
         folds over inside the image (inside the view mask, where there is one).
+
+    Examples
+    --------
+    >>> import simtest
+    >>> camera = simtest.Camera.from_fov(70.0, 640, 480)
+    >>> camera.unproject([[320.0, 240.0]])
+    array([[0., 0., 1.]])
     """
 
     width: int
@@ -129,6 +145,8 @@ class Camera:
     skew: float = 0.0
     distortion: Distortion | None = None
     view_mask: ViewMask | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         self._check_numbers()

@@ -45,6 +45,14 @@ class BrownConrady:
     ------
     InputError
         If a coefficient is not finite.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> lens = simtest.BrownConrady(k1=-0.2)
+    >>> camera = simtest.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, distortion=lens)
+    >>> camera.project([[1.0, 0.0, 10.0]]).round(2)
+    array([[369.9, 240. ]])
     """
 
     k1: float = 0.0
@@ -201,6 +209,14 @@ class KannalaBrandt:
     ------
     InputError
         If a coefficient is not finite.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> fisheye = simtest.KannalaBrandt()
+    >>> camera = simtest.Camera(640, 480, 200.0, 200.0, 320.0, 240.0, distortion=fisheye)
+    >>> camera.project([[1.0, 0.0, 0.5]]).round(1)  # 63 deg off the axis
+    array([[541.4, 240. ]])
     """
 
     k1: float = 0.0

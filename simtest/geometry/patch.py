@@ -11,6 +11,7 @@ from simtest.geometry import pixel_sets
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.level_sets import Crossings, LevelSet
 from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.short_repr import short_repr
 
 MIN_PLATEAU_PX = 12
 """Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
@@ -48,6 +49,15 @@ class Patch:
         Made from the fields above, unless it is one that was.
     kept : dict
         What estimators have fitted to this patch, by a name, each with the camera; a copy starts without.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:40, :40] + 0.5
+    >>> lobe = np.exp(-((x - 20) ** 2 + (y - 18) ** 2) / 50)
+    >>> patch = simtest.Patch.cut(lobe, (5, 5, 30, 30))
+    >>> patch.peak_px.round(1)
+    array([20., 18.])
     """
 
     values: Image | Array
@@ -63,6 +73,8 @@ class Patch:
     others_px: tuple[tuple[float, float], ...] = ()
     tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.

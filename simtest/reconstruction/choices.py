@@ -16,6 +16,7 @@ from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
+from simtest.runtime.short_repr import short_repr
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
@@ -56,6 +57,8 @@ class Choices:
     priors: Priors
     inferred: tuple[str, ...] = ()
     assumed: tuple[Assumption, ...] = ()
+
+    __repr__ = short_repr
 
     def __str__(self) -> str:
         """Return the choices on one line; those that nobody told are marked."""

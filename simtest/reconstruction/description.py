@@ -21,6 +21,7 @@ from simtest.reconstruction.ranking import StatedErrors, best_of, stated_errors
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
+from simtest.runtime.short_repr import short_repr
 from simtest.spec import describe_camera
 
 Points = list[list[float]]
@@ -37,6 +38,8 @@ class Drawing:
 
     isophotes: list[tuple[float, Points]]
     curves: list[Points]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,8 @@ class SpecularityRecord:
     reference: ReferenceRecord | None = None
     best_because: str = ""
 
+    __repr__ = short_repr
+
     @property
     def normals(self) -> dict[str, Estimate]:
         """The results of the estimators that did not fail."""
@@ -168,6 +173,8 @@ class PictureRecord:
     assumed: Sequence[Assumption] = ()
     smoothing_px: float | None = None
     inferred: Sequence[str] = ()
+
+    __repr__ = short_repr
 
     @property
     def stated(self) -> StatedErrors | None:

@@ -4,6 +4,8 @@ The pages show these sentences where the names appear; docs/reference/estimators
 define the names.
 """
 
+from simtest.errors import Reason
+
 FLAGS = {
     "ambiguous": "the two candidates of the circle pose are hardly told apart: a margin below 2 standard deviations",
     "ambiguous_light": "the data do not tell which of several lights made the highlight; their mean position is used",
@@ -44,22 +46,7 @@ KINDS = {
 }
 """By kind of a highlight that was found by colour (docs/concepts/detection.md)."""
 
-REASONS = {
-    "no_light": "no light reached the sensor",
-    "no_peak": "the region has no value above the others",
-    "cluster": "several highlights touch, so that none has isophotes of its own",
-    "no_closed_isophote": "no isophote at the isovalue closes around the peak",
-    "too_few_points": "the isophote has too few points for an ellipse",
-    "not_an_ellipse": "no ellipse fits the isophote",
-    "degenerate_conic": "the fitted ellipse is nearly a line",
-    "not_finite": "the estimator gave values that are not finite",
-    "not_converged": "the fit did not converge",
-    "streak": "the spot is so long that its centre along it is not determined",
-    "unresolved": "the spot is too small to have a shape",
-    "not_known": "the estimator needs what the calibration does not tell, such as the lights' positions",
-    "no_estimate": "the estimator found nothing that it could answer for",
-    "estimator_error": "the estimator stopped with an error",
-}
+REASONS = {str(reason): reason.meaning for reason in Reason}
 """By reason of a failure."""
 
 PARTS = {

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ from simtest.reconstruction.choices import (
     complete,
     untold,
 )
+from simtest.reconstruction.found import Reconstruction, Specularities, Specularity
 from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Image, Mask
 from simtest.runtime.resources import shown
@@ -41,49 +42,6 @@ MAX_SMOOTHING_PX = 50
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
 estimates have the flag ``small``."""
-
-
-@dataclass(frozen=True)
-class Specularity:
-    """One region of interest and what each estimator made of it.
-
-    Parameters
-    ----------
-    region : Region
-        Where it is.
-    patch : Patch or Failure
-        The smoothed crop.
-    estimates : dict
-        `Estimate` or `Failure` by estimator name.
-    """
-
-    region: Region
-    patch: Patch | Failure
-    estimates: dict[str, Estimate | Failure]
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """The normals of a picture, and the detection that they stand on."""
-
-    specularities: list[Specularity]
-    detection: Detection
-
-
-class Specularities(list[Specularity]):
-    """The specularities found in a frame, the brightest first, with how the frame was taken.
-
-    Attributes
-    ----------
-    detection : Detection
-        What the detector found, with highlights of other kinds and the view where it judges them.
-    choices : Choices
-        Encoding, detector, smoothing, estimators and priors; `choices.inferred` names those that nobody told.
-    """
-
-    def __init__(self, made: Reconstruction, choices: Choices) -> None:
-        super().__init__(made.specularities)
-        self.detection, self.choices = made.detection, choices
 
 
 def reconstruct(
@@ -147,6 +105,15 @@ def reconstruct(
     InputError
         If the frame is no image, differs in size from the camera's calibration, or holds NaN, infinity or integers of
         another type, whose range nobody knows; if an argument is of the wrong kind or out of range.
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:120, :160] + 0.5
+    >>> frame = np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 200).astype(np.float32)
+    >>> found = simtest.reconstruct(frame, 60.0)
+    >>> len(found), found.choices.detector
+    (1, 'peaks')
     """
     if isinstance(camera, int | float) and not isinstance(camera, bool):
         height, width = image_size(frame)

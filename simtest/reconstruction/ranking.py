@@ -18,7 +18,7 @@ and `circle_pose` last, which takes a curved surface for a plane."""
 
 def deviation_deg(estimate: Estimate) -> float | None:
     """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
-    return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
+    return estimate.deviation_deg
 
 
 @dataclass(frozen=True)

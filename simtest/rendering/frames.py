@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.short_repr import short_repr
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class Radiance:
     specular: Image
     diffuse: Image
     indirect: Image
+
+    __repr__ = short_repr
 
     @property
     def total(self) -> Image:
@@ -84,6 +87,8 @@ class Labels:
     instance: npt.NDArray[np.int32]
     face: npt.NDArray[np.int32]
 
+    __repr__ = short_repr
+
     @property
     def mask(self) -> Mask:
         """Where there is a surface, shape (H, W)."""
@@ -109,6 +114,8 @@ class Frame:
 
     radiance: Radiance
     labels: Labels
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)
@@ -157,6 +164,8 @@ class TruthMaps:
     mask: Mask
     instrument: npt.NDArray[np.uint8]
 
+    __repr__ = short_repr
+
     @property
     def larger_curvature(self) -> Array:
         """Principal curvature of larger size, 1/mm, shape (H, W)."""
@@ -183,6 +192,8 @@ class MisfitMaps:
     fine: Image
     base: Image
     margin: int
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)
@@ -231,6 +242,8 @@ class HighlightPoint:
     kd_max_base: float
     pool: bool
     hidden: bool = False
+
+    __repr__ = short_repr
 
     @property
     def min_gain(self) -> float:

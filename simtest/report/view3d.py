@@ -15,10 +15,14 @@ from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
 from simtest.runtime.arrays import Array, IntArray, Mask
 
+MARGIN = {"l": 0, "r": 0, "t": 0, "b": 76}  # px; the legend stands below the scene, not on it
 _GRID, _NORMALS = 72, 9  # samples of the surface along the longer side, and of the normals that are drawn all over it
 _OCCLUSION = 1.25  # factor between the distances of neighbouring samples beyond which there is an edge
+TRUE_COLOUR = "#C9A800"
+BUTTONS = {"font": {"color": "#1b1f24"}, "bgcolor": "#e9ecf0", "bordercolor": "#7d828a"}
+"""Look of the buttons that choose the surface's colours, readable on light and on dark."""
 _TRUE, _AT_HIGHLIGHT, _SIGHTLINE = "true normals", "true normal at the highlight", "sightline from the camera"
-_COLOURS = {_TRUE: "#5E8FBF", _SIGHTLINE: NEUTRAL, _AT_HIGHLIGHT: "#C9A800"}
+_COLOURS = {_TRUE: "#5E8FBF", _SIGHTLINE: NEUTRAL, _AT_HIGHLIGHT: TRUE_COLOUR}
 CURVATURE_COLOURS = ("#053061", "#2166ac", "#4393c3", "#92c5de", "#d1e5f0", "#f7f7f7", "#fddbc7", "#f4a582", "#d6604d",
                      "#b2182b", "#67001f")  # fmt: skip
 """From concave to convex: blue to red."""
@@ -168,15 +172,15 @@ def view_json(data: View3D) -> PlotlyJson:
         "intensity": rounded(np.sqrt(data.intensity)), "cmin": -0.35, "cmax": 1, "colorscale": "Greys",
         "showscale": False, "lighting": {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0, "roughness": 1.0},
     }  # fmt: skip
-    lines = [_lines_json(part) for part in data.segments]
+    lines = [lines_json(part) for part in data.segments]
     points = [
-        _scatter_json(name, positions, "markers") | {"marker": {"size": 4, "color": colour, "symbol": symbol}}
+        scatter_json(name, positions, "markers") | {"marker": {"size": 4, "color": colour, "symbol": symbol}}
         for (name, positions, colour), symbol in zip(data.points, ("diamond", "circle"), strict=False)
     ]
     axes = {f"{a}axis": {"title": {"text": f"{a} ({data.unit})"}, "nticks": 5} for a in "xyz"}
     camera = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}}
     made: PlotlyJson = {"height": data.height, "scene": {"aspectmode": "data", "camera": camera, **axes},
-                        "dragmode": "orbit", "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}  # fmt: skip
+                        "dragmode": "orbit", "margin": MARGIN}  # fmt: skip
     if data.curvature is None:
         return {"data": [mesh | picture, *lines, *points], "layout": made}
     title = f"curvature of<br>larger size (1/{data.unit}),<br>convex positive"
@@ -193,16 +197,18 @@ def view_json(data: View3D) -> PlotlyJson:
         for name, which in (("curvature", [False, True]), ("picture", [True, False]))
     ]
     made["updatemenus"] = [{"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1,
-                            "xanchor": "left", "yanchor": "top", "font": {"color": "#1b1f24"}}]  # fmt: skip
+                            "xanchor": "left", "yanchor": "top", **BUTTONS}]  # fmt: skip
     return {"data": [mesh | picture | {"visible": False}, mesh | curved, *lines, *points], "layout": made}
 
 
-def _scatter_json(name: str, points: Array, mode: str) -> PlotlyJson:
+def scatter_json(name: str, points: Array, mode: str) -> PlotlyJson:
+    """Return plotly's trace of points, shape (n, 3), or of lines through them; NaN parts lines."""
     x, y, z = (rounded(side) for side in points.T)
     return {"type": "scatter3d", "x": x, "y": y, "z": z, "mode": mode, "name": escape(name), "hoverinfo": "name"}
 
 
-def _lines_json(part: Segments) -> PlotlyJson:
+def lines_json(part: Segments) -> PlotlyJson:
+    """Return plotly's trace of line segments."""
     gaps = np.full_like(part.start, np.nan)
     points = np.stack([part.start, part.end, gaps], axis=1).reshape(-1, 3)
-    return _scatter_json(part.name, points, "lines") | {"line": {"color": part.colour, "width": part.width}}
+    return scatter_json(part.name, points, "lines") | {"line": {"color": part.colour, "width": part.width}}

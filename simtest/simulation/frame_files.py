@@ -18,6 +18,7 @@ from simtest.runtime.machine_errors import write_error
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
+from simtest.simulation.preview import preview
 from simtest.spec import Scene, calibration_toml, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
 
@@ -25,6 +26,8 @@ FIELDS = {
     "frame.png": "sRGB-encoded picture of the sensor's frame, clipped to full scale",
     "calibration.toml": "what reconstruction is told of frame.png: simtest reconstruct frame.png --camera "
     "calibration.toml",
+    "preview.jpg": "the frame for the eye, exposed for the surface, with highlights clipped; a surface without diffuse "
+    "light is shown as matt tissue; no data",
     "radiance.exr": "linear radiance, power per steradian over mm^2",
     "depth_mm": "distance along the ray from the camera centre, mm; NaN off the surface, as in all fields below",
     "position_mm": "surface point, camera frame (x right, y down, z forward), mm",
@@ -64,12 +67,12 @@ MOTION_FIELD = (
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml and calibration.toml.
+    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml, calibration.toml and preview.jpg.
 
     The folder is made if need be; `InputError` is raised if it cannot be written,
     `SimtestError` if its disk is full. Returns the files.
     """
-    names = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml")
+    names = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml", "preview.jpg")
     files = [out / name for name in names]
     calibration = calibration_toml(picture_calibration(frame.calibration, frame.scene.sensor), _note(frame.scene))
     make_folder(out)
@@ -80,9 +83,18 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
         write_json(files[3], _description(frame))
         write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
         write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
+        write_atomically(files[6], lambda part: part.write_bytes(_preview_jpeg(frame)))
     except OSError as error:
         raise write_error(error, out) from error
     return files
+
+
+def _preview_jpeg(frame: LabelledFrame) -> bytes:
+    """Encode the preview as JPEG."""
+    # OpenCV wants blue first.
+    ok, encoded = cv2.imencode(".jpg", preview(frame)[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    assert ok
+    return bytes(encoded)
 
 
 def _png_bits(sensor: Sensor) -> int:

@@ -8,6 +8,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.runtime.arrays import Array, Image
+from simtest.runtime.short_repr import short_repr
 from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -45,6 +46,14 @@ class LabelledFrame:
         Mitsuba variant.
     calibration : Calibration
         What reconstruction is told of camera, sensor, lights, distance and lobe.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> frame = simtest.render("sphere", width=96, height=96)
+    >>> found = simtest.reconstruct(frame.image, frame.calibration)
+    >>> float(found[0].estimates["cone_axis"].normal @ frame.highlights[0].normal) > 0.999
+    True
     """
 
     scene: Scene
@@ -59,6 +68,22 @@ class LabelledFrame:
     world_from_camera: Array
     variant: str
     calibration: Calibration
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the lit surface with its highlights, and what was rendered."""
+        from simtest.pages.notebook import note_html, picture_html
+        from simtest.simulation.preview import preview
+
+        isolated = sum(truth.isolated for truth in self.highlights)
+        what = "isolated highlight" if isolated == 1 else "isolated highlights"
+        text = (
+            f"{self.scene.name}: {self.scene.surface.type}, {self.scene.reflectance.type}; "
+            f"{self.camera.width} x {self.camera.height} px; {isolated} {what}. "
+            "Exposed for the eye; `image` holds the data."
+        )
+        return picture_html(preview(self), text) + note_html(text)
 
 
 def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:

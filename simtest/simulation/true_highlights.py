@@ -15,6 +15,7 @@ from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Image, IntArray, Mask
 from simtest.runtime.files import Json
+from simtest.runtime.short_repr import short_repr
 
 Pixel = tuple[int, int]
 """Row and column."""
@@ -45,6 +46,8 @@ class TrueHighlight(HighlightPoint):
     why_not: str
     radius_px: float = math.nan
     cloud: int | None = None
+
+    __repr__ = short_repr
 
     @property
     def isolated(self) -> bool:

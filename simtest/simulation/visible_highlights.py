@@ -12,6 +12,7 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.runtime.files import Json
+from simtest.runtime.short_repr import short_repr
 from simtest.simulation.true_highlights import TrueHighlight
 
 SADDLE = 0.8
@@ -67,6 +68,8 @@ class VisibleHighlight:
     cloud: int | None
     glints: tuple[int, ...]
     instrument: int | None = None
+
+    __repr__ = short_repr
 
     @property
     def radius_px(self) -> float:

@@ -29,6 +29,15 @@ def load_calibration(path: str | Path) -> Calibration:
     ------
     InputError
         If the file is missing or malformed.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+    >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
+    >>> simtest.load_calibration(path).camera.width
+    640
     """
     path = Path(path)
     # camera
@@ -61,6 +70,15 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     ------
     InputError
         If the calibration holds what no file states (such as a log-uniform distance), or the file cannot be written.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+    >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
+    >>> simtest.load_calibration(path).camera.width
+    640
     """
     path = Path(path)
     if not isinstance(calibration, Calibration):

@@ -186,6 +186,15 @@ def load_camera(path: str | Path) -> Camera:
     ------
     InputError
         If the file is missing or malformed, or describes a lens that simtest does not know.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "camera.toml"
+    >>> simtest.save_camera(simtest.Camera.from_fov(70.0, 640, 480), path)
+    >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
+    True
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -237,6 +246,15 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     ------
     InputError
         If format and suffix do not fit, the format cannot hold the camera, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import simtest, tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "camera.toml"
+    >>> simtest.save_camera(simtest.Camera.from_fov(70.0, 640, 480), path)
+    >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
+    True
     """
     path = Path(path)
     if not isinstance(camera, Camera):

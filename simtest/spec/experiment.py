@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.resources import find
+from simtest.runtime.short_repr import short_repr
 from simtest.spec.spec_model import Name, Spec, load
 
 LawName = Literal[
@@ -52,6 +53,9 @@ class Group(Spec):
         description="count isolated highlights only (theory.md section 6); false: every point where N bisects L and V",
     )
 
+    __repr__ = short_repr
+    __str__ = short_repr
+
     @model_validator(mode="after")
     def _equal_lengths(self) -> "Group":
         for table in (*self.sweep, *self.pool):
@@ -66,7 +70,15 @@ class Group(Spec):
 
 
 class Experiment(Spec):
-    """A validation experiment."""
+    """A validation experiment.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> experiment = simtest.load_experiment("overview")
+    >>> experiment.name, "cone_axis" in experiment.estimators
+    ('overview', True)
+    """
 
     name: Name
     title: str = ""
@@ -75,6 +87,9 @@ class Experiment(Spec):
     seed: int = Field(0, ge=0, lt=2**63)
     estimators: tuple[str, ...] = Field(("circle_pose", "brightest_point", "cone_axis"), min_length=1)
     groups: tuple[Group, ...] = Field(min_length=1)
+
+    __repr__ = short_repr
+    __str__ = short_repr
 
 
 _EXPERIMENT_KEYS = frozenset({"realisations", "seed", "estimators", "title", "description"})
@@ -95,6 +110,12 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     ------
     InputError
         If the file is missing or malformed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.load_experiment("overview", {"realisations": 3}).realisations
+    3
     """
     path = find(name, "scenes", "experiments")
     # The experiment's own keys; all others are keys of the scenes.

@@ -11,6 +11,7 @@ from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find
+from simtest.runtime.short_repr import short_repr
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.instrument import Instrument
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
@@ -68,7 +69,15 @@ class KnownSpec(Spec):
 
 
 class Scene(Spec):
-    """Everything that determines a rendered frame."""
+    """Everything that determines a rendered frame.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> scene = simtest.load_scene("cylinder")
+    >>> scene.surface.radius_mm, scene.reflectance.exponent
+    (10.0, 50.0)
+    """
 
     name: str = Field("scene", min_length=1, max_length=80)
     surface: Surface
@@ -81,6 +90,9 @@ class Scene(Spec):
     instruments: tuple[Instrument, ...] = Field(
         (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
     )
+
+    __repr__ = short_repr
+    __str__ = short_repr
 
     @property
     def shown_instruments(self) -> dict[int, Instrument]:
@@ -200,6 +212,12 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     ------
     InputError
         If the file is missing or malformed.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> simtest.load_scene("cylinder", {"surface.radius_mm": 5.0}).surface.radius_mm
+    5.0
     """
     path = find(name, "scenes")
     data = replace_values(Scene, read_toml(path), settings or {}, str(path))

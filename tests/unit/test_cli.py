@@ -245,7 +245,15 @@ def frames(tmp_path_factory):
     for process, name in zip(children, ("first", "second"), strict=True):
         output, errors = process.communicate(timeout=120)
         assert (process.returncode, errors) == (0, "")
-        written = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml")
+        written = (
+            "frame.png",
+            "radiance.exr",
+            "truth.npz",
+            "frame.json",
+            "camera.toml",
+            "calibration.toml",
+            "preview.jpg",
+        )
         assert output.split() == [f"{name}/{file}" for file in written]
     return folder / "first", folder / "second"
 
@@ -260,6 +268,7 @@ def test_render_writes_its_files_with_the_documented_keys(frames):
         "frame.json",
         "camera.toml",
         "calibration.toml",
+        "preview.jpg",
     }
     assert (first / "frame.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     with np.load(first / "truth.npz", allow_pickle=False) as truth:

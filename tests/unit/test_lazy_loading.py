@@ -67,7 +67,7 @@ def test_a_name_loads_its_own_module_alone():
 @pytest.mark.render
 def test_a_finished_run_is_recognised_without_what_made_it(tmp_path):
     (tmp_path / "small.toml").write_text(EXPERIMENT)
-    page = simtest.validate(tmp_path / "small.toml", tmp_path / "run")
+    page = simtest.validate(tmp_path / "small.toml", tmp_path / "run").page
     before = page.stat().st_mtime_ns
     code = (
         "import contextlib, sys\nsys.argv = ['simtest', 'validate', *sys.argv[1:]]\n"

@@ -418,7 +418,15 @@ def test_known_emission_reads_back(tmp_path):
 def test_the_picture_of_a_plain_sensor_is_calibrated_too(tmp_path):
     frame = render(scene({"noise_sigma": 0.02}, size=80, focal=80.0))
     names = [path.name for path in write_frame(frame, tmp_path)]
-    assert names == ["frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml"]
+    assert names == [
+        "frame.png",
+        "radiance.exr",
+        "truth.npz",
+        "frame.json",
+        "camera.toml",
+        "calibration.toml",
+        "preview.jpg",
+    ]
     assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
     described = json.loads((tmp_path / "frame.json").read_text())
     assert "encoding" not in described

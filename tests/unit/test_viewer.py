@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.report.viewer import Content, make_content, save_screenshot, show, window
+from simtest.report.viewer import Content, make_content, save_screenshot, show, window, write_scene_page
+from simtest.report.viewer.web_page import errors_deg, scene_json
 from simtest.spec import load_scene
 
 SMALL = {"camera.width": 120, "camera.height": 120, "camera.fx": 120.0, "camera.fy": 120.0}
@@ -65,6 +66,40 @@ def test_content_survives_its_file(content, tmp_path):
     again = Content.load(tmp_path / "content.npz")
     np.testing.assert_array_equal(again.vertices, content.vertices)
     assert list(again.names) == list(content.names)
+
+
+@pytest.mark.render
+def test_the_page_of_a_scene_is_one_small_file(content, tmp_path):
+    write_scene_page(content, tmp_path / "scene.html", "sphere")
+    page = (tmp_path / "scene.html").read_text("utf-8")
+    assert len(page) < 3_000_000
+    assert "true normal" in page
+    drawn = scene_json(content)
+    lit, curved, *others = drawn["data"]
+    assert [trace["name"] for trace in others] == [
+        "field of view", "true normal", "cone_axis", "circle_pose", "brightest_point", "curved", "camera", "light",
+    ]  # fmt: skip
+    assert len(lit["vertexcolor"]) == len(lit["x"]) == len(content.vertices)
+    # The sphere's one curvature is not the end of the colours.
+    assert curved["cmax"] == pytest.approx(0.2 * 1.4, rel=1e-3)
+    errors = errors_deg(content)
+    assert max(errors["cone_axis"]) < 0.1
+    assert min(errors["circle_pose"]) > 10
+    with pytest.raises(InputError, match=r"must be \.html"):
+        write_scene_page(content, tmp_path / "scene.png", "sphere")
+    with pytest.raises(InputError, match="no such folder"):
+        write_scene_page(content, tmp_path / "nowhere" / "scene.html", "sphere")
+
+
+@pytest.mark.render
+def test_a_lit_surface_has_its_highlight(content):
+    assert content.lit.shape == content.vertices.shape
+    assert (content.lit >= 0).all()
+    assert (content.lit <= 1).all()
+    is_true = content.names == "true normal"
+    nearest = np.linalg.norm(content.vertices - content.starts[is_true][0], axis=1).argmin()
+    assert content.lit[nearest].min() > 0.95
+    assert np.median(content.lit[:, 0]) > np.median(content.lit[:, 2])
 
 
 @pytest.mark.extra

@@ -6,18 +6,23 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import Failure, InputError
+from simtest.pages.palette import estimator_order
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.report.view3d import grid_triangles
 from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.simulation.preview import coloured, expose, matt_light
 from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Scene
 
 GRID = 240  # samples of the visible surface along the longer side of the frame
+PAGE_GRID = 110  # the same of a page, which holds the samples as text
 FINE_GRID = 1000  # the same where relief or vessels are to be seen: they are as fine as a pixel
 BRIGHTEST = 0.9  # share of full scale that the brightest colours of tissue are shown with
 OCCLUSION = 1.15  # factor between the distances of neighbouring samples beyond which there is an edge
-CAMERA, TRUE = "camera", "true normal"
+CAMERA, TRUE, TRUE_BASE = "camera", "true normal", "true normal of the base"
+SHORTER = 0.11  # share of its length by which each estimator's line is shorter than that of the one before
 
 
 @dataclass(frozen=True)
@@ -29,8 +34,9 @@ class Content:
     curvature: Array  # of the base: principal one of larger size, 1/mm, convex to the camera positive, shape (V,)
     normal: Array  # unit normals of the fine surface, shape (V, 3), or (0, 3) without a relief
     colour: Array  # of the tissue, sRGB from 0 to 1, shape (V, 3), or (0, 3) without one
+    lit: Array  # the surface as an eye sees it under its lights, sRGB from 0 to 1, shape (V, 3)
     lights: Array  # shape (L, 3)
-    names: AnyArray  # `CAMERA`, `TRUE` or an estimator, shape (S,)
+    names: AnyArray  # `CAMERA`, `TRUE`, `TRUE_BASE` or an estimator, shape (S,)
     starts: Array  # shape (S, 3)
     ends: Array
 
@@ -45,14 +51,15 @@ class Content:
             return cls(**{field.name: archive[field.name] for field in fields(cls)})
 
 
-def make_content(scene: Scene, variant: str | None = None) -> Content:
+def make_content(scene: Scene, variant: str | None = None, grid: int | None = None) -> Content:
     """Render a scene, reconstruct the normals at its highlights, and gather what is shown.
 
+    The surface is sampled `grid` times along the longer side of the frame, by default as finely as it has to be seen.
     Raises `InputError` if the camera sees no surface, `BackendError` if the rendering backend cannot be used.
     """
     session = Session(scene, variant)
     seen = render_view(session, scene)
-    vertices, faces, curvature, normal, colour = _visible(session)
+    vertices, faces, curvature, normal, colour, lit = _visible(session, seen, grid)
     distance = np.linalg.norm(vertices, axis=1)
     near, reach = 0.5 * float(np.quantile(distance, 0.05)), 0.35 * float(np.median(distance))
 
@@ -64,21 +71,37 @@ def make_content(scene: Scene, variant: str | None = None) -> Content:
     segments = [(CAMERA, start, end) for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     segments += [(CAMERA, np.zeros(3), corner) for corner in corners]
 
-    # True normals are longer than the estimates', so that they show where these lie on them.
-    found = [truth for truth in seen.highlights if truth.isolated]
-    segments += [(TRUE, h.position, h.position + 1.3 * reach * h.normal) for h in found]
+    # True normals are the longest, and each estimator's are shorter than the one's before, so that all show.
+    segments += [(TRUE, h.position, h.position + 1.3 * reach * h.normal) for h in _true(seen)]
+    if seen.is_rough:
+        segments += [(TRUE_BASE, h.position, h.position + 1.3 * reach * h.normal) for h in seen.clouds]
     estimates = _estimates(session, seen)
-    segments += [(name, look, look + reach * normal) for name, look, normal in estimates]
+    length = {name: reach * (1 - SHORTER * i) for i, name in enumerate(estimator_order(n for n, _, _ in estimates))}
+    segments += [(name, look, look + length[name] * normal) for name, look, normal in estimates]
     names, starts, ends = zip(*segments, strict=True)
     lights = np.asarray(scene.rig.true_mm())
-    shown = (vertices, faces, curvature, normal, colour)
+    shown = (vertices, faces, curvature, normal, colour, lit)
     return Content(*shown, lights, np.array(names), np.array(starts), np.array(ends))
 
 
-def _visible(session: Session) -> tuple[Array, IntArray, Array, Array, Array]:
-    """Sample the visible surface; return vertices, faces, curvature, fine normals and colours (see `Content`)."""
+def estimators(content: Content) -> list[str]:
+    """Return the estimators whose normals a view shows, in the palette's order."""
+    return estimator_order(set(content.names.tolist()) - {CAMERA, TRUE, TRUE_BASE})
+
+
+def _true(seen: RenderedView) -> list[TrueHighlight]:
+    """Return the true highlights whose normals are shown: isolated ones, on a relief those that are alone in a spot."""
+    if not seen.is_rough:
+        return [truth for truth in seen.highlights if truth.isolated]
+    return [seen.highlights[spot.glints[0]] for spot in seen.visible_highlights if len(spot.glints) == 1]
+
+
+def _visible(
+    session: Session, seen: RenderedView, grid: int | None
+) -> tuple[Array, IntArray, Array, Array, Array, Array]:
+    """Sample the visible surface; return vertices, faces, curvature, normals, colours and light (see `Content`)."""
     relief, tissue = session.surface.relief is not None, session.scene.albedo
-    grid = FINE_GRID if relief or tissue else GRID
+    grid = grid or (FINE_GRID if relief or tissue else GRID)
     stride = max(1, -(-max(session.camera.width, session.camera.height) // grid))
     truth = session.truth(stride)
     position = np.asarray(truth.position, dtype=float)
@@ -95,7 +118,20 @@ def _visible(session: Session) -> tuple[Array, IntArray, Array, Array, Array]:
 
         albedo = make_pattern(session.surface, tissue).albedo(session.to_model(position[valid]))
         colour = _srgb(BRIGHTEST * albedo / np.quantile(albedo.max(axis=1), 0.99))
-    return position[valid], faces, curvature[valid], normal, colour
+    lit = _lit(session, seen, position[valid], np.asarray(truth.normal_base, dtype=float)[valid])
+    return position[valid], faces, curvature[valid], normal, colour, lit
+
+
+def _lit(session: Session, seen: RenderedView, points: Array, normals: Array) -> Array:
+    """Return the surface's light at points, as an eye sees it (`expose`), sRGB from 0 to 1, shape (V, 3)."""
+    height, width = seen.radiance.specular.shape[:2]
+    column, row = np.floor(session.camera.project(points)).astype(int).T
+    at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+    specular, own = seen.radiance.specular, seen.radiance.diffuse + seen.radiance.indirect
+    matt = matt_light(points, normals, np.asarray(seen.scene.rig.true_mm(), dtype=float))
+    return _srgb(
+        np.asarray(expose(coloured(specular)[at], coloured(own)[at], matt, np.ones(len(points), dtype=bool)), float)
+    )
 
 
 def _srgb(linear: Array) -> Array:

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.report.viewer.content import CAMERA, TRUE, Content
+from simtest.pages.palette import LIGHT, colours
+from simtest.report.viewer.content import CAMERA, TRUE, TRUE_BASE, Content, estimators
+from simtest.report.viewer.web_page import curvature_limit
 from simtest.runtime.files import write_atomically
 from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown
@@ -23,16 +25,22 @@ OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
 TIMEOUT_S = 180
 SIZE = (1280, 800)
-LINES = {CAMERA: ("black", 2), TRUE: ("black", 3),
-         "circle_pose": ("#d95f02", 6), "brightest_point": ("#7570b3", 6), "cone_axis": ("#1b9e77", 6)}  # fmt: skip
-"""Colour and width of lines."""
+PANEL = 0.26
+"""Share of the window's width for the legend, beside the scene."""
 
-PLAIN = {"ambient": 0.8, "diffuse": 0.2}
+INK, TRUE_INK, BASE_INK = "#3a4048", "#C9A800", "#8A7A2E"
+"""Colours of the camera and of the true normals."""
+
+PLAIN = {"ambient": 0.55, "diffuse": 0.5}
 MATT = {"ambient": 0.5, "diffuse": 0.5}
 ROUGH = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.5, "specular_power": 40.0}
 """Shading: of curvature, of colour, and of a relief, which shows by its glints."""
 
-OTHER, LIGHT = "#666666", "#f2c500"
+CURVATURE = "curvature (1/mm): principal one\nof larger size, of the base,\nconvex to the camera positive"
+
+ZOOM = 1.3
+"""Factor by which the scene is larger than VTK shows it."""
+
 DONE = "simtest view: drawn"
 
 
@@ -103,12 +111,15 @@ def _draw(arguments: list[str], environment: dict[str, str], timeout: float | No
 
 
 def _plot(content: Content, screenshot: str | None) -> None:
-    """Draw in this process."""
+    """Draw in this process: the scene, and beside it the legend, so that none covers the other."""
     import numpy as np
     import pyvista
 
-    plotter = pyvista.Plotter(off_screen=screenshot is not None, window_size=SIZE)
-    plotter.set_background("white")
+    plotter = pyvista.Plotter(
+        off_screen=screenshot is not None, window_size=SIZE, shape=(1, 2), col_weights=[1 - PANEL, PANEL], border=False
+    )
+    plotter.set_background("white", all_renderers=True)
+    plotter.subplot(0, 0)
     faces = np.column_stack([np.full(len(content.faces), 3), content.faces]).ravel()
     surface = pyvista.PolyData(content.vertices, faces)
     # The normals of the relief shade the surface; without one, VTK's own.
@@ -124,8 +135,9 @@ def _plot(content: Content, screenshot: str | None) -> None:
         actor = _add_curvature(plotter, surface, content, light, rough)
     if rough:
         actor.prop.interpolation = "Phong"
-    _add_lines(plotter, content)
+    legend = _add_lines(plotter, content)
     _move_viewer(plotter, content)
+    _add_legend(plotter, legend, None if coloured else actor.mapper)
     if screenshot is None:
         plotter.show(title="simtest view")
     else:
@@ -135,46 +147,62 @@ def _plot(content: Content, screenshot: str | None) -> None:
 
 def _add_curvature(plotter: Any, surface: Any, content: Content, light: dict[str, float], rough: bool) -> Any:
     """Add the surface coloured by curvature; return its actor."""
-    import numpy as np
-
     surface["curvature"] = content.curvature
-    # A few sharp edges must not take all the colours.
-    limit = max(float(np.quantile(np.abs(content.curvature[np.isfinite(content.curvature)]), 0.97)), 1e-4)
+    limit = curvature_limit(content.curvature)
     return plotter.add_mesh(
         surface, scalars="curvature", cmap="RdBu_r", clim=(-limit, limit), nan_color="grey", smooth_shading=not rough,
-        **light,
-        scalar_bar_args={"title": "curvature of larger size (1/mm), convex positive", "color": "black",
-                         "vertical": False, "fmt": "%.3g", "n_labels": 5, "title_font_size": 18, "label_font_size": 15,
-                         "background_color": "white", "fill": True, "width": 0.5, "position_x": 0.25,
-                         "position_y": 0.02},
+        show_scalar_bar=False, **light,
     )  # fmt: skip
 
 
-def _add_lines(plotter: Any, content: Content) -> None:
-    """Add camera, lights and normals, with a legend."""
+def _add_lines(plotter: Any, content: Content) -> list[tuple[str, str]]:
+    """Add camera, lights and normals; return their names and colours."""
     import numpy as np
     import pyvista
 
-    legend: list[tuple[str, str]] = []
-    for name in dict.fromkeys(content.names.tolist()):
+    names = estimators(content)
+    palette = {CAMERA: INK, TRUE: TRUE_INK, TRUE_BASE: BASE_INK, **colours(names)}
+    # The shorter lines are the wider ones, so that all show where they lie on each other.
+    widths = {CAMERA: 2, TRUE: 3, TRUE_BASE: 3, **{name: 5 + 2 * i for i, name in enumerate(names)}}
+    legend = []
+    for name, colour in palette.items():
         own = content.names == name
-        points = np.stack([content.starts[own], content.ends[own]], axis=1).reshape(-1, 3)
-        colour, width = LINES.get(name, (OTHER, 6))
-        plotter.add_mesh(pyvista.line_segments_from_points(points), color=colour, line_width=width)
-        legend.append((name, colour))
-    plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
-    legend.insert(1, ("light", LIGHT))
-    plotter.add_legend([list(entry) for entry in legend], bcolor="white", border=True, size=(0.16, 0.032 * len(legend)))
+        if own.any():
+            points = np.stack([content.starts[own], content.ends[own]], axis=1).reshape(-1, 3)
+            plotter.add_mesh(pyvista.line_segments_from_points(points), color=colour, line_width=widths[name])
+            legend.append((name, colour))
+    if len(content.lights):
+        plotter.add_mesh(pyvista.PolyData(content.lights), color=LIGHT, point_size=14, render_points_as_spheres=True)
+        legend.insert(1, ("light", LIGHT))
+    return legend
+
+
+def _add_legend(plotter: Any, legend: list[tuple[str, str]], mapper: Any) -> None:
+    """Write the names in a column beside the scene, and the colours of curvature below them."""
+    plotter.subplot(0, 1)
+    top = 0.93
+    for name, colour in legend:
+        plotter.add_text("===", position=(0.02, top), viewport=True, font_size=11, color=colour)
+        plotter.add_text(name, position=(0.2, top), viewport=True, font_size=10, color="black")
+        top -= 0.055
+    if mapper is not None:
+        plotter.add_scalar_bar(
+            mapper=mapper, title="", color="black", vertical=True, fmt="%.3g", n_labels=5,
+            title_font_size=16, label_font_size=14, position_x=0.05, position_y=0.06, width=0.25, height=0.4,
+        )  # fmt: skip
+        plotter.add_text(CURVATURE, position=(0.02, 0.49), viewport=True, font_size=8, color="black")
 
 
 def _move_viewer(plotter: object, content: Content) -> None:
-    """Look from behind the camera and above it, at a point between it and the middle of what it sees."""
+    """Look from behind the camera and above it, at all that is shown."""
     import numpy as np
 
     middle = np.median(content.vertices, axis=0)
     size = float(np.linalg.norm(middle))
     viewer, target = (1.2 * size, -1.0 * size, -1.6 * size), (0.55 * middle).tolist()
     plotter.camera_position = [viewer, target, (0.0, -1.0, 0.0)]  # type: ignore[attr-defined]
+    plotter.reset_camera()  # type: ignore[attr-defined]
+    plotter.camera.zoom(ZOOM)  # type: ignore[attr-defined]
     plotter.reset_camera_clipping_range()  # type: ignore[attr-defined]
 
 
