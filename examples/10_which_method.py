@@ -37,7 +37,6 @@ groups = [
 experiment = chosen.out / "10_situations.toml"
 experiment.write_text(head + "".join(groups))
 simtest.validate(experiment, chosen.out / "10_run")  # also writes 10_run/index.html, the page
-
 rows = pl.read_parquet(chosen.out / "10_run" / "results.parquet").filter(pl.col("true_id").is_not_null())
 # A highlight without an answer counts as 90 deg, so that refusing is no way to a small mean.
 error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg")).otherwise(90.0).mean()

@@ -10,11 +10,12 @@ mpl.use("Agg")  # files only: no example opens a window
 import matplotlib.pyplot as plt
 import numpy as np
 
-COLOURS = {
-    "circle_pose": "#D55E00", "brightest_point": "#009E73", "cone_axis": "#0072B2", "curved": "#56B4E9",
-    "bisector": "#CC79A7", "photometric": "#E69F00", "cloud": "#A6761D", "centroid": "#7A8B99",
-}  # fmt: skip
-"""Of the estimators: Okabe and Ito's colours, which colour-blind readers tell apart."""
+from simtest.pages.style import colours
+
+# The colours that the package's own figures give the estimators; not a public name, so take your own in your scripts.
+COLOURS = colours(
+    ("circle_pose", "brightest_point", "cone_axis", "curved", "bisector", "photometric", "cloud", "centroid")
+)
 
 plt.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 100})
 
