@@ -1,8 +1,10 @@
 """Prints which method to use, and where it breaks, at the end of `simtest validate`."""
 
 import itertools
+import json
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,7 +22,7 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
     Parameters
     ----------
     run : Path
-        Folder with results.parquet and summary.json.
+        Folder with its page, index.html, which shows the same table.
     console : rich.console.Console, optional
         Where to; default the standard output, as wide as the terminal, else `WIDTH` columns.
     """
@@ -28,15 +30,12 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from simtest.report.guide_text import HEADS, guide_rows, shared_sentence
-    from simtest.report.run_folder import read_guide
-
     if console is None:
         console = Console(emoji=False, highlight=False)
         if not console.is_terminal:
             console = Console(emoji=False, highlight=False, width=WIDTH)
-    guide = read_guide(run)
-    rows = guide_rows(guide)
+    guide = _read_rows(run / "index.html")
+    rows = guide["rows"]
     if not rows:
         console.print("No true highlight: there is nothing to compare the methods by.")
         return
@@ -44,22 +43,30 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
 
     def table(show_header: bool) -> Table:
         made = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_header=show_header)
-        for head, width in zip(HEADS, (*_WIDTHS, room), strict=True):
+        for head, width in zip(guide["heads"], (*_WIDTHS, room), strict=True):
             made.add_column(head, width=width, overflow="fold", header_style="bold")
         return made
 
     console.print(table(True))
-    for circumstances, group in itertools.groupby(rows[:MOST_ROWS], lambda row: row.circumstances):
+    for circumstances, group in itertools.groupby(rows[:MOST_ROWS], lambda row: row["circumstances"]):
         if circumstances:
             console.print(f"[bold]{escape(circumstances)}[/bold]")
         # A table of its own for each kind of light, noise and relief, all with the same columns.
         part = table(False)
         for row in group:
-            tied = f"tied: {', '.join(row.ties)}" if row.ties else ""
-            best = "\n".join(text for text in (row.best or "none", tied) if text)
-            part.add_row(*map(escape, (row.surface, best, row.error.replace(" (", "\n("), row.answered, row.breaks)))
+            tied = f"tied: {', '.join(row['ties'])}" if row["ties"] else ""
+            best = "\n".join(text for text in (row["best"] or "none", tied) if text)
+            error = row["error"].replace(" (", "\n(")
+            part.add_row(*map(escape, (row["surface"], best, error, row["answered"], row["breaks"])))
         console.print(part)
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more situations, on the page")
-    if shared := shared_sentence(guide):
-        console.print(escape(shared))
+    if guide["shared"]:
+        console.print(escape(guide["shared"]))
+
+
+def _read_rows(page: Path) -> dict[str, Any]:
+    """Read the rows that a page shows, without what computed them."""
+    found = re.search(r'<script type="application/json" id="guide-rows">(.*?)</script>', page.read_text("utf-8"), re.S)
+    rows: dict[str, Any] = json.loads(found[1]) if found else {"rows": []}
+    return rows

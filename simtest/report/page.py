@@ -6,16 +6,18 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from simtest.estimators.descriptions import DESCRIPTIONS
 from simtest.pages import chart_web, pixels, style
-from simtest.pages.html import environment
+from simtest.pages.html import environment, script_json
 from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.error_laws import is_tested, law_results, sentence
 from simtest.report.figure_files import THREADS, FigureFiles
 from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
-from simtest.report.guide_text import RULES, WORDS, guide_rows, method_rows, shared_sentence
+from simtest.report.guide_text import HEADS, RULES, WORDS, guide_rows, method_rows, shared_sentence
 from simtest.report.heat_maps import heat_charts, heat_maps
 from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
@@ -99,11 +101,15 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
 def _guide(run: Run) -> dict[str, Any]:
     """Return what the guide's template needs."""
     guide = run.guide
-    groups = itertools.groupby(guide_rows(guide), lambda row: row.circumstances)
+    rows, shared = guide_rows(guide), shared_sentence(guide)
+    groups = itertools.groupby(rows, lambda row: row.circumstances)
+    # The terminal prints the same rows, from the page: a finished run needs nothing of what computes them.
+    told = Markup(script_json({"heads": HEADS, "rows": [vars(row) for row in rows], "shared": shared}))  # nosec B704
     return {
+        "guide_json": told,
         "guide": [(circumstances, list(rows)) for circumstances, rows in groups],
         "methods": method_rows(guide, DESCRIPTIONS | run.summary.estimators),
-        "shared": shared_sentence(guide), "left_out": guide.left_out, "rules": RULES, "words": WORDS,
+        "shared": shared, "left_out": guide.left_out, "rules": RULES, "words": WORDS,
     }  # fmt: skip
 
 

@@ -250,12 +250,6 @@ def read_run(path: Path) -> Run:
     return Run(path, results, summary.experiments or {}, flattened(summary.run or {}), gallery, len(files))
 
 
-def read_guide(path: Path) -> Guide:
-    """Read which method to use from a run folder, without its gallery; raises `InputError` as `read_run`."""
-    results, summary = _read_results(path / "results.parquet"), _read_summary(path / "summary.json")
-    return Run(path, results, summary.experiments or {}).guide
-
-
 def varied(items: list[GalleryItem]) -> tuple[GalleryItem, ...]:
     """Order frames so that the first ones show every label once: of each label the middle one, then the others."""
     by_label: dict[str, list[GalleryItem]] = {}

@@ -11,8 +11,9 @@ from scipy.stats import binom
 from test_report import make_run
 
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
+from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows
-from simtest.report.run_folder import read_guide
+from simtest.report.run_folder import read_run
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
 from simtest.validation.conditions import conditions, conditions_of
@@ -208,6 +209,7 @@ def printed(run, width, terminal):
 
     from simtest.cli.guide_table import print_guide
 
+    write_report(run)
     file = io.StringIO()
     print_guide(run, Console(file=file, width=width, force_terminal=terminal, emoji=False, highlight=False))
     return file.getvalue()
@@ -218,7 +220,7 @@ def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_l
     text = printed(run, 80, terminal=False)
     assert "\x1b" not in text
     assert all(len(line.rstrip()) <= 80 for line in text.splitlines())
-    guide = read_guide(run)
+    guide = read_run(run).guide
     for row in guide_rows(guide):
         assert row.best in text
     # A line a situation at least, and no line for each of the run's rows.

@@ -1,6 +1,7 @@
 """The report of a run, on small synthetic run folders."""
 
 import base64
+import itertools
 import json
 import re
 import zlib
@@ -16,9 +17,11 @@ from simtest.geometry.camera import Camera
 from simtest.pages.axes import Axis
 from simtest.pages.style import colours, number, rgb
 from simtest.report import write_report
+from simtest.report.curves import Curve
 from simtest.report.heat_maps import heat_maps, heat_range
 from simtest.report.run_folder import read_run
-from simtest.report.series import law_misses, line_figures
+from simtest.report.series import _join_mark, law_misses, line_chart, line_figures
+from simtest.report.surface_errors import _apart
 from simtest.report.view3d import CURVATURE_COLOURS, view_3d, view_json
 from simtest.report.view3d_picture import view_picture
 from simtest.validation import laws
@@ -497,3 +500,32 @@ def test_the_3d_view_in_a_file_shows_the_surface_in_its_colours(tmp_path):
     for part in view.segments:
         assert (np.abs(curved.astype(int) - rgb(part.colour)).max(axis=-1) < 60).any(), part.name
     np.testing.assert_array_equal(curved, view_picture(view))
+
+
+def test_no_chord_joins_unlike_settings(tmp_path):
+    """Lines end where curvature or offset changes sign or becomes 0, and none runs beside a law."""
+    for figure in line_figures(read_run(make_run(tmp_path, "overview", items=0))):
+        shades = colours(figure.estimators)
+        lines = [mark for mark in line_chart(figure, shades).panels[0].marks if mark.line == "solid"]
+        for line in lines:
+            x = np.asarray(line.x)
+            assert all(np.sign(a) == np.sign(b) for a, b in itertools.pairwise(x) if np.isfinite([a, b]).all())
+        # As many joins as joined curves without a visible law.
+        free = [c for c in figure.curves if c.joined and not np.isfinite(figure.y.visible(c.law_y)).any()]
+        assert len(lines) == len(free)
+
+
+def test_gaps_stand_between_kinds():
+    x = np.array([-0.5, -0.1, 0.0, 0.1, 0.5])
+    blank = np.empty(0)
+    curve = Curve("cone_axis", "a", x, x + 2, x, x, x * np.nan, blank, blank, ("",) * 5, ("",) * 5, True)
+    mark = _join_mark(curve, colours(["cone_axis"]))
+    np.testing.assert_array_equal(mark.x, [-0.5, -0.1, np.nan, 0.0, np.nan, 0.1, 0.5])
+    np.testing.assert_array_equal(mark.y, [1.5, 1.9, np.nan, 2.0, np.nan, 2.1, 2.5])
+
+
+def test_a_surface_lit_from_both_sides_is_two():
+    rows = pl.DataFrame(
+        {"surface": ["plane", "plane", "tube"], "setting": ["a", "b", "c"], "eps_over_d": [0.0, 0.1, 0.1]}
+    )
+    assert _apart(rows)["surface"].to_list() == ["plane", "plane, offset", "tube"]
