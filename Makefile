@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV ?= .venv
 WORKERS ?= auto
 BIN := $(VENV)/bin
+RELEASE_PYTHONS ?= all
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo docs test test-all test-ci bench bench-cycles lint audit hashed-constraints format clean
+.PHONY: help demo docs docs-commands test test-all test-ci examples bench bench-cycles lint audit hashed-constraints \
+	release-check format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
+	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
 	@echo "make test      fast tests (under 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-ci   fast tests and those of all extras, which it installs"
@@ -17,6 +20,8 @@ help:
 	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
 	@echo "make audit     risky calls and known vulnerabilities (bandit, pip-audit), where these can run"
+	@echo "make examples  run all examples, renew their pictures in the manual (under 2 minutes of processor time)"
+	@echo "make release-check  wheel and sdist into dist/, each Python from 3.11 on tried; RELEASE_PYTHONS=this: one"
 	@echo "make hashed-constraints  constraints.txt with the hashes of this platform's files, for a release"
 
 $(BIN)/python:
@@ -59,6 +64,9 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx --fail-on-warning --quiet --builder html --doctree-dir build/doctrees docs build/manual
 	$(BIN)/python -m studies.manual links build/manual
 
+docs-commands: $(VENV)/.docs
+	$(BIN)/python -m studies.manual commands $(QUICK) $(PAGES)
+
 test: $(VENV)/.tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
 
@@ -95,6 +103,18 @@ hashed-constraints: $(VENV)/.installed
 format: $(VENV)/.tests
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+# The pictures of the manual are those that the examples make.
+examples: $(VENV)/.installed
+	for script in examples/[0-9]*.py; do $(BIN)/python $$script || exit 1; done
+	for script in examples/[0-9]*.py; do \
+		name=$$(basename $$script .py); picture=$$(ls examples/output/$$name.*); \
+		cp $$picture docs/images/examples/$$(echo $$name | cut -c1-2).$${picture##*.}; \
+	done
+
+# Wheel and sdist, used outside the checkout in a fresh environment of each Python on the machine, or of this one alone.
+release-check: $(BIN)/python
+	$(BIN)/python .ci/release_check.py --pythons $(RELEASE_PYTHONS) $(RELEASE_OPTIONS)
 
 clean:
 	rm -rf $(VENV) $(VENV)-cycles $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

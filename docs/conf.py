@@ -36,5 +36,6 @@ html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["manual.css"]
 html_show_sphinx = False
+html_use_index = False
 html_copy_source = False
 html_theme_options = {"top_of_page_buttons": []}

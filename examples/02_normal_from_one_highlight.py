@@ -1,11 +1,11 @@
 """Estimate the normal at one highlight, and compare the estimators with the truth.
 
 The light is at the camera, so the normal at the BP points back along the sightline: all that an estimator must do is
-find the BP. `cone_axis` and `curved` find it from several isophotes (curves of equal brightness), `brightest_point` from
-the peak alone. `circle_pose` takes the isophote's shape for a tilted circle, and this surface is curved.
+find the BP. `cone_axis` and `curved` find it from several isophotes (curves of equal brightness), `brightest_point`
+from the peak alone. `circle_pose` takes the isophote's shape for a tilted circle, and this surface is curved.
 
-Picture: the highlight with its isophotes, and each estimator's error beside the uncertainty that it states. Takes 3 s of
-processor time.
+Picture: the highlight with its isophotes, and each estimator's error beside the uncertainty that it states. Takes 3 s
+of processor time.
 """
 
 import matplotlib.pyplot as plt
@@ -35,7 +35,7 @@ for name, result in spot.estimates.items():
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", width_ratios=(1, 1.4))
 left.imshow(grey(frame.image), cmap="gray", extent=(0, size, size, 0))
-for number, (isovalue, curve) in enumerate(spot.estimates["cone_axis"].contours(spot.patch)):
+for number, (_, curve) in enumerate(spot.estimates["cone_axis"].contours(spot.patch)):
     left.plot(*curve.T, color=COLOURS["cone_axis"], linewidth=1.2, label="" if number else "isophotes")
 left.plot(*truth.bp_px, "+", color="#D55E00", markersize=12, markeredgewidth=2, label="true BP")
 x, y, width, height = spot.region.box

@@ -1,8 +1,8 @@
 """Move the light away from the camera, and tell the estimators where it is.
 
-With the light beside the camera the highlight is no longer where the surface faces the camera. An estimator that reverses
-the sightline is then off by half the angle between light and camera, seen from the surface. `bisector` is told the light's
-position and the working distance, and takes the direction halfway between the two.
+With the light beside the camera the highlight is no longer where the surface faces the camera. An estimator that
+reverses the sightline is then off by half the angle between light and camera, seen from the surface. `bisector` is told
+the light's position and the working distance, and takes the direction halfway between the two.
 
 Picture: error against the light's offset, with the law. Takes 10 s of processor time.
 """

@@ -3,8 +3,8 @@
     python examples/07_picture_of_a_real_frame.py my_frame.png
 
 takes a PNG, JPEG, BMP or TIFF; FOV_DEG below must then be its camera's horizontal field of view. Without a picture, the
-example renders colon mucosa through the camera chain of an endoscope: mosaic, sharpening, JPEG. Only the field of view is
-told to the reconstruction; what it does not know widens the uncertainties that it states.
+example renders colon mucosa through the camera chain of an endoscope: mosaic, sharpening, JPEG. The reconstruction is
+told the field of view alone; what it does not know widens the uncertainties that it states.
 
 Picture: the frame with a needle at each isolated highlight. Wide bright patches are several highlights that touch: they
 carry no single normal and get none. Takes 9 s of processor time.
@@ -26,7 +26,7 @@ if chosen.picture is None:
     camera = {"camera.width": size[0], "camera.height": size[1], "camera.fx": size[0] / 2, "camera.fy": size[0] / 2}
     chain = {"sensor.preset": "colonoscope_hd", "sensor.coding": {"type": "jpeg", "quality": 90}}
     frame = simtest.render("tissue_colon", camera | chain | {"render.samples_per_pixel": 4})
-    chosen.picture = chosen.out / "07_frame.png"
+    chosen.picture = chosen.out / "07_rendered.png"
     Image.fromarray(np.round(255 * frame.image).astype(np.uint8)).save(chosen.picture)
 
 # 8-bit values are taken as sRGB, clipped at 255; a simtest.Calibration in place of the number tells more.

@@ -43,7 +43,7 @@ for name, found in normals.items():
     errors = [angle_deg(normal, base) for normal in found]
     print(f"{name}: {len(found)} normals, mean error against the base {np.mean(errors):.2f} deg")
 
-figure, (left, chart) = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
+figure, (left, chart) = plt.subplots(1, 2, figsize=(10, 4.9), layout="constrained")
 left.imshow(picture)
 left.plot(*frame.clouds[0].bp_px, "+", color="#D55E00", markersize=16, markeredgewidth=2.5, label="BP of the base")
 left.set(xlabel="x, px", ylabel="y, px", title="frame")
@@ -55,5 +55,5 @@ chart.plot(0, 0, "+", color="#D55E00", markersize=16, markeredgewidth=2.5, label
 chart.set(xlabel="angle from the base's normal, deg", ylabel="angle across, deg", title="estimated normals")
 chart.set_aspect("equal", adjustable="datalim")
 chart.grid(color="#E7E7E7")
-chart.legend(loc="upper right")
+figure.legend(*chart.get_legend_handles_labels(), loc="outside lower right", ncols=3)
 save(figure, chosen.out / "08_tissue_and_clouds.jpg")

@@ -33,7 +33,8 @@ for column, record in zip(axes.T, records, strict=False):
     bps = [highlight["bp_px"] for highlight in record["meta"]["highlights"]]
     column[0].plot(*np.transpose(bps), "+", color="#D55E00", markersize=10, markeredgewidth=2)
     depth = column[1].imshow(record["depth"], cmap="viridis", vmin=8, vmax=16, interpolation="nearest")
-    column[2].imshow((record["normal"] * [1, 1, -1] + 1) / 2, interpolation="nearest")  # x, y and -z from -1 to 1 as red, green and blue
+    # x, y and -z, each from -1 to 1, are shown as red, green and blue
+    column[2].imshow((record["normal"] * [1, 1, -1] + 1) / 2, interpolation="nearest")
     for axis in column:
         axis.set_xticks([])
         axis.set_yticks([])

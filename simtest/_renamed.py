@@ -1,4 +1,4 @@
-"""Names that the manual of the last release documented, for one release more: each warns and leads to the new one."""
+"""Names that the manual of 0.1 documented, for one release more: each warns and leads to the new one."""
 
 import sys
 import warnings
@@ -6,6 +6,9 @@ from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
+
+GONE = "0.3.0"
+"""Release without the old names."""
 
 MODULES = {
     "simtest.colour": "simtest.reconstruction",
@@ -72,7 +75,7 @@ def lookup(module: str, name: str, home: str | None = None) -> Any:
 
 
 def _warn(old: str, new: str) -> None:
-    warnings.warn(f"{old} is now {new}; the old name goes with the next release", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"{old} is now {new}; the old name goes in {GONE}", DeprecationWarning, stacklevel=3)
 
 
 def install() -> None:

@@ -33,7 +33,7 @@ Tile = tuple[str, str, dict[str, object]]
 
 ORGAN: dict[str, object] = {"sensor.exposure": "{average = 0.3}", "sensor.saturation": True, "sensor.noise_sigma": 0.01}
 
-POLYPS = "{polyps = [{along_mm = 60, around_deg = 90, height_mm = 9, width_mm = 8, neck_mm = 4}]}"
+POLYPS = "{polyps = [{along_mm = 60, around_deg = 90, height_mm = 7, width_mm = 6, neck_mm = 3}]}"
 
 SHEETS: dict[str, tuple[Tile, ...]] = {
     "surfaces": tuple((name, name, LIT) for name in ("plane", "cylinder", "sphere", "saddle")),

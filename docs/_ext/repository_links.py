@@ -6,6 +6,7 @@ stays a warning of MyST's.
 """
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -17,8 +18,28 @@ from sphinx.environment import BuildEnvironment
 FILES = "_files"
 """Folder of the site that holds the copies."""
 
-PAGES = {"CHANGELOG.md": "changes"}
-"""Pages that are made of files of the repository."""
+CHANGES = "changes.md"
+"""Page that is made of CHANGELOG.md."""
+
+OUTER = re.compile(r"\]\(((?:\.\./)+)([\w./-]+\.md)((?:#[\w-]*)?)\)")
+"""A link to Markdown in a folder above the page's."""
+
+
+def rewrite(app: Sphinx, name: str, source: list[str]) -> None:
+    """Point links to Markdown outside docs/, which MyST would look for among the pages, to a page or to the file."""
+    docs = Path(app.srcdir)
+    here = (docs / name).parent
+
+    def target(match: re.Match[str]) -> str:
+        up, path, anchor = match.groups()
+        file = (here / up / path).resolve()
+        if docs in file.parents or not file.exists():
+            return match[0]
+        if file == docs.parent / "CHANGELOG.md":
+            return f"]({os.path.relpath(docs / CHANGES, here)}{anchor})"
+        return f"](path:{up}{path})"
+
+    source[0] = OUTER.sub(target, source[0])
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element) -> nodes.Element | None:
@@ -32,8 +53,6 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nod
     if file.is_dir():
         return content
     name = file.relative_to(root).as_posix()
-    if name in PAGES:
-        return nodes.reference("", "", content, refuri=app.builder.get_relative_uri(page, PAGES[name]), internal=True)
     copied = Path(app.outdir) / FILES / name
     copied.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(file, copied)
@@ -42,6 +61,7 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nod
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Resolve what MyST could not."""
+    """Rewrite links before MyST reads them, and resolve what it could not."""
+    app.connect("source-read", rewrite)
     app.connect("missing-reference", resolve, priority=400)
     return {"parallel_read_safe": True, "parallel_write_safe": False}

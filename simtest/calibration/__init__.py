@@ -74,7 +74,7 @@ def __getattr__(name: str) -> Any:
     import warnings
 
     warnings.warn(
-        "simtest.calibration.Known is now simtest.calibration.Priors; the old name goes with the next release",
+        "simtest.calibration.Known is now simtest.calibration.Priors; the old name goes in 0.3.0",
         DeprecationWarning,
         2,
     )

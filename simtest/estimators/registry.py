@@ -37,7 +37,7 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
     if not callable(given):
         raise InputError(f"estimator {name!r}: {given!r} is not callable and has neither estimate nor estimate_frame")
     warnings.warn(
-        f"estimator {name!r} is a plain callable, which the next release refuses: give it a method "
+        f"estimator {name!r} is a plain callable, which 0.3.0 refuses: give it a method "
         "estimate(patch, camera, priors)", DeprecationWarning, stacklevel=3,
     )  # fmt: skip
     return PlainCallable(given)

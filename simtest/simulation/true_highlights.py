@@ -54,7 +54,7 @@ class TrueHighlight(HighlightPoint):
     @property
     def highlight(self) -> "TrueHighlight":
         """Itself: deprecated, from when the verdict stood around the highlight."""
-        warnings.warn("TrueHighlight.highlight is deprecated: use the highlight itself", DeprecationWarning, 2)
+        warnings.warn("TrueHighlight.highlight goes in 0.3.0: use the highlight itself", DeprecationWarning, 2)
         return self
 
     def to_json(self) -> dict[str, Json]:

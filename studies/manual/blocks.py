@@ -53,7 +53,7 @@ class Block:
     @property
     def lines(self) -> list[str]:
         """The commands of a shell block: comments and prompts taken off, continued lines joined."""
-        joined = re.sub(r"\\\n\s*", " ", self.code)
+        joined = re.sub(r"\s*\\\n\s*", " ", self.code)
         prompted = any(line.startswith("$ ") for line in joined.splitlines())
         # Where a session is shown, what has no prompt is output.
         kept = (line[2:] if prompted else line for line in joined.splitlines() if line.startswith("$ ") or not prompted)

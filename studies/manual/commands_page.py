@@ -1,4 +1,4 @@
-"""The page of commands, from the commands' own help."""
+"""The page of commands, from the commands' own help, and the page of the names that they take."""
 
 import inspect
 import re
@@ -6,6 +6,8 @@ import re
 from cyclopts import App
 
 from simtest.cli.commands import APP
+from simtest.cli.listing import HEADINGS, names_of
+from studies.manual.markdown import code, table
 
 OPENING = """# Commands
 
@@ -15,6 +17,15 @@ up).
 
 Exit codes: 0 done; 1 could not render, a full disk, or a command's own verdict; 2 bad input; 130 Ctrl-C; 143 SIGTERM.
 For `nightly`, 1 is a regression or an unexplained change, and whatever else went wrong is 2.
+
+[What is shipped](shipped.md) lists the names that commands take: scenes, experiments, datasets, profiles, estimators,
+detectors and presets.
+
+```{toctree}
+:hidden:
+
+shipped
+```
 
 """
 
@@ -62,3 +73,19 @@ def _section(text: str) -> str:
     if not further or not options:
         return text
     return f"{title}\n{usage}{fence}{head.rstrip()}\n\n{further}\n\n**{options}"
+
+
+SHIPPED = """# What is shipped
+
+The names that commands take, with a line about each; `simtest list` prints the same.
+
+"""
+
+
+def shipped_page() -> str:
+    """Return the page of names as Markdown."""
+    text = SHIPPED
+    for kind, use in HEADINGS.items():
+        rows = ((code(name), about) for name, about in names_of(kind).items())
+        text += f"## {kind.capitalize()}\n\nUsed {use}.\n\n{table(('name', 'about'), rows)}\n\n"
+    return text

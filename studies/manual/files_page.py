@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from docstring_parser import parse
 
@@ -14,6 +14,7 @@ from simtest.validation.column_meanings import MEANINGS
 from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import RunRecord
 from simtest.validation.statistics import Figures
+from studies.manual.markdown import code, table
 from studies.manual.tables import CONSTRAINTS, ESTIMATE, NORMALS, SPECULARITY
 
 PAGE = """# Files and columns
@@ -21,12 +22,6 @@ PAGE = """# Files and columns
 What the commands write, and what each column and key means. Lengths are in mm, pixels have their centres at
 integer + 0.5, and the camera frame has x to the right, y down and z forward. [Keys of the files](keys.md) lists what
 the commands read.
-
-```{toctree}
-:hidden:
-
-keys
-```
 
 ## A rendered frame
 
@@ -112,22 +107,20 @@ def files_page() -> str:
     """Return the page as Markdown."""
     meaning = ("key", "meaning")
     images = (
-        (_code(own.name), _code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.encoding)
+        (code(own.name), code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.encoding)
         for own in SAMPLE_FIELDS
     )
     made = {
-        "FRAME": _table(("file, array or key", "meaning"), _coded({**FIELDS, **INSTRUMENT_FIELDS})),
-        "NORMALS": _table(meaning, _coded(NORMALS)),
-        "SPECULARITY": _table(meaning, _coded(SPECULARITY)),
-        "ESTIMATE": _table(meaning, _coded(ESTIMATE)),
-        "CSV": ", ".join(_code(name) for name in COLUMNS),
-        "CONSTRAINTS": _table(
-            ("array", "shape", "meaning"), ((_code(name), *row) for name, row in CONSTRAINTS.items())
-        ),
-        "RESULTS": _table(("column", "type", "meaning"), _columns()),
+        "FRAME": table(("file, array or key", "meaning"), _coded({**FIELDS, **INSTRUMENT_FIELDS})),
+        "NORMALS": table(meaning, _coded(NORMALS)),
+        "SPECULARITY": table(meaning, _coded(SPECULARITY)),
+        "ESTIMATE": table(meaning, _coded(ESTIMATE)),
+        "CSV": ", ".join(code(name) for name in COLUMNS),
+        "CONSTRAINTS": table(("array", "shape", "meaning"), ((code(name), *row) for name, row in CONSTRAINTS.items())),
+        "RESULTS": table(("column", "type", "meaning"), _columns()),
         "RUN": _parameters(RunRecord),
         "FIGURES": _parameters(Figures),
-        "IMAGES": _table(("field", "member", "decoded", "meaning", "encoding"), images),
+        "IMAGES": table(("field", "member", "decoded", "meaning", "encoding"), images),
         "SAMPLES": _parameters(SampleRow),
         "HIGHLIGHTS": _parameters(HighlightRow),
     }
@@ -142,30 +135,14 @@ def _columns() -> Iterable[tuple[str, str, str]]:
             rows[-1][0].append(name)
         else:
             rows.append(([name], str(kind).lower(), MEANINGS[name]))
-    return [(_code(", ".join(names)), kind, line) for names, kind, line in rows]
+    return [(code(", ".join(names)), kind, line) for names, kind, line in rows]
 
 
-def _coded(table: Mapping[str, str]) -> Iterable[tuple[str, str]]:
-    return ((_code(names), line) for names, line in table.items())
+def _coded(lines: Mapping[str, str]) -> Iterable[tuple[str, str]]:
+    return ((code(names), line) for names, line in lines.items())
 
 
 def _parameters(record: type) -> str:
     """Return the table of a record's fields from its docstring, which a test compares with the fields."""
-    rows = [(_code(own.arg_name), own.description or "") for own in parse(inspect.getdoc(record) or "").params]
-    return _table(("key", "meaning"), rows)
-
-
-def _code(names: str) -> str:
-    return ", ".join(f"`{name}`" for name in names.split(", "))
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *([_cell(cell) for cell in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _cell(text: str) -> str:
-    """Return a cell on one line, its signs taken as they are where they are no code."""
-    parts = " ".join(text.split()).split("`")
-    parts[::2] = [re.sub(r"([|*$<])", r"\\\1", part) for part in parts[::2]]
-    return "`".join(parts)
+    rows = [(code(own.arg_name), own.description or "") for own in parse(inspect.getdoc(record) or "").params]
+    return table(("key", "meaning"), rows)

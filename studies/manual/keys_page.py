@@ -17,7 +17,11 @@ MODELS: dict[str, tuple[str, type[BaseModel]]] = {
 }  # fmt: skip
 """Kinds of files as `simtest schema` names them."""
 
-OPENING = """# Keys of the files
+OPENING = """---
+orphan: true
+---
+
+# Keys of the files
 
 Every key of every kind of file, with its type, range and default; `simtest schema KIND` prints the same as JSON. A key
 that is not listed here is refused. On the command line, `--set surface.radius_mm=5` sets the key `radius_mm` of the
@@ -47,11 +51,11 @@ def _sentence(text: str) -> str:
 
 
 def _table(schema: dict[str, Any]) -> str:
-    rows = ["| key | type | default | meaning |", "|---|---|---|---|"]
+    rows = ["| key | meaning | type | default |", "|---|---|---|---|"]
     required = schema.get("required", [])
     for key, own in schema.get("properties", {}).items():
         default = "" if key in required else _default(own)
-        rows.append(f"| `{key}` | {_type(own)} | {default} | {_escaped(own.get('description', ''))} |")
+        rows.append(f"| `{key}` | {_escaped(own.get('description', ''))} | {_type(own)} | {default} |")
     return "\n".join(rows) + "\n\n"
 
 

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from studies.manual.api_page import api_page
-from studies.manual.commands_page import commands_page
+from studies.manual.commands_page import commands_page, shipped_page
 from studies.manual.files_page import files_page
 from studies.manual.keys_page import keys_page
 
@@ -22,6 +22,7 @@ PAGES = {
     "reference/api.rst": api_page,
     "reference/files.md": files_page,
     "reference/keys.md": keys_page,
+    "reference/shipped.md": shipped_page,
     "changes.md": changes_page,
 }
 """Pages that are not in git, by their path below docs/."""

@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -55,11 +57,13 @@ def _run_page(blocks: list[Block], scratch: Path, quick: bool, timeout_s: float,
     """Run the blocks of a page in a copy of the checkout; return how many failed."""
     _copy_checkout(scratch)
     failed = 0
+    unmade: list[str] = []
     with _Python(scratch) as python:
         for block in blocks:
             for command in _pieces(block):
-                # What installs is run by CI's steps.
-                if any(word in command for word in NEVER + (SLOW if quick else ())):
+                # What needs a result that was left out is left out too.
+                if any(word in command for word in NEVER + (SLOW if quick else ())) or reads(command, unmade):
+                    unmade += outputs_of(command)
                     _tell(f"{'left out':>8}         {block.place}: {_first(command)}", log)
                     continue
                 started = time.monotonic()
@@ -81,6 +85,18 @@ def _pieces(block: Block) -> Iterator[str]:
         yield block.code
     else:
         yield from block.lines
+
+
+def outputs_of(command: str) -> list[str]:
+    """Return the folders and files that a command of simtest writes to, as they stand in it or by default."""
+    named = re.findall(r"--out[ =](\S+)", command)
+    runs = [f"reports/runs/{name}" for name in re.findall(r"simtest validate (\w+)", command) if not named]
+    return [*named, *runs, *(["reports/nightly"] if "simtest nightly" in command else [])]
+
+
+def reads(command: str, paths: list[str]) -> bool:
+    """Return whether a command or block names one of these paths, or what lies below it."""
+    return any(re.search(rf"(?<![\w./-]){re.escape(path)}(?![\w-])", command) for path in paths)
 
 
 def _copy_checkout(scratch: Path) -> None:
@@ -107,7 +123,7 @@ def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
     try:
         text, _ = child.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        os.killpg(child.pid, 15)
+        os.killpg(child.pid, signal.SIGTERM)
         return False, f"{child.communicate()[0]}\nstopped after {timeout_s:g} s"
     return child.returncode == 0, text
 
@@ -123,15 +139,19 @@ class _Python:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._child and self._child.stdin:
-            self._child.stdin.close()
-            self._child.wait(timeout=60)
+        self._end()
+
+    def _end(self) -> None:
+        """End the process, if there is one; its input's end is what it ends by."""
+        if self._child is not None:
+            self._child.communicate()
 
     def run(self, code: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
         """Run a block among the names of those before it."""
         if ">>> " in code:
             code = "\n".join(line[4:] for line in code.splitlines() if line.startswith((">>> ", "... ")))
         if self._child is None or self._child.poll() is not None:
+            self._end()
             self._child = subprocess.Popen(
                 [sys.executable, "-c", NAMESPACE], cwd=scratch, env=_environment(scratch), text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

@@ -11,7 +11,7 @@ import importlib.util
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,11 @@ from cyclopts import CycloptsError
 
 from simtest.cli.commands import APP
 from simtest.cli.manners import FLAGS
+from simtest.dataset.plan import Plan
 from simtest.errors import InputError
+from simtest.estimators import load_estimators
+from simtest.spec import load_dataset, load_experiment, load_profile, load_scene, parse_settings
+from simtest.validation.cases import expand
 from studies.manual.blocks import ROOT, Block, blocks_of, manual_pages
 
 SHELL = ("sh", "console", "indented")
@@ -97,19 +101,22 @@ def _simtest_fault(arguments: list[str], runs: bool) -> str | None:
 
 def _check_names(module: str, function: str, given: dict[str, Any], positional: tuple[Any, ...], runs: bool) -> None:
     """Raise InputError where a command names a scene, an experiment, a recipe, a profile or an estimator amiss."""
-    from simtest.estimators import load_estimators
-    from simtest.spec import load_dataset, load_experiment, load_profile, load_scene, parse_settings
-
     settings = parse_settings(given.get("settings") or [])
-    # A mesh of the reader's is not there to be read.
+    # A mesh of the reader's is not there to be read, nor checked with the other settings.
     absent = any(isinstance(value, str) and _is_file(value) and not Path(value).exists() for value in settings.values())
-    loaders = {("render", "render"): load_scene, ("views", "views"): load_scene, ("view", "view"): load_scene,
-               ("export", "export"): load_scene, ("validate", "validate"): load_experiment,
-               ("dataset", "make"): load_dataset}  # fmt: skip
+    # What a command itself checks before it renders.
+    loaders: dict[tuple[str, str], Callable[[str, dict[str, Any]], object]] = {
+        ("render", "render"): load_scene,
+        ("views", "views"): load_scene,
+        ("view", "view"): load_scene,
+        ("export", "export"): load_scene,
+        ("validate", "validate"): lambda name, values: expand(load_experiment(name, values)),
+        ("dataset", "make"): lambda name, values: Plan(load_dataset(name, values)),
+    }
     loader = loaders.get((module, function))
     if loader and positional and not _is_file(positional[0]):
         loader(positional[0], {} if absent else settings)
-    if function == "nightly" and given.get("profile"):
+    if module == "nightly" and given.get("profile") and not _is_file(given["profile"]):
         load_profile(given["profile"])
     if runs and (names := given.get("estimators") or given.get("estimator")):
         load_estimators(names)

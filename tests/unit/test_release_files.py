@@ -1,7 +1,9 @@
-"""What the audit and the hashed constraints make of the tools' reports."""
+"""What the audit and the hashed constraints make of the tools' reports, and what the release check refuses."""
 
 import importlib.util
 import re
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -67,3 +69,62 @@ def test_hashed_constraints_hold_names_versions_and_hashes_alone():
 def test_constraints_hold_names_and_versions_alone():
     lines = (CI.parent / "constraints.txt").read_text(encoding="ascii").split("\n")[:-1]
     assert all(re.fullmatch(r"[A-Za-z0-9_.-]+==[A-Za-z0-9_.!+-]+", line) for line in lines)
+
+
+def made_wheel(folder, *names):
+    wheel = folder / "simtest-0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name in names:
+            archive.writestr(name, "")
+    return wheel
+
+
+def test_a_wheel_that_holds_more_than_the_package_or_is_too_large_is_refused(tmp_path, monkeypatch):
+    check = loaded("release_check")
+    own = f"simtest-{check.project()['version']}.dist-info/METADATA"
+    check.check_wheel(made_wheel(tmp_path, "simtest/api.py", own))
+    with pytest.raises(check.CheckError, match=r"holds \['tests'\]: must hold the package alone"):
+        check.check_wheel(made_wheel(tmp_path, "simtest/api.py", own, "tests/a.py"))
+    monkeypatch.setattr(check, "LARGEST_WHEEL_MB", 1e-5)
+    with pytest.raises(check.CheckError, match="must be at most 1e-05 MB"):
+        check.check_wheel(made_wheel(tmp_path, "simtest/api.py", own))
+
+
+def test_an_installation_must_have_all_entry_points_and_data():
+    told = loaded("release_check").told()
+    assert {"cone_axis", "circle_pose"} <= set(told["simtest.estimators"])
+    assert {"peaks", "colour"} == set(told["simtest.detectors"])
+    assert {"cylinder", "published"} <= set(told["scenes"])
+    assert {"overview", "laws"} <= set(told["experiments"])
+    assert {"colon", "liver"} == set(told["meshes"])
+
+
+def test_a_step_that_fails_is_told_in_one_line(tmp_path):
+    check = loaded("release_check")
+    code = "import sys; print('first'); print('worst', file=sys.stderr); sys.exit(3)"
+    with pytest.raises(check.CheckError, match=r"exit 3: worst$"):
+        check.run([sys.executable, "-c", code], tmp_path)
+
+
+def test_the_release_check_asks_pythons_that_are_new_enough(monkeypatch):
+    check = loaded("release_check")
+    assert any(python.resolve() == Path(sys.executable).resolve() for python in check.pythons())
+    monkeypatch.setattr(check, "OLDEST", (9, 0))
+    assert check.pythons() == []
+
+
+def test_version_changelog_and_citation_agree():
+    version = loaded("release_check").project()["version"]
+    newest = re.search(r"^## (\S+)", (CI.parent / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert newest.group(1) == version
+    assert f"\nversion: {version}\n" in (CI.parent / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_every_deprecated_name_is_listed_with_the_release_in_which_it_goes():
+    from simtest._renamed import GONE, MODULES
+
+    page = (CI.parent / "docs" / "reference" / "stable.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.endswith(f"| {GONE} |")]
+    listed = set(re.findall(r"`(simtest[\w.]*)`", " ".join(row.split("|")[1] for row in rows)))
+    # Modules below a listed one follow it.
+    assert {old for old in MODULES if not any(old == n or old.startswith(f"{n}.") for n in listed)} == set()

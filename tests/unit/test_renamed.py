@@ -25,7 +25,7 @@ DOCUMENTED = {
 @pytest.mark.parametrize("module", DOCUMENTED)
 def test_old_modules_lead_to_the_new_ones(module):
     sys.modules.pop(module, None)
-    with pytest.warns(DeprecationWarning, match="the old name goes with the next release"):
+    with pytest.warns(DeprecationWarning, match=r"the old name goes in 0\.3\.0"):
         old = importlib.import_module(module)
     new = importlib.import_module(old.__spec__.origin)
     for name in DOCUMENTED[module]:

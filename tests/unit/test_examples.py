@@ -1,0 +1,64 @@
+"""Each example runs as a user runs it, and makes the picture that the list of examples shows."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("[0-9][0-9]_*.py"))
+MANUAL = ROOT / "docs" / "images" / "examples"
+LONGEST = 60
+LARGEST_KB = 150
+
+pytestmark = pytest.mark.skipif(not EXAMPLES, reason="the checkout's examples folder is not there")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+def test_an_example_makes_its_picture(script, tmp_path):
+    # Run from another folder, so that an example depends on nothing that happens to lie in the checkout.
+    own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(script), "--quick", "--out", str(tmp_path / "made")]
+    done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    made = [file for file in (tmp_path / "made").iterdir() if file.stem == script.stem]
+    assert len(made) == 1
+    assert str(made[0]) in done.stdout
+    pixels = np.asarray(Image.open(made[0]).convert("L"), float)
+    assert min(pixels.shape) >= 300
+    # A figure without its data is a white sheet with thin axes.
+    assert (pixels < 250).mean() > 0.01
+    assert pixels.std() > 10
+
+
+def test_examples_are_short_numbered_and_listed():
+    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    assert [script.name[:2] for script in EXAMPLES] == [f"{n:02}" for n in range(1, len(EXAMPLES) + 1)]
+    assert re.findall(r"\]\(([0-9][^)]*\.py)\)", listed) == [script.name for script in EXAMPLES]
+    for script in EXAMPLES:
+        text = script.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= LONGEST, script.name
+        assert "\nPicture: " in text, script.name
+        assert re.search(r"Takes\s+\d+ s\s+of\s+processor\s+time\.", text), script.name
+
+
+def test_examples_use_public_names_alone():
+    for script in EXAMPLES:
+        text = script.read_text(encoding="utf-8")
+        modules = set(re.findall(r"^\s*(?:from|import) (simtest[\w.]*)", text, re.MULTILINE))
+        assert modules <= {"simtest", "simtest.dataset"}, script.name
+
+
+def test_pictures_of_the_manual_are_small():
+    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    shown = re.findall(r"!\[[^]]*\]\(\.\./docs/images/examples/([^)]+)\)", listed)
+    assert sorted(shown) == sorted(file.name for file in MANUAL.iterdir())
+    assert [name[:2] for name in shown] == [script.name[:2] for script in EXAMPLES]
+    for name in shown:
+        assert (MANUAL / name).stat().st_size <= LARGEST_KB * 1000, name
