@@ -82,7 +82,8 @@ def _draw_spot(
     if result.cloud is not None:
         _draw_cloud(canvas, result, size[0], colour)
         for curve in drawing.curves if drawing is not None else ():
-            _polyline(canvas, curve, colour, size[0])
+            for shade, width in ((RAY, 4), (colour, 2)):
+                _polyline(canvas, curve, shade, size[0], width)
     if np.isfinite(result.look_px).all():
         width = 4 if result.cloud is not None else 2
         for k, normal in enumerate(result.candidates):
@@ -134,10 +135,10 @@ def _at(points: npt.ArrayLike, scale: int) -> npt.NDArray[np.int32]:
     return np.rint((np.asarray(points, dtype=float) * scale - 0.5) * 2**FRACTION_BITS).astype(np.int32)
 
 
-def _polyline(canvas: Picture, points: Points, colour: Colour, scale: int) -> None:
+def _polyline(canvas: Picture, points: Points, colour: Colour, scale: int, width: int = 1) -> None:
     if len(points) < 2:
         return
-    cv2.polylines(canvas, [_at(points, scale).reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
+    cv2.polylines(canvas, [_at(points, scale).reshape(-1, 1, 2)], False, colour, width, cv2.LINE_AA, FRACTION_BITS)
 
 
 def _arrow(canvas: Picture, look: Array, normal: Array, colour: Colour, size: tuple[int, float], width: int) -> None:
