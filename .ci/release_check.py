@@ -72,7 +72,7 @@ def main() -> int:
         print(f"release check: {error}", file=sys.stderr)
         return 1
     seconds = sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(f"release check: {wheel.name} works in {len(found)} environments; {seconds:.0f} s of processor time")
+    print(f"release check: {wheel.name} works in {len(found)} environment{'s' * (len(found) > 1)}; {seconds:.0f} s of processor time")
     return 0
 
 
