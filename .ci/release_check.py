@@ -72,7 +72,8 @@ def main() -> int:
         print(f"release check: {error}", file=sys.stderr)
         return 1
     seconds = sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(f"release check: {wheel.name} works in {len(found)} environments; {seconds:.0f} s of processor time")
+    tried = f"{len(found)} environment{'s' * (len(found) > 1)}"
+    print(f"release check: {wheel.name} works in {tried}; {seconds:.0f} s of processor time")
     return 0
 
 
