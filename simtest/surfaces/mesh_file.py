@@ -33,6 +33,9 @@ LEAST_SOUND = 0.5
 LARGE_BYTES = 100_000_000
 """Files of text beyond it are searched for faces before they are read."""
 
+_END_BYTES = 65_536
+"""At the end of an STL file of text, among which its last line is looked for."""
+
 MOST_BYTES_PER_FACE = 2000
 """Of a large file of text: an STL file takes about 250, an OBJ file with its vertices less."""
 
@@ -169,7 +172,7 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
         check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
     elif head[:5].lower() == b"solid":
         with path.open("rb") as file:
-            file.seek(max(0, size - len(head)))
+            file.seek(max(0, size - _END_BYTES))
             end = file.read().lower()
         # A header of a binary file may begin so too.
         if b"facet" in head.lower() and b"endsolid" not in end:
