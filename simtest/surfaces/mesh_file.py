@@ -12,7 +12,7 @@ import numpy as np
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
-from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.limits import check_file, check_limit, limit
 from simtest.runtime.machine_errors import cannot_write, write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
@@ -170,14 +170,15 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
     count = int.from_bytes(head[80:84], "little")
     if size >= 84 and size == 84 + 50 * count:
         check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
-    elif head[:5].lower() == b"solid":
+    elif head[:5].lower() == b"solid" and b"facet" in head.lower():
+        # A header of a binary file may begin so too.
         with path.open("rb") as file:
             file.seek(max(0, size - _END_BYTES))
             end = file.read().lower()
-        # A header of a binary file may begin so too.
-        if b"facet" in head.lower() and b"endsolid" not in end:
+        if b"endsolid" not in end:
             raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
-    elif size < 84 + 50 * count:
+    elif size < 84 + 50 * count and count <= limit("mesh_faces"):
+        # Four letters of a text would be more than that.
         held = max(0, (size - 84) // 50)
         raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
 
