@@ -186,8 +186,8 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
 def _check_obj(path: Path) -> None:
     """Raise `InputError` where a face names vertex 0, which its reader takes for the last one."""
     with path.open("rb") as file:
-        # By pieces that end with a line.
-        while piece := file.read(2**20) + file.readline():
+        # By pieces that end with a line, unless that is longer than any line of a mesh.
+        while piece := file.read(2**20) + file.readline(2**20):
             if wrong := _ZERO_INDEX.search(piece):
                 line = wrong[0].decode("latin-1").strip()
                 raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
