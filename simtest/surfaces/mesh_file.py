@@ -12,7 +12,7 @@ import numpy as np
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import write_atomically
-from simtest.runtime.limits import check_file, check_limit
+from simtest.runtime.limits import check_file, check_limit, limit
 from simtest.runtime.machine_errors import cannot_write, write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
@@ -32,6 +32,9 @@ LEAST_SOUND = 0.5
 
 LARGE_BYTES = 100_000_000
 """Files of text beyond it are searched for faces before they are read."""
+
+_END_BYTES = 65_536
+"""At the end of an STL file of text, among which its last line is looked for."""
 
 MOST_BYTES_PER_FACE = 2000
 """Of a large file of text: an STL file takes about 250, an OBJ file with its vertices less."""
@@ -167,14 +170,15 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
     count = int.from_bytes(head[80:84], "little")
     if size >= 84 and size == 84 + 50 * count:
         check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
-    elif head[:5].lower() == b"solid":
-        with path.open("rb") as file:
-            file.seek(max(0, size - len(head)))
-            end = file.read().lower()
+    elif head[:5].lower() == b"solid" and b"facet" in head.lower():
         # A header of a binary file may begin so too.
-        if b"facet" in head.lower() and b"endsolid" not in end:
+        with path.open("rb") as file:
+            file.seek(max(0, size - _END_BYTES))
+            end = file.read().lower()
+        if b"endsolid" not in end:
             raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
-    elif size < 84 + 50 * count:
+    elif size < 84 + 50 * count and count <= limit("mesh_faces"):
+        # Four letters of a text would be more than that.
         held = max(0, (size - 84) // 50)
         raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
 
@@ -182,8 +186,8 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
 def _check_obj(path: Path) -> None:
     """Raise `InputError` where a face names vertex 0, which its reader takes for the last one."""
     with path.open("rb") as file:
-        # By pieces that end with a line.
-        while piece := file.read(2**20) + file.readline():
+        # By pieces that end with a line, unless that is longer than any line of a mesh.
+        while piece := file.read(2**20) + file.readline(2**20):
             if wrong := _ZERO_INDEX.search(piece):
                 line = wrong[0].decode("latin-1").strip()
                 raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")

@@ -296,3 +296,42 @@ def test_long_tables_are_cut_unless_asked_for(capsys, monkeypatch):
 @pytest.mark.parametrize(("number", "text"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames")])
 def test_nouns_agree_with_their_number(number, text):
     assert printing.counted(number, "frame") == text
+
+
+def spots(count):
+    """Return specularities without an estimate: two of three isolated, the others clusters."""
+    return [
+        SimpleNamespace(id=i, kind="cluster" if i % 3 == 0 else "isolated", score=0.5, best=None, best_estimate=None,
+                        peak_px=(1.0, 2.0), normals={})
+        for i in range(count)
+    ]  # fmt: skip
+
+
+def test_many_specularities_become_a_summary(capsys, monkeypatch):
+    from simtest.cli.reconstruct import _print_tables
+
+    def printed(count):
+        _print_tables(SimpleNamespace(specularities=spots(count), reference=None))
+        return capsys.readouterr().out
+
+    assert printed(20).count("isolated") == 13
+    summary = printed(108)
+    assert [line.split()[1::2][:3] for line in summary.splitlines() if "none" in line] == [
+        ["isolated", "none", "72"], ["cluster", "none", "36"],
+    ]  # fmt: skip
+    assert "--verbose prints a row for each of the 108" in summary
+    monkeypatch.setattr(manners.MANNERS, "verbose", True)
+    assert printed(108).count("isolated") == 72
+
+
+def test_a_night_prints_its_verdict_as_json(here, monkeypatch, tmp_path):
+    import simtest.nightly.run
+
+    verdict = {"state": "regression", "exit_code": 1}
+    (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+    judged = SimpleNamespace(verdict=SimpleNamespace(exit_code=1))
+    made = SimpleNamespace(judged=judged, folder=tmp_path)
+    monkeypatch.setattr(simtest.nightly.run, "run_nightly", lambda *_: made)
+    code, output, errors = here("nightly", "--json")
+    assert (code, errors) == (1, [])
+    assert json.loads(output) == {**verdict, "files": [str(tmp_path / "index.html")]}
