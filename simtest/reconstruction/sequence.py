@@ -179,7 +179,7 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
     if not path.is_file():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = None
     if before != settings:

@@ -14,7 +14,7 @@ from simtest.realism.fitting.parameters import Parameter
 from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import Json, make_folder, write_json
+from simtest.runtime.files import Json, make_folder, require_plain, write_json
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset, Splits
 
@@ -132,7 +132,7 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     for index in range(size):
         path = folder / f"{index:06d}.json"
         try:
-            rows = json.loads(path.read_text(encoding="utf-8"))
+            rows = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
             for row in rows:
                 told = [np.nan if value is None else value for value in row["summaries"]]
                 values = [row["values"][parameter.key] for parameter in parameters]
@@ -170,8 +170,8 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
         write_json(path, wanted)
         return
     try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        held = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise InputError(f"{shown(path)}: not valid JSON ({error}); remove the folder") from error
     if held != json.loads(json.dumps(wanted)):
         raise InputError(
