@@ -18,7 +18,8 @@ and `circle_pose` last, which takes a curved surface for a plane."""
 
 def deviation_deg(estimate: Estimate) -> float | None:
     """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
-    return estimate.deviation_deg
+    # Computed here: a picture's way does not climb back to the estimators.
+    return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
 
 
 @dataclass(frozen=True)
