@@ -177,9 +177,9 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
             end = file.read().lower()
         if b"endsolid" not in end:
             raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
-    elif size < 84 + 50 * count and count <= limit("mesh_faces"):
+    elif 84 <= size < 84 + 50 * count and count <= limit("mesh_faces"):
         # Four letters of a text would be more than that.
-        held = max(0, (size - 84) // 50)
+        held = (size - 84) // 50
         raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
 
 
