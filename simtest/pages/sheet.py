@@ -202,6 +202,8 @@ def _dashes(points: Array, lengths: Array) -> list[Array]:
     """Cut a line, px, into dashes; `lengths` are those of dash, gap, dash, ..., px."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     at = np.arange(0.0, along[-1], _DASH_STEP_PX)
+    if not len(at):
+        return []
     which = np.searchsorted(np.cumsum(lengths), np.mod(at, lengths.sum()), side="right")
     drawn = np.stack([np.interp(at, along, points[:, i]) for i in (0, 1)], axis=-1)
     ends = np.flatnonzero(np.diff(which)) + 1

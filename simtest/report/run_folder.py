@@ -164,11 +164,20 @@ class SceneRealism(BaseModel):
     sentence: Text = ""
 
 
+class JudgedMesh(BaseModel):
+    """A mesh file, and what `simtest mesh check` says of it."""
+
+    file: Text = ""
+    usable: bool = True
+    verdict: Text = ""
+
+
 class ExperimentSummary(BaseModel):
     """An experiment of summary.json: figures by setting and estimator."""
 
     title: Text = ""
     description: Text = ""
+    meshes: Annotated[tuple[JudgedMesh, ...], BeforeValidator(_listed)] = ()
     realism: Annotated[tuple[SceneRealism, ...], BeforeValidator(_listed)] = ()
     estimators: Annotated[dict[str, Text], BeforeValidator(_table)] = {}  # what each does, in one line
     conditions: Annotated[dict[str, dict[str, Any]], BeforeValidator(_table)] = {}  # by setting

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ def _scenes(group: Group) -> Iterator[Scene]:
                 yield scene
 
 
+@lru_cache(maxsize=8)
 def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     # Loaded where there is a mesh: most experiments have none.
     from simtest.surfaces.fineness import concentration

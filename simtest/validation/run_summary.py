@@ -9,6 +9,7 @@ from simtest.runtime.files import Json
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.conditions import conditions_of
+from simtest.validation.mesh_verdicts import mesh_verdicts
 from simtest.validation.realism import realism_of
 from simtest.validation.statistics import summarise
 
@@ -22,6 +23,7 @@ def run_summary(experiment: Experiment, cases: Sequence[Case], results: pl.DataF
     content: Json = {
         "title": experiment.title or experiment.name,
         "description": experiment.description,
+        "meshes": [verdict.to_json() for verdict in mesh_verdicts(experiment)],
         "realism": realism_of(cases),
         "estimators": {**describe_estimators(experiment.estimators)},
         "conditions": {setting: found.to_json() for setting, found in conditions_of(cases).items()},

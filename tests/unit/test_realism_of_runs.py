@@ -109,3 +109,17 @@ def test_page_says_for_which_realism_its_scenes_stand(tmp_path):
     html = write_report(run).read_text(encoding="utf-8")
     assert all(f"curve {i}: Smooth &lt;control&gt; {i}." in html for i in range(6))
     assert "Realism of 2 more groups of scenes" in html
+
+
+def test_page_repeats_what_is_wrong_with_a_mesh(tmp_path):
+    run = make_run(tmp_path / "run", items=0)
+    summary = json.loads((run / "summary.json").read_text())
+    meshes = [
+        {"file": "a.ply", "usable": False, "verdict": "too <coarse>"},
+        {"file": "b.ply", "usable": True, "verdict": "fine enough"},
+    ]
+    summary["experiments"]["overview"]["meshes"] = meshes
+    (run / "summary.json").write_text(json.dumps(summary))
+    html = write_report(run).read_text(encoding="utf-8")
+    assert "<code>a.ply</code>: too &lt;coarse&gt;. The figures below may mean nothing." in html
+    assert "<code>b.ply</code>: fine enough</p>" in html

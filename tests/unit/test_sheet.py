@@ -67,6 +67,8 @@ def test_points_far_away_and_no_points_at_all_do_no_harm():
             empty.line(points, BLACK, width)
             empty.line(points, BLACK, width, "dash")
         assert not ink(empty).any()
+    # A line of no length has no dashes.
+    empty.line([(1, 1), (1, 1)], BLACK, 1, "dash")
     empty.markers([(np.nan, 3)], "o", 8, BLACK, 1)
     assert not ink(empty).any()
 
