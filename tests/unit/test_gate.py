@@ -232,6 +232,7 @@ def test_a_new_version_of_simtest_itself_leaves_pairs_pairs():
     table = rows()
     verdict = compare(night(raised(table, 1.1), versions={"numpy": "2.4", "simtest": "0.2"}), night(table))
     assert set(verdict.comparisons["method"]) == {"paired"}
+    assert verdict.notes[0] == "Versions changed from simtest 0.1 to simtest 0.2."
 
 
 def test_another_definition_of_an_experiment_unpairs_its_cells():
