@@ -202,6 +202,8 @@ def test_page_in_a_browser(tmp_path):
             tab.on("pageerror", lambda error, heard=heard: heard.append(str(error)))
             tab.on("request", lambda request, heard=heard: heard.append(request.url))
             tab.goto(page.as_uri())
+            # Sections are folded on a phone.
+            tab.evaluate("document.querySelectorAll('details').forEach(section => { section.open = true })")
             tab.wait_for_selector("[data-chart=distances] .main-svg", timeout=60_000)
             tab.locator("[data-chart=column_noise]").scroll_into_view_if_needed()
             tab.wait_for_selector("[data-chart=column_noise] .main-svg", timeout=60_000)
