@@ -56,12 +56,18 @@ def halvings(vertices: Array, faces: IntArray, edge_mm: float) -> int:
     return max(0, math.ceil(math.log2(length / edge_mm) - 1e-6))
 
 
-def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
-    """Return how often a mesh may be subdivided: `wanted`, or fewer with a warning that names the reason."""
+def subdivisions_within_limit(faces: int, wanted: int) -> int:
+    """Return how often a mesh of so many faces may be subdivided, at most `wanted` times."""
     allowed = wanted
     # Each subdivision makes four faces of one.
-    while allowed and len(faces) * 4**allowed > MAX_SUBDIVIDED_FACES:
+    while allowed and faces * 4**allowed > MAX_SUBDIVIDED_FACES:
         allowed -= 1
+    return allowed
+
+
+def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
+    """Return how often a mesh may be subdivided: `wanted`, or fewer with a warning that names the reason."""
+    allowed = subdivisions_within_limit(len(faces), wanted)
     if allowed < wanted:
         warnings.warn(
             f"{path}: {wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {allowed}",

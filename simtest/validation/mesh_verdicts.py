@@ -1,16 +1,19 @@
 """What `simtest mesh check` says of the mesh files that an experiment runs on."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import find
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
 from simtest.spec.toml_files import apply_settings
 from simtest.spec.type_change import replace_values
+
+if TYPE_CHECKING:
+    from simtest.surfaces.mesh_check import Verdict
 
 DISTANCE_MM = 30.0
 """Of camera and light, as `simtest mesh check` takes it: the viewpoints are chosen later."""
@@ -59,7 +62,8 @@ def _scenes(group: Group) -> Iterator[Scene]:
     path = find(group.scene, "scenes")
     base = replace_values(Scene, read_toml(path), group.set, str(path))
     swept = [values for table in (*group.sweep, *group.pool) for key, values in table.items() if key == "surface.path"]
-    own: list[Any] = [base.get("surface", {}).get("path")]
+    surface = base.get("surface")
+    own: list[Any] = [surface.get("path")] if isinstance(surface, dict) else []
     for name in dict.fromkeys(own if not swept else (value for values in swept for value in values)):
         if isinstance(name, str) and Path(name).suffix.lower() not in ("", ".toml"):
             scene = scene_from_dict(apply_settings(base, {"surface.path": name}, str(path)), str(path))
@@ -67,7 +71,6 @@ def _scenes(group: Group) -> Iterator[Scene]:
                 yield scene
 
 
-@lru_cache(maxsize=8)
 def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     # Loaded where there is a mesh: most experiments have none.
     from simtest.surfaces.fineness import concentration
@@ -75,15 +78,25 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
 
     lobe = concentration(None, None) if curvature is None else curvature
     found = check_mesh(surface.file(), DISTANCE_MM, lobe, surface.kind)
-    refined = False
-    if found.fine:
+    needed, fine = found.needed_edge_mm, found.fine
+    if fine:
         text = "fine enough"
-    elif found.needed_edge_mm is None:
+    elif needed is None:
         text = "too large to be judged"
+    elif surface.edge_mm is None:
+        text = f"too coarse: edges of {needed:.2g} mm are needed (surface.edge_mm)"
     else:
-        text = f"too coarse: edges of {found.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
-        refined = surface.edge_mm == "auto" or (surface.edge_mm or float("inf")) <= found.needed_edge_mm
-        if refined:
-            text = f"refined to what it needs by surface.edge_mm = {surface.edge_mm}"
+        reached = _refined_edge(found, needed if surface.edge_mm == "auto" else surface.edge_mm)
+        fine = reached <= needed
+        text = f"refined to edges of {reached:.2g} mm by surface.edge_mm = {surface.edge_mm}"
+        text += f", at most {needed:.2g} mm are needed" if fine else f": too coarse, {needed:.2g} mm are needed"
     text += "".join(f"; {problem}" for problem in found.problems)
-    return MeshVerdict(str(surface.path), (found.fine or refined) and not found.problems, text)
+    return MeshVerdict(str(surface.path), fine and not found.problems, text)
+
+
+def _refined_edge(found: "Verdict", target_mm: float) -> float:
+    """Return the length, mm, that 95 % of the edges do not exceed once the mesh is refined as far as it may be."""
+    from simtest.surfaces.subdivision import subdivisions_within_limit
+
+    wanted = max(0, math.ceil(math.log2(found.edge_p95_mm / target_mm) - 1e-6))
+    return float(found.edge_p95_mm / 2 ** subdivisions_within_limit(found.faces, wanted))

@@ -1,5 +1,6 @@
 """Mesh files that are cut, count from 0, or mix polygons: read as what they are, or refused with the cause."""
 
+import re
 import struct
 
 import numpy as np
@@ -106,7 +107,7 @@ def experiment(**values):
     return Experiment(name="x", groups=(Group(scene="anatomy", set=values), Group(scene="plane")))
 
 
-def test_an_experiment_judges_its_mesh_files_once(tmp_path):
+def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     ball().export(path)
     assert mesh_verdicts(experiment()) == []
@@ -117,7 +118,17 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path):
     assert str(coarse).endswith(" mm are needed (surface.edge_mm)")
     assert coarse.to_json() == {"file": str(path), "usable": False, "verdict": coarse.text}
     (refined,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
-    assert (refined.usable, refined.text) == (True, "refined to what it needs by surface.edge_mm = auto")
+    assert refined.usable
+    assert re.fullmatch(
+        r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed", refined.text
+    )
+    # One that would need more faces than are allowed is not fine enough, and says so.
+    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SUBDIVIDED_FACES", 1500)
+    (limited,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
+    assert not limited.usable
+    assert ": too coarse, 0." in limited.text
+    # What is no table is told by whoever reads the scene.
+    assert mesh_verdicts(experiment(surface=5)) == []
     # A wide lobe needs no fine mesh.
     trimesh.creation.icosphere(subdivisions=5, radius=20).export(path)
     (fine,) = mesh_verdicts(experiment(**{"surface.path": str(path), "reflectance.exponent": 2.0}))
