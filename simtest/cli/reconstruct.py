@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from simtest.reconstruction.description import PictureRecord, SpecularityRecord
     from simtest.reconstruction.picture import Options
 
+MOST_FLAGS = 3
+"""Flags named in a row of the summary, the most frequent first."""
+
+MEANING = (
+    "± is one standard deviation of a normal's direction: 95 % of errors lie within 1.7 to 2 times it "
+    "(docs/concepts/uncertainty.md)"
+)
+
 Calibrated = Annotated[
     Path | None,
     Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
@@ -107,6 +115,7 @@ def reconstruct(
     _print_tables(record)
     if record.stated is not None:
         print(f"stated: {record.stated}")
+        print(MEANING)
     _print_assumed(record.assumed)
     print(f"{counted(len(record.specularities), 'specularity', 'specularities')} found in {image}")
     print_files(files, as_json)
@@ -153,6 +162,7 @@ def _print_tables(record: "PictureRecord") -> None:
 
 def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     """Print how many specularities of each kind have which best estimator, and what that states."""
+    from collections import Counter
     from statistics import median
 
     from simtest.reconstruction.ranking import deviation_deg
@@ -163,9 +173,10 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
         stated = [d for s in held if s.best_estimate and (d := deviation_deg(s.best_estimate)) is not None]
-        flagged = sum(bool(s.best_estimate and s.best_estimate.flags) for s in held)
-        rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", str(flagged)))
-    print_table(("kind", "best", "n", "median ± deg", "flagged"), rows)
+        flags = Counter(flag for s in held if s.best_estimate for flag in s.best_estimate.flags)
+        named = ", ".join(f"{flag} {count}" for flag, count in flags.most_common(MOST_FLAGS))
+        rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", named))
+    print_table(("kind", "best", "n", "median ± deg", "flags"), rows)
     print(f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them")
 
 
