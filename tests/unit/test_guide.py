@@ -130,6 +130,21 @@ def test_tissue_of_mixed_curvature_is_named_by_its_surface():
 
 
 @pytest.mark.parametrize(
+    ("base", "surface"), [((0.0, 0.0), "flat"), ((0.0, 0.5), "outside of a tube"), ((-0.5, 0.0), "inside of a tube")]
+)
+def test_a_surface_with_relief_is_named_by_its_base(base, surface):
+    bends = {"kd_min_base": base[0], "kd_max_base": base[1]}
+    rows = [
+        row for first, fine in enumerate(((-3.0, 2.0), (0.5, 4.0), (-2.0, -1.0)))
+        for row in rows_of("cone_axis", [1.0], first=first, kd_min=fine[0], kd_max=fine[1], **bends)
+    ]  # fmt: skip
+    assert guide_from(rows).advice[0].situation.surface == surface
+    # Without a base of its own, the surface itself counts.
+    none = [row | {"kd_min_base": None, "kd_max_base": None} for row in rows]
+    assert guide_from(none).advice[0].situation.surface == "mixed curvature"
+
+
+@pytest.mark.parametrize(
     ("errors", "said", "is_broken"),
     [
         ({"a": [1.0] * 4, "b": [2.0] * 4}, "not here: at most 2°, b", False),
