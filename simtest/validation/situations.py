@@ -25,7 +25,7 @@ _USUAL = {"direct highlight alone", "pinhole camera", "resolved spot", "smooth s
 
 _ANALYTIC = {"plane", "cylinder", "sphere", "quadric"}
 
-_TOLD = ("relief", "sensor", "render", "camera")
+_TOLD = ("reflectance", "emission", "relief", "sensor", "render", "camera")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Situation:
     surface : str
         Kind of surface, in words; of computed frames, what is varied.
     circumstances : str
-        What else sets it apart from the run's other situations: light, noise, relief, spot; may be empty.
+        What else sets it apart from the run's other situations: light, lobe, noise, relief, spot; may be empty.
     settings : tuple of str
         Its settings.
     labels : tuple of str
