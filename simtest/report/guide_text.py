@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from simtest.pages.style import estimator_order, number
-from simtest.runtime.files import Json
 from simtest.validation.guide import (
     BREAK_DEG,
     LEAST_ANSWERED,
@@ -71,7 +71,7 @@ class MethodRow:
     breaks: str
 
 
-def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Json]:
+def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Any]:
     """Return the content of guide.json: the rows in words, and the figures that they are made of.
 
     `about` describes the methods by name.
@@ -92,7 +92,7 @@ def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Json]:
     }  # fmt: skip
 
 
-def _figures(figures: MethodFigures) -> dict[str, Json]:
+def _figures(figures: MethodFigures) -> dict[str, Any]:
     return {
         **{name: value for name, value in vars(figures).items() if name != "estimator"},
         "refused": figures.refused, "breaks": figures.breaks,

@@ -449,3 +449,55 @@ def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_l
 def test_a_run_without_true_highlights_says_so(tmp_path):
     run = make_run(tmp_path, "noise", [row | {"true_id": None} for row in rows_of("cone_axis", [1.0])], items=0)
     assert "nothing to compare" in printed(run, 80, terminal=False)
+
+
+def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, capsys):
+    from simtest.cli.printing import print_run
+
+    run = make_run(tmp_path, items=0)
+    write_report(run)
+    content = json.loads((run / "guide.json").read_text(encoding="utf-8"))
+    guide = read_run(run).guide
+    for row, text, advice in zip(content["rows"], guide_rows(guide), guide.advice, strict=True):
+        assert (row["surface"], row["best"], row["breaks"]) == (text.surface, advice.best, text.breaks)
+        figures = row["methods"][advice.best]
+        assert (figures["n"], figures["mean_deg"]) == (
+            advice.methods[advice.best].n,
+            advice.methods[advice.best].mean_deg,
+        )
+        assert tuple(row["settings"]) == advice.situation.settings
+    print_run(run)
+    assert json.loads(capsys.readouterr().out)["guide"] == content
+
+
+@pytest.mark.parametrize("spoil", [lambda file: file.unlink(), lambda file: file.write_text("{")])
+def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
+    from simtest.cli.guide_table import print_guide
+    from simtest.cli.printing import print_run
+
+    run = make_run(tmp_path, items=0)
+    write_report(run)
+    spoil(run / "guide.json")
+    print_guide(run)
+    said = capsys.readouterr().out
+    assert "guide.json: missing" in said
+    assert "No true highlight" not in said
+    print_run(run)
+    assert json.loads(capsys.readouterr().out)["guide"] is None
+
+
+def test_verbose_prints_every_situation(tmp_path, monkeypatch):
+    from simtest.cli.manners import MANNERS
+    from simtest.cli.printing import MOST_ROWS
+
+    rows = [
+        row | {"surface": f"organ {k}"} for k in range(MOST_ROWS + 3) for row in rows_of("cone_axis", [1.0], f"{k}")
+    ]
+    run = make_run(tmp_path, "noise", rows, items=0)
+    short = printed(run, 80, terminal=False)
+    assert "and 3 more; --verbose prints them all" in " ".join(short.split())
+    assert f"organ {MOST_ROWS}" not in short
+    monkeypatch.setattr(MANNERS, "verbose", True)
+    every = printed(run, 80, terminal=False)
+    assert f"organ {MOST_ROWS + 2}" in every
+    assert "--verbose" not in every
