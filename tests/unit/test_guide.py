@@ -13,6 +13,7 @@ from test_report import make_run
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows
+from simtest.report.pairs import pairs
 from simtest.report.run_folder import read_run
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.reflectance import Reflectance
@@ -202,6 +203,14 @@ def test_an_estimator_answers_for_the_highlights_that_it_has_rows_of():
     assert (normals_of_base.target, normals_of_base.best, own.n, own.answered) == ("base", "cloud", 6, 6)
     assert own.mean_penalised_deg == own.mean_deg == pytest.approx(2.0, abs=0.2)
     assert [row.surface for row in guide_rows(guide_from(glints, clouds))] == ["flat", "flat, normal of the base"]
+
+
+def test_estimators_of_different_surfaces_are_no_pair(tmp_path):
+    """The base's highlight 0 is not the fine surface's highlight 0."""
+    rows = [*rows_of("cone_axis", noisy(1.0, 5), target="fine"), *rows_of("curved", noisy(2.0, 5), target="fine"),
+            *rows_of("cloud", noisy(3.0, 5), target="base")]  # fmt: skip
+    found = pairs(read_run(make_run(tmp_path, "noise", rows, items=0)))
+    assert [(pair.first, pair.second, pair.n) for pair in found] == [("cone_axis", "curved", 5)]
 
 
 def test_of_one_surface_too_only_highlights_with_a_row_count():
