@@ -213,7 +213,7 @@ def validate(
     experiment : Experiment, str or Path
         An experiment, its file, or the name of a shipped one.
     out : str or Path
-        Folder of the run: results.parquet, summary.json, figures/, index.html. A stopped run goes on.
+        Folder of the run: results.parquet, summary.json, guide.json, figures/, index.html. A stopped run goes on.
     settings : mapping, optional
         Values that replace those of the experiment's file and scenes, by key path.
     command : str

@@ -1,16 +1,14 @@
 """Prints which method to use, and where it breaks, at the end of `simtest validate`."""
 
 import itertools
-import json
-import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from simtest.cli.manners import MANNERS
+from simtest.cli.printing import MOST_ROWS, print_rest, read_guide
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-MOST_ROWS = 20
-"""Situations that are printed; the page holds all."""
 
 WIDTH = 80
 _WIDTHS = (16, 17, 15, 10)  # of all columns but the last
@@ -22,7 +20,7 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
     Parameters
     ----------
     run : Path
-        Folder with its page, index.html, which shows the same table.
+        Folder with guide.json, whose rows the page shows too.
     console : rich.console.Console, optional
         Where to; default the standard output, as wide as the terminal, else `WIDTH` columns.
     """
@@ -34,11 +32,17 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
         console = Console(emoji=False, highlight=False)
         if not console.is_terminal:
             console = Console(emoji=False, highlight=False, width=WIDTH)
-    guide = _read_rows(run / "index.html")
+    guide = read_guide(run)
+    if guide is None:
+        console.print(
+            f"{run / 'guide.json'}: missing or not readable, so the methods cannot be compared", soft_wrap=True
+        )
+        return
     rows = guide["rows"]
     if not rows:
         console.print("No true highlight: there is nothing to compare the methods by.")
         return
+    kept = rows if MANNERS.verbose else rows[:MOST_ROWS]
     room = max(console.width, WIDTH) - sum(_WIDTHS) - len(_WIDTHS)
 
     def table(show_header: bool) -> Table:
@@ -48,7 +52,7 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
         return made
 
     console.print(table(True))
-    for circumstances, group in itertools.groupby(rows[:MOST_ROWS], lambda row: row["circumstances"]):
+    for circumstances, group in itertools.groupby(kept, lambda row: row["circumstances"]):
         if circumstances:
             console.print(f"[bold]{escape(circumstances)}[/bold]")
         # A table of its own for each kind of light, noise and relief, all with the same columns.
@@ -57,16 +61,9 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
             tied = f"tied: {', '.join(row['ties'])}" if row["ties"] else ""
             best = "\n".join(text for text in (row["best"] or "none", tied) if text)
             error = row["error"].replace(" (", "\n(")
-            part.add_row(*map(escape, (row["surface"], best, error, row["answered"], row["breaks"])))
+            answered = "\n".join((row["answered"], *filter(None, row["unanswered"].split(", "))))
+            part.add_row(*map(escape, (row["surface"], best, error, answered, row["breaks"])))
         console.print(part)
-    if len(rows) > MOST_ROWS:
-        console.print(f"and {len(rows) - MOST_ROWS} more situations, on the page")
+    print_rest(len(rows) - len(kept), "as the page shows them", console.print)
     if guide["shared"]:
         console.print(escape(guide["shared"]))
-
-
-def _read_rows(page: Path) -> dict[str, Any]:
-    """Read the rows that a page shows, without what computed them."""
-    found = re.search(r'<script type="application/json" id="guide-rows">(.*?)</script>', page.read_text("utf-8"), re.S)
-    rows: dict[str, Any] = json.loads(found[1]) if found else {"rows": []}
-    return rows

@@ -1,7 +1,7 @@
 """What commands print: one JSON document, or tables and lines."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,19 @@ def print_json(value: Any) -> None:
 
 
 def print_run(folder: Path, **told: Any) -> None:
-    """Print a run as one JSON document: its page, its results, what its summary.json holds, and what else is told."""
+    """Print a run as one JSON document: its files, what guide.json and summary.json hold, and what else is told."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    print_json({"page": folder / "index.html", "results": folder / "results.parquet", **told, **summary})
+    files = {"page": folder / "index.html", "results": folder / "results.parquet"}
+    print_json({**files, **told, "guide": read_guide(folder), **summary})
+
+
+def read_guide(folder: Path) -> dict[str, Any] | None:
+    """Read which method to use, and where each breaks, from a run's guide.json; None where there is none."""
+    try:
+        guide: dict[str, Any] = json.loads((folder / "guide.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return guide
 
 
 def print_files(files: Iterable[object], as_json: bool, **told: Any) -> None:
@@ -41,12 +51,13 @@ def print_lines(lines: Sequence[str]) -> None:
     kept = lines if MANNERS.verbose else lines[:MOST_ROWS]
     for line in kept:
         print(line)
-    _print_rest(len(lines) - len(kept))
+    print_rest(len(lines) - len(kept))
 
 
-def _print_rest(count: int, rest: str = "") -> None:
+def print_rest(count: int, rest: str = "", tell: Callable[[str], object] = print) -> None:
+    """Say how many rows are left out, if any, and where else they can be read; `tell` prints it."""
     if count:
-        print(f"and {count} more; --verbose prints them all{rest and f', {rest}'}")
+        tell(f"and {count} more; --verbose prints them all{rest and f', {rest}'}")
 
 
 def print_table(
@@ -84,7 +95,7 @@ def print_table(
     for row in kept:
         table.add_row(*(escape(cell) for cell in row))
     console.print(table)
-    _print_rest(len(rows) - len(kept), rest)
+    print_rest(len(rows) - len(kept), rest)
 
 
 def counted(number: int, one: str, many: str = "") -> str:

@@ -1,32 +1,47 @@
-"""The guide to a run's methods in words, for its page and for the terminal."""
+"""The guide to a run's methods in words, for its page, for guide.json and for the terminal."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from simtest.pages.style import estimator_order, number
-from simtest.validation.guide import BREAK_DEG, LEAST_ANSWERED, Advice, Guide, MethodFigures
+from simtest.validation.guide import (
+    BREAK_DEG,
+    LEAST_ANSWERED,
+    MATTERS_DEG,
+    MATTERS_SHARE,
+    Advice,
+    Guide,
+    MethodFigures,
+)
+from simtest.validation.paired import LEAST_FRAMES
 from simtest.validation.statistics import PENALTY_DEG
 
 HEADS = ("situation", "best method", "median error", "answered", "where it breaks")
 
 RULES = (
-    "Median error: the angle between the estimated and the true normal, with the 95 % interval of the median where six "
-    "or more highlights were answered.",
-    "Best method: the lowest mean error, where a highlight that a method missed or could not answer counts as "
-    f"{PENALTY_DEG:g}°. A method is tied with it where the 95 % interval of their mean difference on the same "
-    "highlights holds 0.",
-    f"A method breaks where that mean exceeds {BREAK_DEG:g}°, or where it answers fewer than "
+    "Median error: the angle between the estimated and the true normal, of the answers. Its 95 % interval resamples "
+    f"the frames of each setting; none is given where a setting has fewer than {LEAST_FRAMES} distinct frames.",
+    "Answered: of the true highlights that the method had to answer for. Missed ones were not detected; refused ones "
+    "were, and the method gave a reason instead of a normal.",
+    "Best method: the lowest mean error, where a highlight that was missed or refused counts as "
+    f"{PENALTY_DEG:g}°. A method is tied with it where their mean difference is below {MATTERS_DEG:g}° or "
+    f"{100 * MATTERS_SHARE:g} % of the better one's mean error, or where the 95 % interval of that difference on the "
+    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it.",
+    "Frames whose errors are the same to the last bit, as without noise, count as one frame.",
+    "Methods that state the normal of the base, the surface without its relief, are ranked in rows of their own.",
+    f"A method breaks where the mean error of its answers exceeds {BREAK_DEG:g}°, or where it answers fewer than "
     f"{100 * LEAST_ANSWERED:g} % of the highlights.",
 )
 """How the table is made."""
 
 WORDS = {
-    "k d": "curvature times distance, positive where the surface is convex",
+    "k d": "curvature times distance, positive where the surface is convex; of the base where there is a relief",
     "ε/d": "distance of the light from the camera over that of the surface",
     "flat": "|k d| below 0.05",
     "outside, inside of a tube": "convex, concave in one direction, flat in the other",
     "dome, bowl": "convex, concave in both directions",
-    "place, distance told": "what the methods may use: where the light is, how far the surface is",
+    "position, distance known": "what the methods may use: where the light is, how far the surface is",
 }
 """Words of the situations and figures, explained."""
 
@@ -41,6 +56,7 @@ class GuideRow:
     ties: tuple[str, ...]
     error: str
     answered: str
+    unanswered: str  # why, where there are any
     breaks: str
     is_broken: bool  # whether the best method breaks in one of the settings
 
@@ -55,20 +71,52 @@ class MethodRow:
     breaks: str
 
 
+def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Any]:
+    """Return the content of guide.json: the rows in words, and the figures that they are made of.
+
+    `about` describes the methods by name.
+    """
+    rows = [
+        vars(row)
+        | {
+            "target": advice.target,
+            "settings": advice.situation.settings,
+            "methods": {name: _figures(figures) for name, figures in advice.methods.items()},
+            "best_by_setting": {name: _figures(figures) for name, figures in advice.by_setting.items()},
+        }
+        for row, advice in zip(guide_rows(guide), guide.advice, strict=True)
+    ]
+    return {
+        "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "left_out": guide.left_out,
+        "methods": [vars(row) for row in method_rows(guide, about)], "rules": RULES, "words": WORDS,
+    }  # fmt: skip
+
+
+def _figures(figures: MethodFigures) -> dict[str, Any]:
+    return {
+        **{name: value for name, value in vars(figures).items() if name != "estimator"},
+        "refused": figures.refused, "breaks": figures.breaks,
+    }  # fmt: skip
+
+
 def guide_rows(guide: Guide) -> list[GuideRow]:
     """Return a row for each situation."""
     return [_row(advice) for advice in guide.advice]
 
 
 def _row(advice: Advice) -> GuideRow:
-    where = (advice.situation.surface, advice.situation.circumstances)
+    where = (_surface(advice), advice.situation.circumstances)
     if advice.best is None:
-        return GuideRow(*where, None, (), "–", f"0 of {advice.n}", "no method answered", True)
+        return GuideRow(*where, None, (), "–", f"0 of {advice.n}", "", "no method answered", True)
     best = advice.methods[advice.best]
-    answered = f"{best.answered} of {best.n}"
     return GuideRow(
-        *where, advice.best, advice.ties, _error(best), answered, _breaks(advice), bool(advice.broken)
+        *where, advice.best, advice.ties, _error(best), _share(best), _unanswered(best), _breaks(advice),
+        bool(advice.broken),
     )  # fmt: skip
+
+
+def _surface(advice: Advice) -> str:
+    return advice.situation.surface + (", normal of the base" if advice.target == "base" else "")
 
 
 def _error(figures: MethodFigures) -> str:
@@ -77,25 +125,59 @@ def _error(figures: MethodFigures) -> str:
     return f"{texts[0]}°" if low is None else f"{texts[0]}° ({texts[1]}–{texts[2]})"
 
 
+def _share(figures: MethodFigures) -> str:
+    return f"{figures.answered} of {figures.n}"
+
+
+def _unanswered(figures: MethodFigures) -> str:
+    parts = ((figures.missed, "missed"), (figures.refused, "refused"))
+    return ", ".join(f"{count} {word}" for count, word in parts if count)
+
+
+def _mean(figures: MethodFigures) -> str:
+    return f"{number(figures.mean_deg, 2)}°"
+
+
 def _breaks(advice: Advice) -> str:
     """Say in which settings a situation's best method breaks, or how far it is from that."""
-    settings, broken = advice.by_setting, advice.broken
-    worst = f"{number(settings[advice.worst].mean_penalised_deg, 2)}°"
-    if not broken:
-        return f"not here: at most {worst}" + (f", {_short(advice, advice.worst)}" if len(settings) > 1 else "")
-    first, figures = next(iter(broken.items()))
-    if len(settings) == 1:
-        return f"here: {_why(figures)}"
-    if len(broken) == len(settings):
-        return f"all {len(settings)} settings: {_why(figures)} or more"
-    count = f"{len(broken)} of {len(settings)} settings, {_short(advice, first)}: {_why(figures)}"
-    return count if len(broken) == 1 else f"{count}; worst {worst}"
+    settings = advice.by_setting
+    if not advice.broken:
+        where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
+        return f"nowhere here (worst: {_mean(settings[advice.worst])}{where})"
+    errs = {name: figures for name, figures in settings.items() if figures.errs}
+    silent = {name: figures for name, figures in settings.items() if figures.is_silent}
+    mildest_first = sorted(errs, key=lambda name: errs[name].mean_deg or 0.0)
+    fewest_last = sorted(silent, key=lambda name: silent[name].answered / silent[name].n, reverse=True)
+    parts = (
+        _span(advice, mildest_first, "mean {}", _mean, "or more"),
+        _span(advice, fewest_last, "{} answered", _share, "or fewer"),
+    )
+    return "; ".join(filter(None, parts))
+
+
+def _span(
+    advice: Advice, names: Sequence[str], form: str, told: Callable[[MethodFigures], str], beyond: str
+) -> str:  # fmt: skip
+    """Say at which settings, the mildest first, a method breaks in one way; empty where it does not."""
+    if not names:
+        return ""
+    count = len(advice.by_setting)
+    first, last = (told(advice.by_setting[names[end]]) for end in (0, -1))
+    if count == 1:
+        return f"here: {form.format(first)}"
+    if len(names) == count:
+        return f"all {count} settings: {form.format(first)}" + (f" {beyond}" if first != last else "")
+    if len(names) == 1:
+        return f"1 of {count} settings, {_short(advice, names[0])}: {form.format(first)}"
+    ends = f"{first} ({_short(advice, names[0])}) to {last} ({_short(advice, names[-1])})"
+    return f"{len(names)} of {count} settings: {form.format(ends)}"
 
 
 def _why(figures: MethodFigures) -> str:
-    if figures.answered < LEAST_ANSWERED * figures.n:
-        return f"{figures.answered} of {figures.n} answered"
-    return f"mean {number(figures.mean_penalised_deg, 2)}°"
+    """Say why a method breaks."""
+    told = [f"mean {_mean(figures)}"] if figures.errs else []
+    told += [f"{_share(figures)} answered"] if figures.is_silent else []
+    return ", ".join(told)
 
 
 def _short(advice: Advice, setting: str) -> str:

@@ -6,18 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
 from simtest.estimators.descriptions import DESCRIPTIONS
 from simtest.pages import chart_web, pixels, style
-from simtest.pages.html import environment, script_json
+from simtest.pages.html import environment
 from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
 from simtest.report.error_laws import is_tested, law_results, sentence
 from simtest.report.figure_files import THREADS, FigureFiles
 from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
-from simtest.report.guide_text import HEADS, RULES, WORDS, guide_rows, method_rows, shared_sentence
+from simtest.report.guide_text import guide_content
 from simtest.report.heat_maps import heat_charts, heat_maps
 from simtest.report.law_charts import law_charts, law_colours
 from simtest.report.pairs import pairs
@@ -98,19 +96,16 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _guide(run: Run) -> dict[str, Any]:
-    """Return what the guide's template needs."""
-    guide = run.guide
-    rows, shared = guide_rows(guide), shared_sentence(guide)
-    groups = itertools.groupby(rows, lambda row: row.circumstances)
-    # The terminal prints the same rows, from the page: a finished run needs nothing of what computes them.
-    told = Markup(script_json({"heads": HEADS, "rows": [vars(row) for row in rows], "shared": shared}))  # nosec B704
-    return {
-        "guide_json": told,
-        "guide": [(circumstances, list(rows)) for circumstances, rows in groups],
-        "methods": method_rows(guide, DESCRIPTIONS | run.summary.estimators),
-        "shared": shared, "left_out": guide.left_out, "rules": RULES, "words": WORDS,
-    }  # fmt: skip
+def guide_json(run: Run) -> dict[str, Any]:
+    """Return the content of guide.json: which method to use, and where each breaks."""
+    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators)
+
+
+def _guide(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the guide's template needs of guide.json."""
+    groups = itertools.groupby(content["rows"], lambda row: row["circumstances"])
+    # Under a name of its own: a template's `methods` would be anyone's.
+    return {"guide": {**content, "groups": [(circumstances, list(rows)) for circumstances, rows in groups]}}
 
 
 def _draw_frame(figures: FigureFiles, index: int, item: GalleryItem, colours: Mapping[str, str]) -> Shown:
@@ -136,7 +131,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
             "realism": summary.realism, "meshes": summary.meshes,
             "gallery": [card.result() for card in cards], "still": still.result() if still else "",
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
-            "columns": HEADINGS, **_guide(run),
+            "columns": HEADINGS, **_guide(guide_json(run)),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
             "figures": figures.packed(), "plotly": chart_web.packed_plotly() if figures.json else None,
         }

@@ -8,7 +8,7 @@ import polars as pl
 
 from simtest.pages.style import estimator_order, number
 from simtest.report.run_folder import Run
-from simtest.validation.guide import side_by_side
+from simtest.validation.paired import side_by_side, targets_of
 from simtest.validation.statistics import student_interval
 
 NONE = "–"
@@ -47,19 +47,22 @@ class Pair:
 def pairs(run: Run) -> list[Pair]:
     """Compare each two estimators by the errors of their proposed normals.
 
-    Each label is counted apart, since labels differ in kind; a single estimator has no pairs.
+    Each label is counted apart, since labels differ in kind; a single estimator has no pairs. Estimators that state
+    the normals of different surfaces, fine and base, are no pair: they answer for different highlights.
     """
     true = run.results.filter(pl.col("true_id").is_not_null())
     names = estimator_order(true["estimator"].drop_nulls().to_list())
     if len(names) < 2:
         return []
-    wide, _ = side_by_side(true)
+    targets = targets_of(true)
+    wide = side_by_side(true, targets)
     labels = wide["label"].unique(maintain_order=True).to_list()
     groups = [(str(label), wide.filter(pl.col("label") == label)) for label in labels]
     return [
         _pair(label, first, second, part)
         for label, part in groups
         for first, second in itertools.combinations(names, 2)
+        if targets[first] == targets[second]
     ]
 
 

@@ -3,6 +3,7 @@
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -222,7 +223,7 @@ class Run:
         """Its entry in summary.json."""
         return self.experiments.get(self.experiment) or ExperimentSummary()
 
-    @property
+    @cached_property
     def guide(self) -> Guide:
         """Which method to use, and where it breaks."""
         return guide_of(self.results, self.summary.conditions)

@@ -37,7 +37,7 @@ class RunResults:
 
     @property
     def folder(self) -> Path:
-        """Folder of the run: results.parquet, summary.json, figures/, index.html."""
+        """Folder of the run: results.parquet, summary.json, guide.json, figures/, index.html."""
         return self.page.parent
 
     @cached_property

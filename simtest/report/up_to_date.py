@@ -1,4 +1,4 @@
-"""Tells whether a run's page is up to date: what it was made of, and its figures, stand in a note at its end."""
+"""Tells whether a run's page is up to date: what it was made of, and its files, stand in a note at its end."""
 
 import hashlib
 import json
@@ -7,6 +7,9 @@ from functools import cache
 from pathlib import Path
 
 from simtest.runtime.provenance import file_hash, package_versions, source_hash, versions
+
+GUIDE = "guide.json"
+"""File of a run folder with the rows of its page's first table."""
 
 _OPEN, _CLOSE = "<!-- made of ", " -->\n"
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -24,10 +27,11 @@ def page_key(run: Path) -> str:
     return _hash({"files": content, "code": _code(), "versions": versions() | package_versions(_DRAWING)})
 
 
-def signed(html: str, key: str, figures: Mapping[str, str]) -> str:
-    """Return a page with its note: the key, and the SHA-256 of the page itself and of its figures by file name."""
+def signed(html: str, key: str, figures: Mapping[str, str], guide: str) -> str:
+    """Return a page with its note: the key, and the SHA-256 of the page, its figures by file name, and `GUIDE`."""
     digest = hashlib.sha256(html.encode()).hexdigest()
-    note = json.dumps({"key": key, "page": digest, "figures": dict(sorted(figures.items()))}, separators=(",", ":"))
+    content = {"key": key, "page": digest, "guide": guide, "figures": dict(sorted(figures.items()))}
+    note = json.dumps(content, separators=(",", ":"))
     return f"{html}{_OPEN}{note}{_CLOSE}"
 
 
@@ -39,6 +43,8 @@ def is_up_to_date(run: Path, key: str) -> bool:
             return False
         note = json.loads(end.removesuffix(_CLOSE))
         if note["key"] != key or note["page"] != hashlib.sha256(html.encode()).hexdigest():
+            return False
+        if file_hash(run / GUIDE) != note["guide"]:
             return False
         return all(file_hash(run / "figures" / name) == digest for name, digest in note["figures"].items())
     except (OSError, ValueError, KeyError, TypeError, AttributeError):

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from simtest.report.up_to_date import is_up_to_date, page_key, signed
-from simtest.runtime.files import write_atomically
+from simtest.report.up_to_date import GUIDE, is_up_to_date, page_key, signed
+from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.provenance import file_hash
 
 Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and what is done."""
@@ -24,7 +25,8 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     Returns
     -------
     pathlib.Path
-        ``run/index.html``. Beside it, ``run/figures/*.png`` are written anew; pictures of an earlier report go.
+        ``run/index.html``. Beside it, ``run/guide.json`` and ``run/figures/*.png`` are written anew; pictures of an
+        earlier report go.
 
     Raises
     ------
@@ -36,7 +38,7 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     if is_up_to_date(run, key):
         return page
     # Imported here: a page that is up to date needs none of what draws it.
-    from simtest.report.page import draw_page
+    from simtest.report.page import draw_page, guide_json
     from simtest.report.run_folder import read_run
 
     if progress:
@@ -45,8 +47,10 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     folder = run / "figures"
     folder.mkdir(exist_ok=True)
     html, figures, steps = draw_page(data, folder, progress)
+    write_json(run / GUIDE, guide_json(data))
     # The page comes last, so that a stopped report leaves the earlier one.
-    write_atomically(page, lambda part: part.write_text(signed(html, key, figures), encoding="utf-8"))
+    note = signed(html, key, figures, file_hash(run / GUIDE))
+    write_atomically(page, lambda part: part.write_text(note, encoding="utf-8"))
     if progress:
         progress(steps, steps, "page written")
     return page

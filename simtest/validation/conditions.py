@@ -13,6 +13,45 @@ from simtest.validation.cases import Case
 LOW_NOISE = 0.02
 """White noise up to this share of full scale is called low."""
 
+LOBES = {
+    "phong": "Phong lobe",
+    "rough_plastic": "rough plastic",
+    "principled": "principled lobe",
+    "rough_conductor": "rough conductor",
+    "tissue": "film over tissue",
+}
+"""Types of reflectance in words."""
+
+_PRESET = "stands for lights, which count themselves"
+_NUMBER = "in the number of lights and their offset, which the results tell"
+_TOLD_EMISSION = "told to the estimators, unless emission_known is false"
+
+DEGREES: dict[str, dict[str, str]] = {
+    "rig": {
+        **dict.fromkeys(("preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each"), _PRESET),
+        "seed": "of position_error_mm",
+        **{f"lights.{key}": _NUMBER for key in ("position_mm", "offset_mm", "azimuth_deg")},
+        **{f"lights.{key}": _TOLD_EMISSION for key in ("colour", "profile", "direction", "spot_deg", "soft_edge_deg",
+                                                       "power")},
+    },
+    "reflectance": {
+        "colour": "of the diffuse base, which is a kind",
+        "albedo": "colour of the diffuse base, which is a kind",
+        "translucency": "of the diffuse base, which is a kind",
+        "specular": "scales the picture",
+        "normalised": "scales the picture",
+        "film": "its roughness is the half-width of the lobe, its level stands with the relief",
+    },
+    "sensor": {
+        "preset": "stands for other keys, which count themselves",
+        "vignetting": "taken out of the picture, unless vignetting_known is false",
+        "exposure": "scales the picture; what it clips is told by saturation",
+        "read_noise": "part of shot noise",
+        "seed": "of the noise",
+    },
+}  # fmt: skip
+"""Keys of a scene that set no situations apart, each with why; all others are kinds."""
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -21,7 +60,8 @@ class Conditions:
     Parameters
     ----------
     told : str
-        What the estimators are told of the lights: "place and distance told", "place told" or "place not told".
+        What the estimators are told of the lights: "position and distance known", "position known" or
+        "position not known", and whether the known one has an error.
     relief : str
         Relief and film of the surface.
     sensor : str
@@ -30,6 +70,10 @@ class Conditions:
         Light beside the direct highlight: a diffuse base, bounces.
     camera : str
         Projection and distortion.
+    reflectance : str
+        Type of the lobe.
+    emission : str
+        What of the lights' emission estimators suffer from; empty where nothing.
     half_width_rad : float or None
         Angle between normal and sightline at which the lobe falls to half.
     focal_px : float or None
@@ -41,6 +85,8 @@ class Conditions:
     sensor: str = ""
     render: str = ""
     camera: str = ""
+    reflectance: str = ""
+    emission: str = ""
     half_width_rad: float | None = None
     focal_px: float | None = None
 
@@ -63,15 +109,24 @@ def conditions(scene: Scene) -> Conditions:
     half_width = getattr(scene.reflectance, "half_width", None)
     return Conditions(
         _told(scene), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
+        LOBES.get(scene.reflectance.type, scene.reflectance.type), _emission(scene),
         None if half_width is None else float(half_width), float(scene.camera.fx),
     )  # fmt: skip
 
 
 def _told(scene: Scene) -> str:
     if not scene.known.lights:
-        return "place not told"
+        return "position not known"
     has_distance = scene.known.distance_mm is not None or scene.known.distance_error is not None
-    return "place and distance told" if has_distance else "place told"
+    told = "position and distance known" if has_distance else "position known"
+    wrong = any(light.position_error_mm for light in scene.rig.lights)
+    return f"{told}, the position with an error" if wrong else told
+
+
+def _emission(scene: Scene) -> str:
+    parts = [] if scene.rig.emission_known else ["emission not told"]
+    parts += ["light of finite size"] if any(light.source is not None for light in scene.rig.lights) else []
+    return ", ".join(parts)
 
 
 def _relief(scene: Scene) -> str:
@@ -99,6 +154,10 @@ def _sensor(scene: Scene) -> str:
             ("vignetting not told", not sensor.vignetting_known),
             ("lossy coding", sensor.coding is not None),
             ("colour mosaic", sensor.mosaic is not None),
+            ("colour processing", sensor.colour is not None),
+            ("sharpening", sensor.sharpening is not None),
+            ("rescaled", sensor.scaling is not None),
+            ("overlay", sensor.overlay is not None),
         )
         if applies
     ]

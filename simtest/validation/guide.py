@@ -1,49 +1,79 @@
 """Which method to use, and where it breaks: a run's highlights by situation, and each method's figures there.
 
 A situation is a kind of surface under one kind of light, noise, relief and spot: settings that differ in kind never
-share one. Settings that differ in degree do, and where a method breaks among them is told by setting.
+share one. Settings that differ in degree do, and where a method breaks among them is told by setting. Methods that
+state the normal of the base are ranked apart from those that state the fine surface's: their errors are of other
+normals, and of other highlights.
 
 The best method of a situation has the lowest mean error, a highlight without an answer counting `PENALTY_DEG`. A
-method ties with it where the 95 % interval of their mean difference over the same highlights holds 0; frames, not
-highlights, are the independent units of that interval.
+method ties with it where the two differ by less than `MATTERS_DEG` or `MATTERS_SHARE`, or where the 95 % interval of
+their mean difference over the same highlights holds 0 (`simtest.validation.paired`).
 """
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from simtest.geometry import student_t
 from simtest.runtime.arrays import Array
+from simtest.validation.paired import (
+    Distinct,
+    distinct_frames,
+    is_above_zero,
+    median_interval,
+    side_by_side,
+    targets_of,
+    units,
+)
 from simtest.validation.situations import Situation, situations_of
-from simtest.validation.statistics import CONFIDENCE, PENALTY_DEG, Interval
+from simtest.validation.statistics import PENALTY_DEG, Interval
 
 BREAK_DEG = 5.0
-"""A method breaks where its mean error is larger, failed and missed highlights counting `PENALTY_DEG`, ..."""
+"""A method breaks where the mean error of its answers is larger, ..."""
 
 LEAST_ANSWERED = 0.5
 """... or where it answers less than this share of the highlights."""
 
-KEYS = ("experiment", "setting", "realisation", "true_id")  # a true highlight of a frame
+MATTERS_DEG = 0.01
+"""A smaller difference between two methods decides nothing, ..."""
+
+MATTERS_SHARE = 0.05
+"""... nor one below this share of the better method's mean error."""
 
 
 @dataclass(frozen=True)
 class MethodFigures:
-    """Figures of one method over some highlights; errors in deg."""
+    """Figures of one method over the highlights that it has rows of; errors in deg."""
 
     estimator: str
     n: int  # highlights
     answered: int
-    median_deg: float | None  # of the answers
+    missed: int  # that no detection found; the others without an answer were refused
+    median_deg: float | None  # of the answers, as `interval_deg` and `mean_deg`
     interval_deg: Interval  # 95 % interval of the median
-    mean_penalised_deg: float
+    mean_deg: float | None
+    mean_penalised_deg: float  # highlights without an answer counting `PENALTY_DEG`
+
+    @property
+    def refused(self) -> int:
+        """Highlights that were found, and that the method gave a reason for instead of a normal."""
+        return self.n - self.answered - self.missed
+
+    @property
+    def errs(self) -> bool:
+        """Whether its answers are too far off."""
+        return self.mean_deg is not None and self.mean_deg > BREAK_DEG
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether it answers too few."""
+        return self.answered < LEAST_ANSWERED * self.n
 
     @property
     def breaks(self) -> bool:
         """Whether the method breaks here."""
-        return self.mean_penalised_deg > BREAK_DEG or self.answered < LEAST_ANSWERED * self.n
+        return self.errs or self.is_silent
 
 
 @dataclass(frozen=True)
@@ -51,6 +81,7 @@ class Advice:
     """What a run says of one situation."""
 
     situation: Situation
+    target: str  # surface whose normal the methods state: "fine" or "base"
     n: int  # true highlights
     methods: Mapping[str, MethodFigures]
     best: str | None  # None where no method answered
@@ -59,14 +90,13 @@ class Advice:
 
     @property
     def broken(self) -> dict[str, MethodFigures]:
-        """The settings where the best method breaks, the mildest first."""
-        broken = {setting: figures for setting, figures in self.by_setting.items() if figures.breaks}
-        return dict(sorted(broken.items(), key=lambda item: item[1].mean_penalised_deg))
+        """The settings where the best method breaks."""
+        return {setting: figures for setting, figures in self.by_setting.items() if figures.breaks}
 
     @property
     def worst(self) -> str:
-        """The setting where the best method's mean error is largest."""
-        return max(self.by_setting, key=lambda setting: self.by_setting[setting].mean_penalised_deg)
+        """The setting where the mean error of the best method's answers is largest."""
+        return max(self.by_setting, key=lambda setting: self.by_setting[setting].mean_deg or 0.0)
 
 
 @dataclass(frozen=True)
@@ -97,89 +127,63 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
-    return Guide(shared, tuple(_advice(each, true) for each in found), tuple(left))
+    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left))
 
 
-def _advice(situation: Situation, true: pl.DataFrame) -> Advice:
+def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
+    """Return what is said of the fine surface's normals, and of the base's, as far as there are methods for them."""
     rows = true.filter(pl.col("setting").is_in(situation.settings))
-    wide, names = side_by_side(rows)
-    methods = {name: _figures(name, wide[f"of {name}"]) for name in names}
+    targets = targets_of(rows)
+    made = []
+    for target in sorted(set(targets.values()), reverse=True):
+        names = [name for name, own in targets.items() if own == target]
+        wide = side_by_side(rows, dict.fromkeys(names, target))
+        made.append(_ranked(situation, target, distinct_frames(wide), names))
+    return made
+
+
+def _ranked(situation: Situation, target: str, distinct: Distinct, names: Sequence[str]) -> Advice:
+    wide = distinct.wide
+    methods = {name: _figures(name, wide) for name in names}
     ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
     if not any(each.answered for each in ranked):
-        return Advice(situation, wide.height, methods, None, (), {})
+        return Advice(situation, target, wide.height, methods, None, (), {})
     best = ranked[0].estimator
-    frames = wide.select(pl.struct("experiment", "setting", "realisation").rank("dense")).to_series().to_numpy()
     ties = [
-        each.estimator
-        for each in ranked[1:]
-        if each.answered
-        and not _is_worse(_penalised(wide[f"of {each.estimator}"]) - _penalised(wide[f"of {best}"]), frames)
-    ]
+        each.estimator for each in ranked[1:] if each.answered and not _is_worse(each.estimator, best, distinct)
+    ]  # fmt: skip
     by_setting = {
-        str(setting): _figures(best, part[f"of {best}"])
-        for (setting,), part in wide.group_by("setting", maintain_order=True)
-    }  # fmt: skip
-    return Advice(situation, wide.height, methods, best, tuple(ties), by_setting)
+        str(setting): _figures(best, part)
+        for (setting,), part in wide.drop_nulls(f"status {best}").group_by("setting", maintain_order=True)
+    }
+    return Advice(situation, target, wide.height, methods, best, tuple(ties), by_setting)
 
 
-def side_by_side(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
-    """Return a row for each true highlight with each estimator's error.
-
-    Returns
-    -------
-    (polars.DataFrame, list of str)
-        The table, with the columns `KEYS`, `label`, and "of NAME" for each estimator: its error, deg, null without an
-        answer; and the estimators that were run on all of these highlights or some, in order of appearance.
-    """
-    names = [str(name) for name in rows["estimator"].drop_nulls().unique(maintain_order=True)]
-    error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
-    # A highlight may be found twice; the first detection counts for all estimators alike.
-    columns = [error.filter(pl.col("estimator") == name).first().alias(f"of {name}") for name in names]
-    return rows.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns), names
-
-
-def _figures(name: str, errors: pl.Series) -> MethodFigures:
-    answers = errors.drop_nulls().to_numpy()
+def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:
+    own = wide.drop_nulls(f"status {name}")
+    answered = own.drop_nulls(f"of {name}")
+    answers = answered[f"of {name}"].to_numpy()
+    mean = float(np.mean(answers)) if len(answers) else None
+    missed = int((own[f"status {name}"] == "missed").sum())
+    penalised = float(np.mean(_penalised(own, name))) if own.height else PENALTY_DEG
     median = float(np.median(answers)) if len(answers) else None
-    mean = float(np.mean(_penalised(errors)))
-    return MethodFigures(name, len(errors), len(answers), median, median_interval(answers), mean)
+    interval = median_interval(answers, *units(answered))
+    return MethodFigures(name, own.height, len(answers), missed, median, interval, mean, penalised)
 
 
-def _penalised(errors: pl.Series) -> Array:
-    return errors.fill_null(PENALTY_DEG).to_numpy()
+def _penalised(wide: pl.DataFrame, name: str) -> Array:
+    return wide[f"of {name}"].fill_null(PENALTY_DEG).to_numpy()
 
 
-def _is_worse(differences: Array, frames: Array) -> bool:
-    """Whether the interval of the mean of differences, deg, lies above 0; `frames` numbers the frame of each."""
-    n = len(differences)
-    _, index = np.unique(frames, return_inverse=True)
-    count = int(index.max()) + 1
-    if count < 2:
+def _is_worse(name: str, best: str, distinct: Distinct) -> bool:
+    """Whether a method is worse than the best by more than chance, and by enough to matter."""
+    # What only one of them was asked compares nothing.
+    both = distinct.wide.drop_nulls([f"status {name}", f"status {best}"])
+    if both.is_empty():
         return False
-    mean = float(np.mean(differences))
-    # Highlights of one frame share its noise and its light: residuals are summed before they are squared.
-    sums = np.bincount(index, weights=differences - mean)
-    deviation = math.sqrt(count / (count - 1) * float(np.sum(sums**2))) / n
-    return mean - student_t.quantile((1 + CONFIDENCE) / 2, count - 1) * deviation > 0
-
-
-def median_interval(values: Array) -> Interval:
-    """Compute the 95 % interval of a median from order statistics; None with fewer than six values.
-
-    The number of values below the median is binomial whatever their distribution, so the k-th smallest and the k-th
-    largest hold it with a confidence of at least 95 %, k the largest for which that is so.
-    """
-    n = len(values)
-    rank = max((k for k, below in enumerate(_binomial(n), 1) if below <= (1 - CONFIDENCE) / 2), default=0)
-    if not rank:
-        return None, None
-    ordered = np.sort(values)
-    return float(ordered[rank - 1]), float(ordered[n - rank])
-
-
-def _binomial(n: int) -> Iterator[float]:
-    """Yield P(B <= k) for k = 0, 1, ... below n / 2, B binomial with n draws of probability 1/2."""
-    total = 0.0
-    for k in range((n + 1) // 2):
-        total += math.exp(math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) - n * math.log(2))
-        yield total
+    at_best = _penalised(both, best)
+    differences = _penalised(both, name) - at_best
+    if np.mean(differences) < max(MATTERS_DEG, MATTERS_SHARE * float(np.mean(at_best))):
+        return False
+    certain = both["setting"].is_in(list(distinct.copied)).to_numpy()
+    return is_above_zero(differences, *units(both), certain)

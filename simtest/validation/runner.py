@@ -390,7 +390,7 @@ def _check_folder(folder: Path) -> None:
             raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
         # Leftovers of a killed run.
         held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
-        for name in [name for name in held if re.fullmatch(r"\.(results|summary|index)\.\d+\.part\.\w+", name)]:
+        for name in [name for name in held if re.fullmatch(r"\.(results|summary|guide|index)\.\d+\.part\.\w+", name)]:
             held.pop(name).unlink()
         for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
             left.unlink()
@@ -398,7 +398,8 @@ def _check_folder(folder: Path) -> None:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     # What is no part of a run.
     held.pop(LOCK, None)
-    strangers = sorted(held.keys() - {"results.parquet", "summary.json", "gallery", "figures", "index.html", PARTS})
+    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html", PARTS}
+    strangers = sorted(held.keys() - own)
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
         strangers = sorted(held)

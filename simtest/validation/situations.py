@@ -25,7 +25,7 @@ _USUAL = {"direct highlight alone", "pinhole camera", "resolved spot", "smooth s
 
 _ANALYTIC = {"plane", "cylinder", "sphere", "quadric"}
 
-_TOLD = ("relief", "sensor", "render", "camera")
+_TOLD = ("reflectance", "emission", "relief", "sensor", "render", "camera")
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,9 @@ class Situation:
     surface : str
         Kind of surface, in words; of computed frames, what is varied.
     circumstances : str
-        What else sets it apart from the run's other situations: light, noise, relief, spot; may be empty.
+        What else sets it apart from the run's other situations: light, lobe, noise, relief, spot; may be empty.
     settings : tuple of str
         Its settings.
-    kd : tuple of float
-        Least and largest curvature times distance at its true highlights; NaN where the run computes no surface.
-    eps : tuple of float
-        Least and largest light offset over distance.
     labels : tuple of str
         Names of its curves.
     """
@@ -51,8 +47,6 @@ class Situation:
     surface: str
     circumstances: str
     settings: tuple[str, ...]
-    kd: tuple[float, float] = (float("nan"), float("nan"))
-    eps: tuple[float, float] = (float("nan"), float("nan"))
     labels: tuple[str, ...] = ()
 
     @property
@@ -94,15 +88,9 @@ def situations_of(
         told = [text for text, varies in zip(kind, varying, strict=True) if text and varies]
         circumstances = ", ".join(text for text in told[1:] if text not in _USUAL)
         labels = tuple(str(label) for label in rows["label"].unique(maintain_order=True))
-        kd = _ends([*rows["kd_min"].drop_nulls(), *rows["kd_max"].drop_nulls()])
-        eps = _ends(rows["eps_over_d"].drop_nulls().to_list())
-        found.append(Situation(told[0], circumstances, tuple(settings), kd, eps, labels))
+        found.append(Situation(told[0], circumstances, tuple(settings), labels))
     order = list(dict.fromkeys(situation.circumstances for situation in found))
     return shared, sorted(found, key=lambda situation: order.index(situation.circumstances))
-
-
-def _ends(values: list[float]) -> tuple[float, float]:
-    return (min(values), max(values)) if values else (float("nan"), float("nan"))
 
 
 def _kind(rows: pl.DataFrame, told: Mapping[str, object]) -> tuple[str, ...]:
@@ -118,8 +106,11 @@ def _kind(rows: pl.DataFrame, told: Mapping[str, object]) -> tuple[str, ...]:
 
 
 def _surface(rows: pl.DataFrame) -> str:
-    """Name the kind of surface at some highlights by the signs of their principal curvatures."""
-    low, high = (rows[name].drop_nulls().to_numpy() for name in ("kd_min", "kd_max"))
+    """Name the kind of surface at some highlights by the signs of their principal curvatures.
+
+    Under a relief these are the base's: the fine surface bends both ways within every cloud.
+    """
+    low, high = (_of_base(rows, name).drop_nulls().to_numpy() for name in ("kd_min", "kd_max"))
     # A curvature that lies within the limit at all highlights is none; one that changes sign is mixed.
     signs = [_sign(values) for values in (low, high)]
     names = {
@@ -127,6 +118,12 @@ def _surface(rows: pl.DataFrame) -> str:
         (-1, 1): "saddle",
     }  # fmt: skip
     return MIXED if None in signs else names[signs[0] or 0, signs[1] or 0]
+
+
+def _of_base(rows: pl.DataFrame, name: str) -> pl.Series:
+    """Return a column of the base, and of the fine surface where the base has none."""
+    base = f"{name}_base"
+    return rows.select(pl.coalesce(base, name)).to_series() if base in rows.columns else rows[name]
 
 
 def _sign(values: np.ndarray) -> int | None:

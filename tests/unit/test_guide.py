@@ -3,21 +3,26 @@
 import io
 import json
 from itertools import groupby
+from typing import get_args
 
 import numpy as np
 import polars as pl
 import pytest
-from scipy.stats import binom
 from test_report import make_run
 
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows
+from simtest.report.pairs import pairs
 from simtest.report.run_folder import read_run
 from simtest.spec import load_experiment, load_scene
+from simtest.spec.reflectance import Reflectance
+from simtest.spec.rig import LightSpec, Rig
+from simtest.spec.sensor import Sensor
 from simtest.validation.cases import expand
-from simtest.validation.conditions import conditions, conditions_of
-from simtest.validation.guide import guide_of, median_interval
+from simtest.validation.conditions import DEGREES, conditions, conditions_of
+from simtest.validation.guide import guide_of
+from simtest.validation.paired import LEAST_FRAMES, median_interval
 from simtest.validation.run_summary import run_summary
 
 FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
@@ -130,13 +135,37 @@ def test_tissue_of_mixed_curvature_is_named_by_its_surface():
 
 
 @pytest.mark.parametrize(
+    ("base", "surface"), [((0.0, 0.0), "flat"), ((0.0, 0.5), "outside of a tube"), ((-0.5, 0.0), "inside of a tube")]
+)
+def test_a_surface_with_relief_is_named_by_its_base(base, surface):
+    bends = {"kd_min_base": base[0], "kd_max_base": base[1]}
+    rows = [
+        row for first, fine in enumerate(((-3.0, 2.0), (0.5, 4.0), (-2.0, -1.0)))
+        for row in rows_of("cone_axis", [1.0], first=first, kd_min=fine[0], kd_max=fine[1], **bends)
+    ]  # fmt: skip
+    assert guide_from(rows).advice[0].situation.surface == surface
+    # Without a base of its own, the surface itself counts.
+    none = [row | {"kd_min_base": None, "kd_max_base": None} for row in rows]
+    assert guide_from(none).advice[0].situation.surface == "mixed curvature"
+
+
+@pytest.mark.parametrize(
     ("errors", "said", "is_broken"),
     [
-        ({"a": [1.0] * 4, "b": [2.0] * 4}, "not here: at most 2°, b", False),
+        ({"a": [1.0] * 4, "b": [2.0] * 4}, "nowhere here (worst: 2°, at b)", False),
+        ({"a": [1.0] * 4}, "nowhere here (worst: 1°)", False),
         ({"a": [1.0] * 4, "b": [6.0] * 4}, "1 of 2 settings, b: mean 6°", True),
-        ({"a": [1.0] * 4, "b": [6.0] * 4, "c": [9.0] * 4}, "2 of 3 settings, b: mean 6°; worst 9°", True),
+        ({"a": [1.0] * 4, "b": [6.0] * 4, "c": [9.0] * 4}, "2 of 3 settings: mean 6° (b) to 9° (c)", True),
         ({"a": [7.0] * 4, "b": [6.0] * 4}, "all 2 settings: mean 6° or more", True),
         ({"a": [0.1, None, "missed", None]}, "here: 1 of 4 answered", True),
+        ({"a": [0.1, None, None], "b": [None, "missed"]}, "all 2 settings: 1 of 3 answered or fewer", True),
+        (
+            {"a": [0.1, None, None], "b": [9.0]},
+            "1 of 2 settings, b: mean 9°; 1 of 2 settings, a: 1 of 3 answered",
+            True,
+        ),
+        # One in 18 refused: 5.6 % of 90 deg alone are 5 deg.
+        ({"a": [*noisy(1.0, 17, spread=0.001), None]}, "nowhere here (worst: 1°)", False),
         ({"a": [None, "missed"]}, "no method answered", True),
     ],
 )
@@ -153,17 +182,137 @@ def test_false_detections_count_nowhere_and_settings_without_highlights_are_name
     assert guide_of(pl.DataFrame(false)).advice == ()
 
 
-@pytest.mark.parametrize("count", [6, 7, 20, 101])
-def test_the_interval_of_a_median_holds_it_in_95_of_100_samples(count):
-    low, high = median_interval(np.arange(1.0, count + 1))
-    # Order statistics low and high hold the median unless fewer than `low`, or more than `high` - 1, lie below it.
-    held = binom.cdf(high - 1, count, 0.5) - binom.cdf(low - 1, count, 0.5)
-    narrower = binom.cdf(high - 2, count, 0.5) - binom.cdf(low, count, 0.5)
-    assert narrower < 0.95 <= held
+def frames_of(estimator, errors, **more):
+    """Rows of frames that hold several highlights; a list of errors for each."""
+    return [
+        row | {"true_id": true_id}
+        for realisation, own in enumerate(errors)
+        for true_id, error in enumerate(own)
+        for row in rows_of(estimator, [error], first=realisation, **more)
+    ]
 
 
-def test_five_values_have_no_interval():
-    assert median_interval(np.arange(5.0)) == (None, None)
+def test_an_estimator_answers_for_the_highlights_that_it_has_rows_of():
+    """One row a cloud, of one cloud a frame, beside a row of each of its glints."""
+    base = {"kd_min_base": 0.0, "kd_max_base": 0.0}
+    glints = frames_of("cone_axis", [noisy(8.0, 7, seed) for seed in range(6)], target="fine", **base)
+    clouds = frames_of("cloud", [[error] for error in noisy(2.0, 6, seed=9)], target="base", **base)
+    fine, normals_of_base = guide_from(glints, clouds).advice
+    assert (fine.target, fine.best, fine.n, list(fine.methods)) == ("fine", "cone_axis", 42, ["cone_axis"])
+    own = normals_of_base.methods["cloud"]
+    assert (normals_of_base.target, normals_of_base.best, own.n, own.answered) == ("base", "cloud", 6, 6)
+    assert own.mean_penalised_deg == own.mean_deg == pytest.approx(2.0, abs=0.2)
+    assert [row.surface for row in guide_rows(guide_from(glints, clouds))] == ["flat", "flat, normal of the base"]
+
+
+def test_estimators_of_different_surfaces_are_no_pair(tmp_path):
+    """The base's highlight 0 is not the fine surface's highlight 0."""
+    rows = [*rows_of("cone_axis", noisy(1.0, 5), target="fine"), *rows_of("curved", noisy(2.0, 5), target="fine"),
+            *rows_of("cloud", noisy(3.0, 5), target="base")]  # fmt: skip
+    found = pairs(read_run(make_run(tmp_path, "noise", rows, items=0)))
+    assert [(pair.first, pair.second, pair.n) for pair in found] == [("cone_axis", "curved", 5)]
+
+
+def test_of_one_surface_too_only_highlights_with_a_row_count():
+    every, few = noisy(1.0, 20), noisy(0.5, 8, seed=1)
+    (advice,) = guide_from(rows_of("cone_axis", every), rows_of("curved", few)).advice
+    assert (advice.best, advice.methods["curved"].n, advice.methods["cone_axis"].n) == ("curved", 8, 20)
+    assert advice.ties == ()
+
+
+def test_a_failed_cloud_is_one_of_the_base():
+    parts = (rows_of("cloud", [None, 2.0, "missed"], target="base"), rows_of("cone_axis", [1.0], target="fine"))
+    fine, base = guide_from(*parts).advice
+    assert (fine.n, base.n, base.methods["cloud"].missed, base.methods["cloud"].refused) == (1, 3, 1, 1)
+    # A failure of an estimator of single highlights names no surface; its answers do.
+    odd = [row | {"target": "base" if row["status"] == "ok" else "fine"} for row in rows_of("own", [None, 2.0])]
+    (advice,) = guide_from(odd).advice
+    assert (advice.target, advice.n) == ("base", 2)
+
+
+def test_spread_between_settings_does_not_hide_a_worse_method():
+    """As inside of a tube: one method is worse in every frame of some settings, and as good in the others."""
+    steps = (0.0, 0.0, 0.02, 0.5, 3.0)
+    one, other = [], []
+    for number, step in enumerate(steps):
+        errors = noisy(0.05, 3, seed=number, spread=0.005)
+        one += rows_of("cone_axis", errors, f"r={number}")
+        shifted = [error + step + shift for error, shift in zip(errors, noisy(0, 3, 50 + number, 0.01), strict=True)]
+        other += rows_of("bisector", shifted, f"r={number}")
+    (advice,) = guide_from(one, other).advice
+    assert (advice.best, advice.ties) == ("cone_axis", ())
+
+
+def test_one_frame_a_setting_leaves_the_spread_between_settings():
+    one = [row for k in range(5) for row in rows_of("cone_axis", [1.0 + k / 100], f"r={k}")]
+    far, near = (
+        [row for k, delta in enumerate(deltas) for row in rows_of("bisector", [1.0 + k / 100 + delta], f"r={k}")]
+        for deltas in ([0.5, 0.6, 0.7, 0.5, 0.6], [0.0, 0.0, 0.02, 0.5, 3.0])
+    )
+    (advice,) = guide_from(one, far).advice
+    assert advice.ties == ()
+    (advice,) = guide_from(one, near).advice
+    assert advice.ties == ("bisector",)
+
+
+def test_frames_that_are_copies_count_once():
+    """Without noise, realisations repeat each other: no interval, and what matters decides."""
+    errors = {"cone_axis": 1.0, "centroid": 1.04, "bisector": 1.06, "brightest_point": 3.0}
+    (advice,) = guide_from(*(rows_of(name, [error] * 20) for name, error in errors.items())).advice
+    assert advice.n == 1
+    assert advice.methods["cone_axis"].interval_deg == (None, None)
+    # 0.04 deg are below 5 % of the best method's mean; 0.06 are not, and copies leave nothing to chance.
+    assert (advice.best, advice.ties) == ("cone_axis", ("centroid",))
+    # A single frame may owe its order to noise: nothing says that another would be the same.
+    (advice,) = guide_from(*(rows_of(name, [error]) for name, error in errors.items())).advice
+    assert advice.ties == ("centroid", "bisector", "brightest_point")
+
+
+def test_frames_without_an_answer_are_no_copies():
+    (advice,) = guide_from(rows_of("cone_axis", ["missed"] * 9 + noisy(1.0, 6))).advice
+    figures = advice.methods["cone_axis"]
+    assert (figures.n, figures.answered, figures.missed, figures.refused) == (15, 6, 9, 0)
+
+
+def test_differences_below_a_hundredth_of_a_degree_are_tied():
+    errors = noisy(0.02, 20, spread=0.001)
+    for delta, ties in ((0.009, ("curved",)), (0.011, ())):
+        (advice,) = guide_from(rows_of("cone_axis", errors), rows_of("curved", [e + delta for e in errors])).advice
+        assert advice.ties == ties
+
+
+def test_what_was_missed_and_what_was_refused_is_told():
+    (row,) = guide_rows(guide_from(rows_of("cone_axis", [*noisy(1.0, 3), None, "missed", "missed"])))
+    assert (row.answered, row.unanswered) == ("3 of 6", "2 missed, 1 refused")
+
+
+@pytest.mark.parametrize(("frames", "highlights"), [(12, 3), (8, 2)])
+def test_the_interval_of_a_median_holds_it_in_95_of_100_samples_of_frames(frames, highlights):
+    random, trials = np.random.default_rng(5), 150
+    settings = np.zeros(frames * highlights, int)
+    number = np.repeat(np.arange(frames), highlights)
+    held = alone = 0
+    for _ in range(trials):
+        values = random.standard_normal(frames)[number] + 0.3 * random.standard_normal(len(number))
+        for counted, units in (("frames", number), ("highlights", np.arange(len(number)))):
+            low, high = median_interval(values, settings, units)
+            held += counted == "frames" and low <= 0 <= high
+            alone += counted == "highlights" and low <= 0 <= high
+    # Four standard deviations below 95 % in 150 trials.
+    assert held / trials > 0.88
+    # As independent highlights, the same values claim too much.
+    assert alone < held - 0.05 * trials
+
+
+def test_settings_of_few_frames_have_no_interval():
+    few, enough = (np.arange(float(n)) for n in (LEAST_FRAMES - 1, LEAST_FRAMES))
+    assert median_interval(few, np.zeros(len(few), int), np.arange(len(few))) == (None, None)
+    low, high = median_interval(enough, np.zeros(len(enough), int), np.arange(len(enough)))
+    assert low < np.median(enough) < high
+    assert median_interval(np.empty(0), np.empty(0, int), np.empty(0, int)) == (None, None)
+    # Spread between settings alone is none.
+    both = np.repeat([1.0, 2.0, 3.0], 6)
+    assert median_interval(both, np.repeat([0, 1, 2], 6), np.arange(18)) == (2.0, 2.0)
 
 
 def test_methods_say_what_they_are_and_where_they_break():
@@ -188,10 +337,85 @@ def test_conditions_come_from_the_scene():
     assert plain.half_width_rad == pytest.approx(0.083063, abs=1e-6)  # n = 50
     changed = {"sensor.noise_sigma": 0.01, "sensor.full_well": 1000, "known.lights": False, "render.path_depth": 3}
     found = conditions(load_scene("plane", changed))
-    assert (found.told, found.sensor) == ("place not told", "noise up to 2 %, shot noise")
+    assert (found.told, found.sensor) == ("position not known", "noise up to 2 %, shot noise")
     assert "bounced light" in found.render
     told = load_scene("plane", {"known.distance_error": 0.0})
-    assert conditions(told).told == "place and distance told"
+    assert conditions(told).told == "position and distance known"
+
+
+# A change of each key that sets situations apart, with what it needs beside.
+KINDS = {
+    "rig": {
+        "emission_known": {"rig.emission_known": False},
+        "lights.position_error_mm": {"rig.lights.0.position_error_mm": 0.2},
+        "lights.source": {"rig.lights.0.source.type": "disc", "rig.lights.0.source.radius_mm": 1.0},
+    },
+    "reflectance": {
+        "type": {"reflectance.type": "rough_conductor"},
+        "diffuse": {"reflectance.diffuse": 0.3},
+        "exponent": {"reflectance.exponent": 2e4},
+        "alpha": {"reflectance.type": "rough_conductor", "reflectance.alpha": 0.003},
+        "roughness": {"reflectance.type": "principled", "reflectance.roughness": 0.05},
+    },
+    "sensor": {
+        "point_spread_px": {"sensor.point_spread_px": 1.0},
+        "full_well": {"sensor.full_well": 1000},
+        "noise_sigma": {"sensor.noise_sigma": 0.0},
+        "saturation": {"sensor.saturation": True},
+        "response": {"sensor.response.type": "srgb"},
+        "response_known": {"sensor.response.type": "srgb", "sensor.response_known": False},
+        "bits": {"sensor.bits": 8},
+        "mosaic": {"sensor.mosaic.pattern": "rggb"},
+        "colour": {"sensor.colour.white_balance": [1.2, 1.0, 1.1]},
+        "sharpening": {"sensor.sharpening.amount": 0.5},
+        "scaling": {"sensor.scaling.factor": 0.5},
+        "overlay": {"sensor.overlay.boxes": [{"x": 0, "y": 0, "width": 0.1, "height": 0.1}]},
+        "coding": {"sensor.bits": 8, "sensor.coding.type": "jpeg"},
+        "vignetting_known": {"sensor.vignetting_known": False},
+    },
+}
+
+
+def keys_of(*models):
+    """Keys of some models; those of a light behind "lights"."""
+    names = {name for model in models for name in model.model_fields}
+    if "lights" in names:
+        names = (names - {"lights"}) | {f"lights.{name}" for name in LightSpec.model_fields}
+    return names
+
+
+@pytest.mark.parametrize(
+    ("part", "models"),
+    [("rig", [Rig]), ("sensor", [Sensor]), ("reflectance", get_args(get_args(Reflectance)[0]))],
+)
+def test_every_key_of_a_scene_is_of_a_kind_or_a_degree(part, models):
+    keys, degrees = keys_of(*models), set(DEGREES[part])
+    assert keys == KINDS[part].keys() | degrees
+    assert not KINDS[part].keys() & degrees
+
+
+@pytest.mark.parametrize("key", [f"{part} {key}" for part, keys in KINDS.items() for key in keys])
+def test_a_key_of_a_kind_sets_situations_apart(key):
+    part, name = key.split()
+    changes = KINDS[part][name]
+    # Without the key alone, so that what it needs beside does not count.
+    last = name.removeprefix("lights.")
+    beside = {path: value for path, value in changes.items() if last not in path.split(".")}
+    told = {name: conditions(load_scene("plane", own)).to_json() for name, own in (("a", changes), ("b", beside))}
+    offset = FLAT | {"eps_over_d": 0.05}
+    parts = (rows_of("cone_axis", [1.0], setting, **offset) for setting in told)
+    assert len(guide_from(*parts, conditions=told).advice) == 2
+
+
+def test_what_is_not_told_of_the_light_and_the_lobe_set_situations_apart():
+    found = conditions(load_scene("plane", {"rig.emission_known": False}))
+    assert (found.emission, found.reflectance) == ("emission not told", "Phong lobe")
+    told = {"a": found.to_json(), "b": conditions(load_scene("plane")).to_json(),
+            "c": conditions(load_scene("plane", {"reflectance.type": "rough_conductor"})).to_json()}  # fmt: skip
+    guide = guide_from(*(rows_of("cone_axis", [1.0], name) for name in told), conditions=told)
+    assert {each.situation.circumstances for each in guide.advice} == {
+        "Phong lobe, emission not told", "Phong lobe", "rough conductor"
+    }  # fmt: skip
 
 
 def test_summary_json_holds_conditions_and_descriptions():
@@ -234,3 +458,55 @@ def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_l
 def test_a_run_without_true_highlights_says_so(tmp_path):
     run = make_run(tmp_path, "noise", [row | {"true_id": None} for row in rows_of("cone_axis", [1.0])], items=0)
     assert "nothing to compare" in printed(run, 80, terminal=False)
+
+
+def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, capsys):
+    from simtest.cli.printing import print_run
+
+    run = make_run(tmp_path, items=0)
+    write_report(run)
+    content = json.loads((run / "guide.json").read_text(encoding="utf-8"))
+    guide = read_run(run).guide
+    for row, text, advice in zip(content["rows"], guide_rows(guide), guide.advice, strict=True):
+        assert (row["surface"], row["best"], row["breaks"]) == (text.surface, advice.best, text.breaks)
+        figures = row["methods"][advice.best]
+        assert (figures["n"], figures["mean_deg"]) == (
+            advice.methods[advice.best].n,
+            advice.methods[advice.best].mean_deg,
+        )
+        assert tuple(row["settings"]) == advice.situation.settings
+    print_run(run)
+    assert json.loads(capsys.readouterr().out)["guide"] == content
+
+
+@pytest.mark.parametrize("spoil", [lambda file: file.unlink(), lambda file: file.write_text("{")])
+def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
+    from simtest.cli.guide_table import print_guide
+    from simtest.cli.printing import print_run
+
+    run = make_run(tmp_path, items=0)
+    write_report(run)
+    spoil(run / "guide.json")
+    print_guide(run)
+    said = capsys.readouterr().out
+    assert "guide.json: missing" in said
+    assert "No true highlight" not in said
+    print_run(run)
+    assert json.loads(capsys.readouterr().out)["guide"] is None
+
+
+def test_verbose_prints_every_situation(tmp_path, monkeypatch):
+    from simtest.cli.manners import MANNERS
+    from simtest.cli.printing import MOST_ROWS
+
+    rows = [
+        row | {"surface": f"organ {k}"} for k in range(MOST_ROWS + 3) for row in rows_of("cone_axis", [1.0], f"{k}")
+    ]
+    run = make_run(tmp_path, "noise", rows, items=0)
+    short = printed(run, 80, terminal=False)
+    assert "and 3 more; --verbose prints them all" in " ".join(short.split())
+    assert f"organ {MOST_ROWS}" not in short
+    monkeypatch.setattr(MANNERS, "verbose", True)
+    every = printed(run, 80, terminal=False)
+    assert f"organ {MOST_ROWS + 2}" in every
+    assert "--verbose" not in every

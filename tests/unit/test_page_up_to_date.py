@@ -17,7 +17,7 @@ def run(tmp_path):
 
 
 def contents(run):
-    files = [run / "index.html", *sorted((run / "figures").iterdir())]
+    files = [run / "index.html", run / "guide.json", *sorted((run / "figures").iterdir())]
     return {file.name: file.read_bytes() for file in files}
 
 
@@ -31,7 +31,9 @@ def draws(monkeypatch, run):
 
 
 def test_a_page_that_is_up_to_date_stays(run, monkeypatch):
-    before = {file: file.stat().st_mtime_ns for file in (run / "index.html", *(run / "figures").iterdir())}
+    before = {
+        file: file.stat().st_mtime_ns for file in (run / "index.html", run / "guide.json", *(run / "figures").iterdir())
+    }
     told = []
     assert not draws(monkeypatch, run)
     write_report(run, lambda *step: told.append(step))
@@ -63,7 +65,19 @@ def spoil_the_note(run):
     file.write_text(file.read_text(encoding="utf-8").replace('{"key":', '["key":'), encoding="utf-8")
 
 
-@pytest.mark.parametrize("damage", [remove_a_figure, cut_a_figure, cut_the_page, edit_the_page, spoil_the_note])
+def remove_the_guide(run):
+    (run / "guide.json").unlink()
+
+
+def edit_the_guide(run):
+    file = run / "guide.json"
+    file.write_text(file.read_text(encoding="utf-8").replace("median", "mean"), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [remove_the_guide, edit_the_guide, remove_a_figure, cut_a_figure, cut_the_page, edit_the_page, spoil_the_note],
+)
 def test_what_is_damaged_is_written_again(run, monkeypatch, damage):
     whole = contents(run)
     damage(run)

@@ -1,0 +1,191 @@
+"""Compares estimators on the same highlights; frames, not highlights, are the independent units.
+
+Highlights of one frame share its noise, its light and its surface. Settings are chosen, not drawn, so the spread
+between them is no noise: all spread is taken within settings. A frame that repeats another of its setting to the last
+bit, as every realisation without noise does, says nothing new and counts once.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from simtest.geometry import student_t
+from simtest.runtime.arrays import Array
+from simtest.validation.statistics import CONFIDENCE, Interval
+
+FRAME = ("experiment", "setting", "realisation")
+
+KEYS = (*FRAME, "target", "true_id")
+"""A true highlight of a frame. Of an estimator of clouds ``true_id`` numbers the base's highlights: a list apart."""
+
+LEAST_FRAMES = 5
+"""Distinct frames that each setting needs before the interval of a median is stated."""
+
+_RESAMPLES = 1000
+_CHUNK = 2_000_000  # numbers in memory at once
+
+
+def targets_of(rows: pl.DataFrame) -> dict[str, str]:
+    """Return the surface whose normal each estimator states, "fine" or "base", in order of appearance."""
+    names = [str(name) for name in rows["estimator"].drop_nulls().unique(maintain_order=True)]
+    if "target" not in rows.columns:
+        return dict.fromkeys(names, "fine")
+    # A failure states no surface of its own: answers tell first.
+    told = rows.sort(pl.col("status") == "ok", descending=True, maintain_order=True).drop_nulls("target")
+    found = dict(told.group_by("estimator", maintain_order=True).agg(pl.col("target").first()).iter_rows())
+    return {name: str(found.get(name, "fine")) for name in names}
+
+
+def side_by_side(rows: pl.DataFrame, targets: Mapping[str, str]) -> pl.DataFrame:
+    """Return a row for each true highlight with each estimator's error.
+
+    Parameters
+    ----------
+    rows : polars.DataFrame
+        Rows of results.parquet with a true highlight.
+    targets : mapping
+        Estimators and the surface whose normal they state (`targets_of`).
+
+    Returns
+    -------
+    polars.DataFrame
+        The columns `KEYS` and `label`; for each estimator "status NAME", null for a highlight that it has no row of,
+        and "of NAME", its error, deg, null without an answer.
+    """
+    error = pl.when(pl.col("status") == "ok").then(pl.col("error_deg"))
+    columns = []
+    for name in targets:
+        own = pl.col("estimator") == name
+        # A highlight may be found twice; the first detection counts for all estimators alike.
+        columns += [pl.col("status").filter(own).first().alias(f"status {name}"),
+                    error.filter(own).first().alias(f"of {name}")]  # fmt: skip
+    stated = pl.col("estimator").replace_strict(targets, default=None, return_dtype=pl.String).alias("target")
+    told = rows.with_columns(stated).drop_nulls("target")
+    return told.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns)
+
+
+@dataclass(frozen=True)
+class Distinct:
+    """Highlights of frames that differ.
+
+    Parameters
+    ----------
+    wide : polars.DataFrame
+        Rows of `side_by_side` of all frames but copies.
+    copied : frozenset of str
+        Settings whose frames were all the same, two at least: their errors have no spread.
+    """
+
+    wide: pl.DataFrame
+    copied: frozenset[str]
+
+
+def distinct_frames(wide: pl.DataFrame) -> Distinct:
+    """Leave out each frame whose errors are those of an earlier frame of its setting, to the last bit.
+
+    Frames in which nothing was answered cannot be told apart, and all stay.
+    """
+    errors = [name for name in wide.columns if name.startswith("of ")]
+    marked = wide.with_columns(
+        wide.select("true_id", *errors).hash_rows().alias("_mark"),
+        pl.any_horizontal(pl.col(name).is_not_null() for name in errors).alias("_answered"),
+    )
+    frames = marked.group_by(FRAME, maintain_order=True).agg(
+        pl.col("_mark").sort().cast(pl.String).str.join(",").alias("_marks"), pl.col("_answered").any()
+    )
+    first = pl.struct("experiment", "setting", "_marks").is_first_distinct()
+    frames = frames.with_columns((first | ~pl.col("_answered")).alias("_kept"))
+    counts = frames.group_by("setting").agg(pl.len().alias("all"), pl.col("_kept").sum().alias("kept"))
+    copied = counts.filter((pl.col("all") > 1) & (pl.col("kept") == 1))["setting"].to_list()
+    kept = wide.join(frames.filter("_kept").select(FRAME), on=FRAME, how="semi", maintain_order="left")
+    return Distinct(kept, frozenset(map(str, copied)))
+
+
+def units(wide: pl.DataFrame) -> tuple[Array, Array]:
+    """Return the number of the setting and of the frame of each highlight, from 0."""
+    numbered = wide.select(
+        pl.struct("experiment", "setting").rank("dense").alias("setting") - 1, pl.struct(FRAME).rank("dense") - 1
+    )
+    return numbered.to_series(0).to_numpy().astype(int), numbered.to_series(1).to_numpy().astype(int)
+
+
+def is_above_zero(differences: Array, settings: Array, frames: Array, certain: NDArray[np.bool_]) -> bool:
+    """Return whether the 95 % interval of the mean of differences lies above 0.
+
+    Parameters
+    ----------
+    differences : ndarray
+        Of each highlight, deg.
+    settings, frames : ndarray
+        Number of the setting and of the frame of each.
+    certain : ndarray
+        Whether its setting has no spread; such highlights widen no interval.
+    """
+    if not len(differences):
+        return False
+    mean = float(np.mean(differences))
+    if certain.all():
+        return mean > 0
+    values, setting, frame = (each[~certain] for each in (differences, settings, frames))
+    count, kinds = len(np.unique(frame)), len(np.unique(setting))
+    freedom = count - kinds
+    if freedom:
+        totals, sizes = np.bincount(setting, values), np.bincount(setting)
+        residuals = values - (totals / np.maximum(sizes, 1))[setting]
+    else:
+        # One frame a setting: no spread within any is seen, so that between them has to do.
+        residuals, freedom = values - float(np.mean(values)), count - 1
+    if not freedom:
+        return False
+    # Highlights of one frame are no draws of their own: residuals are summed before they are squared.
+    sums = np.bincount(frame, residuals)
+    deviation = math.sqrt(count / freedom * float(np.sum(sums**2))) / len(differences)
+    return mean - student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation > 0
+
+
+def median_interval(values: Array, settings: Array, frames: Array) -> Interval:
+    """Compute the 95 % interval of a median by resampling the frames within each setting.
+
+    Of n frames n - 1 are drawn, with replacement, and weigh n / (n - 1): n draws would make the interval too narrow
+    where n is small (Rao and Wu, J. Am. Stat. Assoc. 83, 1988, 231).
+
+    Returns
+    -------
+    (float or None, float or None)
+        None where a setting has fewer than `LEAST_FRAMES` frames. The resampling is seeded: the same values give the
+        same interval.
+    """
+    if not len(values):
+        return None, None
+    numbers, first, frame = np.unique(frames, return_index=True, return_inverse=True)
+    of_setting = settings[first]
+    _, sizes = np.unique(of_setting, return_counts=True)
+    if sizes.min() < LEAST_FRAMES:
+        return None, None
+    order = np.argsort(values, kind="stable")
+    ordered, frame = values[order], frame[order]
+    draws = np.empty((_RESAMPLES, len(numbers)))
+    random = np.random.default_rng(0)
+    for setting in np.unique(of_setting):
+        own = np.flatnonzero(of_setting == setting)
+        n = len(own)
+        draws[:, own] = random.multinomial(n - 1, np.full(n, 1 / n), _RESAMPLES) * (n / (n - 1))
+    step = max(1, _CHUNK // len(ordered))
+    medians = [_medians(ordered, draws[at : at + step][:, frame]) for at in range(0, _RESAMPLES, step)]
+    low, high = np.quantile(np.concatenate(medians), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _medians(ordered: Array, weights: Array) -> Array:
+    """Return the median of ordered values under each row of weights."""
+    total = np.cumsum(weights, axis=1)
+    half = total[:, -1:] / 2
+    slack = 1e-9 * half
+    lower = np.argmax(total >= half - slack, axis=1)
+    upper = np.argmax(total > half + slack, axis=1)
+    medians: Array = (ordered[lower] + ordered[upper]) / 2
+    return medians
