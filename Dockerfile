@@ -1,6 +1,6 @@
 # simtest in a container, installed by pip from the checkout with the pinned packages; LLVM comes by pip too.
 #   docker build -t simtest .
-#   docker run --rm -v "$PWD:/work" simtest validate overview
+#   docker run --rm -v "$PWD:/data" simtest validate overview
 FROM python:3.13-slim-bookworm
 
 # libatomic: Mitsuba links it. EGL: `simtest view --screenshot` draws with it where there is no display.
@@ -17,6 +17,6 @@ RUN pip install --no-cache-dir -c constraints.txt . \
 
 # Kernels and generated anatomies are kept in the user's home.
 USER 1000
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["simtest"]
 CMD ["doctor"]

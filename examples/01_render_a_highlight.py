@@ -9,7 +9,7 @@ Picture: the frame with the BP, the depth, and the tilt of the normals. Takes 3 
 
 import matplotlib.pyplot as plt
 import numpy as np
-from common import grey, options, save
+from common import TRUTH, grey, options, save
 
 import simtest
 
@@ -30,7 +30,7 @@ print(f"distance times curvature: {bp.kd_min:.2f} along the cylinder, {bp.kd_max
 tilt = np.degrees(np.arccos(np.clip(-frame.truth.normal[..., 2], -1, 1)))
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.4), layout="constrained")
 axes[0].imshow(grey(frame.image), cmap="gray", vmin=0, vmax=1)
-axes[0].plot(*bp.bp_px, "+", color="#D55E00", markersize=14, markeredgewidth=2, label="true BP")
+axes[0].plot(*bp.bp_px, "+", color=TRUTH, markersize=14, markeredgewidth=2, label="true BP")
 axes[0].legend(loc="lower right")
 axes[0].set_title("frame")
 for axis, values, title, unit in (

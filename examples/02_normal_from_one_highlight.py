@@ -10,7 +10,7 @@ of processor time.
 
 import matplotlib.pyplot as plt
 import numpy as np
-from common import COLOURS, angle_deg, grey, options, save
+from common import COLOURS, TRUTH, angle_deg, grey, options, save
 
 import simtest
 
@@ -37,7 +37,7 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained"
 left.imshow(grey(frame.image), cmap="gray", extent=(0, size, size, 0))
 for number, (_, curve) in enumerate(spot.estimates["cone_axis"].contours(spot.patch)):
     left.plot(*curve.T, color=COLOURS["cone_axis"], linewidth=1.2, label="" if number else "isophotes")
-left.plot(*truth.bp_px, "+", color="#D55E00", markersize=12, markeredgewidth=2, label="true BP")
+left.plot(*truth.bp_px, "+", color=TRUTH, markersize=12, markeredgewidth=2, label="true BP")
 x, y, width, height = spot.region.box
 left.set(xlim=(x, x + width), ylim=(y + height, y), xlabel="x, px", ylabel="y, px", title="highlight")
 left.legend(loc="lower right")

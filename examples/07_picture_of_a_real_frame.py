@@ -10,6 +10,9 @@ Picture: the frame with a needle at each isolated highlight. Wide bright patches
 carry no single normal and get none. Takes 9 s of processor time.
 """
 
+import sys
+from collections import Counter
+
 import matplotlib.pyplot as plt
 import numpy as np
 from common import COLOURS, options, save
@@ -35,20 +38,18 @@ spots = simtest.reconstruct(picture, FOV_DEG)
 assumed = "; ".join(str(each) for each in spots.choices.assumed)
 print(f"{len(spots)} isolated highlights; assumed: {assumed}")
 
-found = {}
-for spot in spots:
-    result = spot.estimates["cone_axis"]
-    if isinstance(result, simtest.Failure):
-        found.setdefault(result.reason, []).append(spot)
-        continue
-    found.setdefault("ok", []).append(result)
-sigmas = [np.degrees(np.sqrt(np.trace(each.covariance))) for each in found["ok"] if each.covariance is not None]
-print({str(outcome): len(those) for outcome, those in found.items()})
+results = [spot.estimates["cone_axis"] for spot in spots]
+answers = [each for each in results if not isinstance(each, simtest.Failure)]
+outcomes = dict(Counter(str(each.reason) if isinstance(each, simtest.Failure) else "ok" for each in results))
+if not answers:
+    sys.exit(f"{chosen.picture}: no highlight with a normal: {outcomes or 'none found'}")
+print(outcomes)
+sigmas = [np.degrees(np.sqrt(np.trace(each.covariance))) for each in answers if each.covariance is not None]
 
 figure, axis = plt.subplots(figsize=(7.4, 5.2), layout="constrained")
 axis.imshow(picture)
-x, y = np.transpose([each.look_px for each in found["ok"]])
-u, v = np.transpose([each.normal[:2] * NEEDLE * picture.shape[1] for each in found["ok"]])
+x, y = np.transpose([each.look_px for each in answers])
+u, v = np.transpose([each.normal[:2] * NEEDLE * picture.shape[1] for each in answers])
 axis.quiver(x, y, u, v, angles="xy", scale_units="xy", scale=1, color=COLOURS["curved"], width=0.006,
             edgecolor="black", linewidth=0.5, label="normal, as seen in the picture")  # fmt: skip
 axis.plot(x, y, "o", color="black", markersize=3)

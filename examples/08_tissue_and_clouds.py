@@ -9,7 +9,7 @@ Picture: the frame, and the angles of all normals from the base's. Takes 5 s of 
 
 import matplotlib.pyplot as plt
 import numpy as np
-from common import COLOURS, angle_deg, options, save
+from common import COLOURS, TRUTH, angle_deg, options, save
 
 import simtest
 
@@ -45,13 +45,13 @@ for name, found in normals.items():
 
 figure, (left, chart) = plt.subplots(1, 2, figsize=(10, 4.9), layout="constrained")
 left.imshow(picture)
-left.plot(*frame.clouds[0].bp_px, "+", color="#D55E00", markersize=16, markeredgewidth=2.5, label="BP of the base")
+left.plot(*frame.clouds[0].bp_px, "+", color=TRUTH, markersize=16, markeredgewidth=2.5, label="BP of the base")
 left.set(xlabel="x, px", ylabel="y, px", title="frame")
 left.legend(loc="lower right")
 for name, marker, label in (("cone_axis", "o", "single highlights (cone_axis)"), ("cloud", "*", "their cloud")):
     angles = np.degrees(np.array(normals[name]) @ across.T)
     chart.plot(*angles.T, marker, color=COLOURS[name], markersize=15 if marker == "*" else 5, label=label)
-chart.plot(0, 0, "+", color="#D55E00", markersize=16, markeredgewidth=2.5, label="true normal of the base")
+chart.plot(0, 0, "+", color=TRUTH, markersize=16, markeredgewidth=2.5, label="true normal of the base")
 chart.set(xlabel="angle from the base's normal, deg", ylabel="angle across, deg", title="estimated normals")
 chart.set_aspect("equal", adjustable="datalim")
 chart.grid(color="#E7E7E7")

@@ -12,7 +12,7 @@ import sys
 
 import matplotlib.pyplot as plt
 import numpy as np
-from common import options, save
+from common import TRUTH, options, save
 
 from simtest.dataset import read
 
@@ -31,7 +31,7 @@ figure, axes = plt.subplots(3, 6, figsize=(10, 4.1), layout="constrained")
 for column, record in zip(axes.T, records, strict=False):
     column[0].imshow(record["image"], interpolation="nearest")
     bps = [highlight["bp_px"] for highlight in record["meta"]["highlights"]]
-    column[0].plot(*np.transpose(bps), "+", color="#D55E00", markersize=10, markeredgewidth=2)
+    column[0].plot(*np.transpose(bps), "+", color=TRUTH, markersize=10, markeredgewidth=2)
     depth = column[1].imshow(record["depth"], cmap="viridis", vmin=8, vmax=16, interpolation="nearest")
     # x, y and -z, each from -1 to 1, are shown as red, green and blue
     column[2].imshow((record["normal"] * [1, 1, -1] + 1) / 2, interpolation="nearest")

@@ -9,7 +9,7 @@ Picture: a table of mean errors, the best of each situation framed. Takes 15 s o
 import matplotlib.pyplot as plt
 import numpy as np
 import polars as pl
-from common import options, save
+from common import TRUTH, options, save
 from matplotlib.colors import LogNorm
 
 import simtest
@@ -50,7 +50,7 @@ drawn = axis.imshow(values, norm=LogNorm(0.002, 90), cmap="cividis", aspect="aut
 for row, errors in enumerate(values):
     best = int(np.nanargmin(errors))
     print(f"{labels[row]}: {NAMES[best]}, {errors[best]:.3f} deg")
-    axis.add_patch(plt.Rectangle((best - 0.46, row - 0.44), 0.92, 0.88, fill=False, edgecolor="#D55E00", linewidth=2.5))
+    axis.add_patch(plt.Rectangle((best - 0.46, row - 0.44), 0.92, 0.88, fill=False, edgecolor=TRUTH, linewidth=2.5))
     for column, value in enumerate(errors):
         axis.text(column, row, f"{value:.2g}", ha="center", va="center", color="white" if value < 1 else "black")
 axis.set_xticks(range(len(NAMES)), NAMES)

@@ -17,6 +17,9 @@ COLOURS = colours(
     ("circle_pose", "brightest_point", "cone_axis", "curved", "bisector", "photometric", "cloud", "centroid")
 )
 
+# Vermilion of true points: it stands out on dark tissue, on a white highlight and on a white ground.
+TRUTH = "#D55E00"
+
 plt.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 100})
 
 

@@ -273,19 +273,20 @@ def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, over
     """Return the described scene with values replaced, by key path and by the last name of a key."""
     from simtest.spec import Scene, load_scene
     from simtest.spec.scene import scene_from_dict
-    from simtest.spec.toml_files import apply_settings
+    from simtest.spec.short_keys import full_keys
+    from simtest.spec.type_change import replace_values
 
-    values = dict(settings or {})
-    described = scene if isinstance(scene, Scene) else load_scene(scene, values)
-    if overrides:
-        from simtest.spec.short_keys import full_keys
+    def replaced(values: dict[str, Any]) -> Scene:
+        if not isinstance(scene, Scene):
+            return load_scene(scene, values)
+        data = scene.model_dump(mode="json", exclude_unset=True)
+        return scene_from_dict(replace_values(Scene, data, values, "scene")) if values else scene
 
-        values |= full_keys([described], overrides)
-    elif not values or not isinstance(scene, Scene):
+    described = replaced(values := dict(settings or {}))
+    if not overrides:
         return described
-    if not isinstance(scene, Scene):
-        return load_scene(scene, values)
-    return scene_from_dict(apply_settings(described.model_dump(mode="json", exclude_unset=True), values, "scene"))
+    # The keys are those of the scene with its settings, so that a new type's keys have short names too.
+    return replaced(values | full_keys([described], overrides))
 
 
 def _experiment(
@@ -307,7 +308,7 @@ def _experiment(
     if rest := {name: value for name, value in overrides.items() if name not in OWN_KEYS}:
         from simtest.spec.short_keys import full_keys, scene_models
 
-        values |= full_keys(scene_models(described), rest)
+        values |= full_keys(scene_models(described), rest, OWN_KEYS)
     return load_experiment(experiment, values)
 
 

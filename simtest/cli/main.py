@@ -30,13 +30,13 @@ def main() -> None:
 
 def _run(stop: Termination) -> int:
     """Run the command and return its exit code."""
-    from simtest.cli.manners import MANNERS, take_flags
+    from simtest.cli.manners import MANNERS, meant_flag, take_flags
 
     sys.argv[1:], wants_traceback = take_flags(sys.argv[1:])
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     _answer_warnings(MANNERS.quiet, wants_traceback)
 
-    from cyclopts import CycloptsError
+    from cyclopts import CycloptsError, UnknownOptionError
 
     from simtest.cli.commands import APP
     from simtest.cli.options import gather_settings
@@ -58,6 +58,11 @@ def _run(stop: Termination) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
+    except UnknownOptionError as error:
+        # Cyclopts knows the command's own options alone.
+        known = [name for argument in error.argument_collection for name in argument.names]
+        word = error.token.keyword or error.token.value
+        return _report(meant_flag(word, known) or str(error), BAD_USE)
     except (CycloptsError, InputError) as error:
         return _report(str(error), BAD_USE)
     except SimtestError as error:

@@ -1,6 +1,6 @@
 """What a command says beside its results: progress, warnings, rows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 FLAGS = ("--quiet", "--verbose", "--traceback")
@@ -40,3 +40,27 @@ def take_flags(words: Sequence[str]) -> tuple[list[str], bool]:
     flags = set(words[:end]).intersection(FLAGS)
     MANNERS.quiet, MANNERS.verbose = "--quiet" in flags, "--verbose" in flags
     return [word for i, word in enumerate(words) if i >= end or word not in FLAGS], "--traceback" in flags
+
+
+def meant_flag(word: str, options: Iterable[str]) -> str | None:
+    """Return the message for an unknown option that is a flag of all commands, mistyped or with a value.
+
+    Parameters
+    ----------
+    word : str
+        The option as it was given, such as ``--verbse`` or ``--quiet=1``.
+    options : iterable of str
+        Of the command; one that is as close as a flag comes first.
+
+    Returns
+    -------
+    str, optional
+        None where no flag is meant.
+    """
+    from simtest.runtime.resources import close_names, shown
+
+    name = word.partition("=")[0]
+    if name in FLAGS:
+        return f"{name}: takes no value"
+    close = close_names(name, [*options, *FLAGS])
+    return f'Unknown option: "{shown(word, 60)}". Did you mean "{close[0]}"?' if set(close) & set(FLAGS) else None

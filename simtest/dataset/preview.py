@@ -18,6 +18,7 @@ from simtest.dataset.reader import open_manifest, read_samples, shard_names
 from simtest.dataset.sample import Sample
 from simtest.errors import InputError
 from simtest.pages import palette
+from simtest.pages.pixels import jpeg_address
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.files import write_atomically
 from simtest.runtime.machine_errors import cannot_write
@@ -154,9 +155,7 @@ def _data_url(image: AnyArray) -> str:
     """Return a picture as a thumbnail's data URL."""
     height = max(1, round(image.shape[0] * WIDTH / image.shape[1]))
     small = cv2.resize(np.ascontiguousarray(image), (WIDTH, height), interpolation=cv2.INTER_AREA)
-    ok, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
-    assert ok
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    return jpeg_address(np.asarray(small, np.uint8), 82)
 
 
 # Distributions ------------------------------------------------------------------------------------------------------

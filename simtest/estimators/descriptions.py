@@ -3,19 +3,19 @@
 import inspect
 from collections.abc import Sequence
 
-from simtest.estimators.registry import load_estimators
+from simtest.runtime.entry_points import OWN
 
 DESCRIPTIONS: dict[str, str] = {
     "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",
     "circle_pose": "The published method: takes one isophote for a circle and solves for its pose; two candidates.",
     "brightest_point": "The line of sight through the brightest pixel.",
-    "bisector": "The cone's axis, corrected for a light beside the camera whose place is told.",
+    "bisector": "The cone's axis, corrected for a light beside the camera whose position is known.",
     "curved": "The centre of the isophotes carries the normal, their shape the surface's curvature.",
     "photometric": "A fit of the reflectance model to all pixels of the highlight.",
     "inverse_rendering": "A curved patch, rendered and adjusted until it looks like the highlight.",
     "cloud": "The normal of the base surface, from the cloud of glints that its relief makes of one highlight.",
 }
-"""Of this package's estimators, by name."""
+"""Of this package's estimators, by name: in pages, `simtest list`, completion and the reference."""
 
 
 def describe_estimators(names: Sequence[str]) -> dict[str, str]:
@@ -23,9 +23,12 @@ def describe_estimators(names: Sequence[str]) -> dict[str, str]:
 
     A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description.
     """
+    from simtest.estimators.registry import load_estimators
+
     described = {}
     for name in names:
-        described[name] = DESCRIPTIONS.get(name) or _first_line(load_estimators([name])[name])
+        own = DESCRIPTIONS.get(name.removeprefix(f"{OWN}:"))
+        described[name] = own or _first_line(load_estimators([name])[name])
     return described
 
 

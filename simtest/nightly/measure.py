@@ -25,7 +25,8 @@ from simtest.runtime.engines.engine import Engine
 from simtest.runtime.measuring import PeakMemory
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
-from simtest.validation.runner import Progress, definition, run_experiments
+from simtest.validation.fingerprints import definition
+from simtest.validation.runner import Progress, run_experiments
 
 _LOOK_S = 0.5
 """Time between two looks at the memory: each takes some milliseconds of a big process."""

@@ -1,6 +1,5 @@
 """What a notebook shows of results: a picture with a short table, as HTML without scripts."""
 
-import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 
@@ -8,17 +7,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.pages.palette import NEUTRAL, SERIES
+from simtest.pages.pixels import jpeg_address
+
 WIDEST_PX = 760
 """Pictures are made smaller to this width."""
 
 DIAL_PX = 120
-CHI95 = 5.991
-"""95 % of chi-squared with 2 degrees of freedom."""
 
 
 def picture_html(picture: npt.NDArray[np.uint8], text: str, widest: int = WIDEST_PX) -> str:
     """Return an RGB or grey picture, of 8 bits, as an image element up to px wide; `text` says what it shows."""
-    shown = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    shown = picture
     width = shown.shape[1]
     if width > widest:
         share = widest / width
@@ -26,9 +26,7 @@ def picture_html(picture: npt.NDArray[np.uint8], text: str, widest: int = WIDEST
     elif width < WIDEST_PX // 3:
         factor = WIDEST_PX // 3 // width + 1
         shown = np.asarray(cv2.resize(shown, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST), np.uint8)
-    data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    address = "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
-    return f'<img src="{address}" alt="{escape(text)}" style="max-width:100%;height:auto">'
+    return f'<img src="{jpeg_address(shown)}" alt="{escape(text)}" style="max-width:100%;height:auto">'
 
 
 def table_html(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -43,32 +41,32 @@ def note_html(text: str) -> str:
     return f"<div>{escape(text)}</div>"
 
 
-def normal_html(across: npt.ArrayLike, covariance: npt.ArrayLike | None = None) -> str:
+def normal_html(across: npt.ArrayLike, region: npt.ArrayLike | None = None) -> str:
     """Draw the part of a unit normal across the view as an arrow in the unit circle, x right and y down.
 
     Parameters
     ----------
     across : array_like, shape (2,)
         The normal's x and y.
-    covariance : array_like, shape (2, 2), optional
-        Of x and y; its 95 % ellipse stands about the arrow's tip.
+    region : array_like, shape (2, 2), optional
+        Of x and y: the covariance times a quantile of chi-squared; its ellipse stands about the arrow's tip.
     """
     reach = DIAL_PX / 2 - 6
     x, y = (reach * np.asarray(across, dtype=float)).tolist()
     ellipse = ""
-    if covariance is not None:
-        values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=float))
-        small, large = (reach * np.sqrt(CHI95 * np.maximum(values, 0))).tolist()
+    if region is not None:
+        values, vectors = np.linalg.eigh(np.asarray(region, dtype=float))
+        small, large = (reach * np.sqrt(np.maximum(values, 0))).tolist()
         turn = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
         ellipse = (
             f'<ellipse rx="{large:.2f}" ry="{small:.2f}" transform="translate({x:.2f} {y:.2f}) rotate({turn:.1f})" '
-            'fill="#0072B2" fill-opacity="0.25" stroke="#0072B2"/>'
+            f'fill="{SERIES[0]}" fill-opacity="0.25" stroke="{SERIES[0]}"/>'
         )
     half = DIAL_PX / 2
     return (
         f'<svg width="{DIAL_PX}" height="{DIAL_PX}" viewBox="{-half} {-half} {DIAL_PX} {DIAL_PX}" role="img" '
         'aria-label="normal across the view"><circle r="'
-        f'{reach:.1f}" fill="none" stroke="#7D828A"/><circle r="1.5" fill="#7D828A"/>{ellipse}'
-        f'<path d="M0 0L{x:.2f} {y:.2f}" stroke="#0072B2" stroke-width="2.5"/>'
-        f'<circle cx="{x:.2f}" cy="{y:.2f}" r="3" fill="#0072B2"/></svg>'
+        f'{reach:.1f}" fill="none" stroke="{NEUTRAL}"/><circle r="1.5" fill="{NEUTRAL}"/>{ellipse}'
+        f'<path d="M0 0L{x:.2f} {y:.2f}" stroke="{SERIES[0]}" stroke-width="2.5"/>'
+        f'<circle cx="{x:.2f}" cy="{y:.2f}" r="3" fill="{SERIES[0]}"/></svg>'
     )

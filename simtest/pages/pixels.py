@@ -12,7 +12,7 @@ from simtest.pages.sheet import Pixels, Sheet, text_width
 from simtest.pages.style import rgb
 from simtest.runtime.arrays import Array
 
-__all__ = ["Canvas", "Pixels", "Window", "data_address", "displayed", "legend", "png"]
+__all__ = ["Canvas", "Pixels", "Window", "data_address", "displayed", "jpeg_address", "legend", "png"]
 
 Window = tuple[float, float, float, float]
 GAMMA = 2.2  # frames are linear; they are shown with this display gamma. Isophotes are those of the linear frame
@@ -122,6 +122,14 @@ def png(picture: Pixels) -> bytes:
     done, data = cv2.imencode(".png", ordered, how)
     assert done
     return data.tobytes()
+
+
+def jpeg_address(picture: Pixels, quality: int = 85) -> str:
+    """Return a picture, RGB or grey, as ``data:image/jpeg;base64,...``."""
+    ordered = picture if picture.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
 def data_address(picture: Pixels, height: int | None = None) -> str:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from simtest.errors import Failure
+from simtest.estimators.across import tilt_deg
 from simtest.estimators.protocol import Estimate
 from simtest.pages.notebook import note_html, picture_html, table_html
 from simtest.pages.pixels import displayed
@@ -84,6 +85,5 @@ def _row(name: str, result: Estimate | Failure) -> tuple[object, ...]:
     if isinstance(result, Failure):
         return (name, "no normal", "", "", str(result.reason))
     x, y, z = result.normal
-    tilt = float(np.degrees(np.arccos(np.clip(-z, -1, 1))))
     deviation = "–" if result.deviation_deg is None else f"{result.deviation_deg:.3g}"
-    return (name, f"{x:.3f}, {y:.3f}, {z:.3f}", f"{tilt:.1f}", deviation, ", ".join(result.flags))
+    return (name, f"{x:.3f}, {y:.3f}, {z:.3f}", f"{tilt_deg(result):.1f}", deviation, ", ".join(result.flags))

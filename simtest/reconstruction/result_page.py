@@ -1,20 +1,19 @@
 """The pages of a picture and of a sequence: one file each that needs nothing else, but for a sequence's pictures."""
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
+from simtest.estimators.across import CHI95, covariance_across, tilt_deg
 from simtest.estimators.budget import deviations
-from simtest.geometry.vectors import basis_across
 from simtest.pages.html import write_page
+from simtest.pages.pixels import jpeg_address
 from simtest.pages.style import colours
 from simtest.reconstruction import explanations
 from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
@@ -23,7 +22,8 @@ from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
 
-MAX_PICTURE_BYTES = 1_200_000
+MAX_ADDRESS = 1_600_000
+"""Characters of a picture in its page: 1.2 MB of JPEG."""
 
 LEAST_FRAMES = 3
 """Shorter tracks are counted, not listed."""
@@ -52,10 +52,10 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
     # Parts below a hundredth of the whole change nothing that is shown.
     told = [] if stated is None else [p for p in stated.parts_deg.items() if p[1] >= 0.01 * stated.median_deg]
     write_page(
-        path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_data_address(picture),
+        path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_address(picture),
         title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
-        others=len(data["others"]), parts=explanations.PARTS,
+        others=len(data["others"]), parts=explanations.PARTS, chi95=CHI95,
     )  # fmt: skip
 
 
@@ -78,17 +78,16 @@ def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequ
     )  # fmt: skip
 
 
-def _data_address(picture: Image) -> str:
+def _address(picture: Image) -> str:
     """Return the picture as a JPEG's data address, of lower quality where it would be large."""
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-    values = values if values.ndim == 2 else cv2.cvtColor(values, cv2.COLOR_RGB2BGR)
-    data = b""
+    address = ""
     # lower the quality until the page is small enough
     for quality in (92, 80, 65, 45):
-        data = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-        if len(data) <= MAX_PICTURE_BYTES:
+        address = jpeg_address(values, quality)
+        if len(address) <= MAX_ADDRESS:
             break
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
+    return address
 
 
 @dataclass
@@ -133,13 +132,13 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
     return {
         "status": "ok",
         "normals": _rounded(result.candidates, 4),
-        "tilt": round(float(np.degrees(np.arccos(np.clip(-result.normal[2], -1, 1)))), 2),
+        "tilt": round(tilt_deg(result), 2),
         "margin": result.choice_margin,
         "look": [v if np.isfinite(v) else None for v in _rounded(result.look_px, 2)],
         "isophotes": [lines.index(points) for _, points in traced],
         "curves": [lines.index(curve) for curve in drawing.curves],
         "deviation": deviation_deg(result),
-        "across": None if result.covariance is None else _across(result),
+        "across": _across(result),
         "target": result.target,
         "parts": {name: round(float(np.degrees(v)), 4) for name, v in deviations(result.budget or {}).items()},
         "flags": result.flags,
@@ -148,12 +147,10 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
     }
 
 
-def _across(result: Estimate) -> list[float]:
+def _across(result: Estimate) -> list[float] | None:
     """Return the covariance of the normal's part across the view: xx, xy and yy."""
-    assert result.covariance is not None
-    basis = basis_across(result.normal)[:, :2]
-    seen = basis.T @ result.covariance @ basis
-    return [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
+    seen = covariance_across(result)
+    return None if seen is None else [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
 
 
 def _cloud(result: Estimate) -> JsonObject | None:

@@ -1,6 +1,7 @@
 """The results of a run, as a notebook holds them: table, summary and page, read when they are asked for."""
 
 import json
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -52,6 +53,15 @@ class RunResults:
         """summary.json: provenance, and the figures of each experiment, setting and estimator."""
         read: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
         return read
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what a `Path` of the page has by a public name: `simtest.validate` returned one in 0.1."""
+        # A notebook asks for many names that start with an underscore; a copy asks before there is a page.
+        if name.startswith("_") or "page" not in vars(self) or not hasattr(Path, name):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        how = f"RunResults.{name} is deprecated and goes in 0.3.0; use .page.{name}"
+        warnings.warn(how, DeprecationWarning, stacklevel=2)
+        return getattr(self.page, name)
 
     def __fspath__(self) -> str:
         return str(self.page)

@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
@@ -65,9 +65,18 @@ class EntryPointGroup:
         except Exception as error:
             raise InputError(f"{self.kind} {name!r}: {found[0].value} cannot be imported ({error})") from error
 
-    def described(self) -> dict[str, str]:
-        """Return the first line of each member's module, by name; modules are read, not imported."""
-        return {name: _first_line(point) for name in self.names() for point in self._registered(name)[:1]}
+    def described(self, own: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Return a line about each member, by name.
+
+        Parameters
+        ----------
+        own : mapping, optional
+            Lines of this package's members, by name. Of all others it is the first line of the module, which is read,
+            not imported.
+        """
+        points = {name: point for name in self.names() for point in self._registered(name)[:1]}
+        lines = {n: (own or {}).get(p.name, "") if _normalised(_package(p)) == OWN else "" for n, p in points.items()}
+        return {name: line.rstrip(".") or _first_line(points[name]) for name, line in lines.items()}
 
     def distributions(self, names: Sequence[str]) -> dict[str, str]:
         """Return package and version of each installed name, by "kind NAME"."""

@@ -55,14 +55,20 @@ def leads_nowhere(path: Path) -> str:
         return ""
 
 
-def suggestion(name: object, known: Iterable[str]) -> str:
-    """Return " (did you mean NAME?)" for the known name closest to a wrong one; nothing where none is close."""
+def close_names(name: object, known: Iterable[str], count: int = 1, alike: float = _ALIKE) -> list[str]:
+    """Return at most `count` known names that a wrong one may mean, the closest first; `alike` is from 0 to 1."""
     import difflib  # slow to import
 
     wrong, names = str(name)[:_LONGEST_NAME], list(known)
     # A name that was cut short, or written without its suffix, is meant more likely than one of like letters.
-    close = [n for n in names if wrong and n.startswith(wrong)] or difflib.get_close_matches(wrong, names, 1, _ALIKE)
-    return f" (did you mean {close[0]}?)" if close else ""
+    begun = [n for n in names if wrong and n.startswith(wrong)]
+    return (begun or difflib.get_close_matches(wrong, names, count, alike))[:count]
+
+
+def suggestion(name: object, known: Iterable[str], count: int = 1) -> str:
+    """Return " (did you mean NAME?)", or of several " (did you mean NAME or NAME?)"; nothing where none is close."""
+    close = close_names(name, known, count)
+    return f" (did you mean {' or '.join(close)}?)" if close else ""
 
 
 def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...] = (".toml",)) -> Path:

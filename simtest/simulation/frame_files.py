@@ -60,6 +60,9 @@ INSTRUMENT_FIELDS = {
 }
 """Further fields of a scene with instruments."""
 
+FILES = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml", "preview.jpg")
+"""What a labelled frame is written as."""
+
 MOTION_FIELD = (
     "scene.camera.motion: frame.png, radiance.exr and the radiance's parts are the mean over the exposure; labels, "
     "highlights, lights and poses are those of its middle"
@@ -67,13 +70,12 @@ MOTION_FIELD = (
 
 
 def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
-    """Write frame.png, radiance.exr, truth.npz, frame.json, camera.toml, calibration.toml and preview.jpg.
+    """Write the files of `FILES`.
 
     The folder is made if need be; `InputError` is raised if it cannot be written,
     `SimtestError` if its disk is full. Returns the files.
     """
-    names = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml", "preview.jpg")
-    files = [out / name for name in names]
+    files = [out / name for name in FILES]
     calibration = calibration_toml(picture_calibration(frame.calibration, frame.scene.sensor), _note(frame.scene))
     make_folder(out)
     try:

@@ -7,8 +7,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.runtime.resources import find
+from simtest.runtime.resources import find, shown, suggestion
 from simtest.runtime.short_repr import short_repr
+from simtest.spec.paper import PaperScene
+from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Spec, load
 
 LawName = Literal[
@@ -121,6 +123,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
+    _check_first_parts(settings)
     experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
     if "realisations" in own:
@@ -131,6 +134,18 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     if settings:
         description = f"{description} With {', '.join(f'{key}={value}' for key, value in settings.items())}.".strip()
     return experiment.model_copy(update={"groups": groups, "description": description})
+
+
+def _check_first_parts(settings: Mapping[str, Any]) -> None:
+    """Raise `InputError` for a key path that begins with no key of an experiment, nor of its scenes."""
+    scene = dict.fromkeys([*Scene.model_fields, *PaperScene.model_fields])
+    for path in settings:
+        first = path.partition(".")[0]
+        if first not in scene:
+            own = sorted(_EXPERIMENT_KEYS)
+            meant = suggestion(first, [*own, *scene])
+            allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
+            raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{meant}")
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:

@@ -1,18 +1,18 @@
 """Keys by their last name: ``radius_mm`` for ``surface.radius_mm``, where only one key of the scene ends so."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any
 
 from pydantic import BaseModel
 
 from simtest.errors import InputError
-from simtest.runtime.resources import find, shown
+from simtest.runtime.resources import find, shown, suggestion
 from simtest.spec.experiment import Experiment
 from simtest.spec.paper import PaperScene, is_paper
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import validate
-from simtest.spec.toml_files import apply_settings, read_toml
+from simtest.spec.toml_files import read_toml
+from simtest.spec.type_change import replace_values
 
 CLOSE = 3
 """Names that are suggested for one that does not exist."""
@@ -23,12 +23,12 @@ def scene_models(experiment: Experiment) -> list[BaseModel]:
     found: list[BaseModel] = []
     for group in experiment.groups:
         path = find(group.scene, "scenes")
-        data = apply_settings(read_toml(path), group.set, str(path))
+        data = replace_values(Scene, read_toml(path), group.set, str(path))
         found.append(validate(PaperScene if is_paper(data) else Scene, data, str(path)))
     return found
 
 
-def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
+def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Sequence[str] = ()) -> dict[str, Any]:
     """Return values by full key path, of values by the last name of a key.
 
     Keys that the scene's file states come before those that it leaves at their defaults, and keys of tables before
@@ -40,6 +40,8 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any]) -> dict[str
         Whose keys may be meant: a scene, or those of an experiment.
     given : mapping
         Values by name; a name may be a full path too.
+    others : sequence of str
+        Names that the caller takes itself; a mistyped one may mean one of them.
 
     Raises
     ------
@@ -49,10 +51,10 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any]) -> dict[str
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)
     rest = dict.fromkeys(path for path, is_stated in found if not is_stated and path not in stated)
-    return {_path_of(name, list(stated), list(rest)): value for name, value in given.items()}
+    return {_path_of(name, list(stated), list(rest), others): value for name, value in given.items()}
 
 
-def _path_of(name: str, stated: Sequence[str], rest: Sequence[str]) -> str:
+def _path_of(name: str, stated: Sequence[str], rest: Sequence[str], others: Sequence[str]) -> str:
     for paths in (stated, rest):
         if name in paths:
             return name
@@ -63,8 +65,8 @@ def _path_of(name: str, stated: Sequence[str], rest: Sequence[str]) -> str:
         if ending:
             one = f'settings={{"{ending[0]}": ...}}'
             raise InputError(f"{shown(name, 60)}: {len(ending)} keys end so: {', '.join(ending)}; name one by {one}")
-    close = get_close_matches(name, dict.fromkeys(path.rsplit(".", 1)[-1] for path in (*stated, *rest)), CLOSE)
-    meant = f"; did you mean {' or '.join(close)}?" if close else "; `simtest schema scene` lists the keys"
+    known = dict.fromkeys(path.rsplit(".", 1)[-1] for path in (*others, *stated, *rest))
+    meant = suggestion(name, known, CLOSE) or "; `simtest schema scene` lists the keys"
     raise InputError(f"{shown(name, 60)}: no key of this scene or experiment ends so{meant}")
 
 

@@ -1,6 +1,5 @@
 """Base of all specification models: strict validation, ranges they share, and errors of one line."""
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -12,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.resources import close_names, shown, suggestion
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
@@ -182,7 +181,7 @@ def _allowed_keys(location: tuple[Any, ...], model: type[BaseModel]) -> str:
     """List the keys that are allowed instead of an unknown one, the closest first."""
     nodes = nodes_at(model.model_json_schema(), location[:-1])
     known = list(next((node["properties"] for node in nodes if "properties" in node), ()))
-    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+    close = close_names(location[-1], known, alike=0.5)
     ordered = close + [k for k in known if k not in close]
     return f"; allowed: {', '.join(ordered)}{suggestion(location[-1], known)}" if ordered else ""
 

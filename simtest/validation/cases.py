@@ -225,7 +225,7 @@ def _expand_group(experiment: Experiment, group: Group) -> list[Case]:
         for part, pooled in enumerate(_combinations(group.pool)):
             # Scene.
             values = {**swept, **pooled}
-            data = apply_settings(base, values, str(path))
+            data = replace_values(Scene, base, values, str(path))
             # Names: pooled values are parts of one setting, so they are not in its name.
             label = group.label or ("published" if is_paper(data) else scene_from_dict(data, str(path)).surface.label)
             setting = ", ".join([label, *(f"{_short(key, swept)}={_plain(value)}" for key, value in swept.items())])

@@ -1,6 +1,5 @@
 """Runs an experiment case by case; each finished case is kept, so that a stopped run can go on."""
 
-import hashlib
 import itertools
 import json
 import re
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.estimators.installed import ESTIMATORS
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -27,8 +25,8 @@ from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.paper import PaperSetting
-from simtest.spec.surface import AnatomySurface
 from simtest.validation.cases import Case, expand, swept_example
+from simtest.validation.fingerprints import fingerprint, input_hashes
 
 if TYPE_CHECKING:
     import polars as pl
@@ -160,7 +158,7 @@ def run_experiments(
     expanded = [expand(experiment) for experiment, _ in wanted]
     variant = backend.requested_variant(variant, coloured=any(map(_is_coloured, expanded)))
     jobs = [
-        _Job(experiment, folder, cases, _fingerprint(experiment, cases, variant))
+        _Job(experiment, folder, cases, fingerprint(experiment, cases, variant))
         for (experiment, folder), cases in zip(wanted, expanded, strict=True)
     ]
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
@@ -185,7 +183,7 @@ def run_experiments(
             started=started.isoformat(timespec="seconds"),
             duration_s=round(time.monotonic() - clock, 1),
             command=command,
-            inputs=_inputs(job.cases),
+            inputs=input_hashes(job.cases),
         )
         finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
@@ -304,33 +302,6 @@ def _in_gallery(cases: list[Case]) -> set[int]:
     return chosen | set(itertools.islice(at_defaults, 1))
 
 
-def _fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
-    """Return a hash of everything that determines a run's results."""
-    return _hash(
-        {
-            "experiment": experiment.model_dump(mode="json"),
-            "scenes": [case.data for case in cases],
-            "inputs": _inputs(cases),
-            "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
-            "source": provenance.source_hash(),
-            "variant": variant,
-        }
-    )
-
-
-def definition(experiment: Experiment, cases: list[Case]) -> str:
-    """Return a hash of what an experiment is: itself, its scenes and input files; not code, versions, paths, prose."""
-    # Names without folders: a moved checkout holds the same experiments.
-    files = sorted((Path(name).name, digest) for name, digest in _inputs(cases).items())
-    scenes = [case.data for case in cases]
-    itself = experiment.model_dump(mode="json", exclude={"title", "description"})
-    return _hash({"experiment": itself, "scenes": scenes, "inputs": files})
-
-
-def _hash(content: Json) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
-
-
 def _finished(folder: Path, digest: str, cases: int) -> Run | None:
     """Return the finished run that a folder holds, if it is the same and its results are as they were written."""
     record = _record_in(folder)
@@ -420,14 +391,3 @@ def _remove(folder: Path) -> None:
         for file in folder.iterdir():
             file.unlink()
         folder.rmdir()
-
-
-def _inputs(cases: list[Case]) -> dict[str, str]:
-    """Return the hashes of the files that the cases were read from."""
-    files = {Path(case.where) for case in cases}
-    for case in cases:
-        surface = case.data.get("surface", {})
-        # Meshes and recipes.
-        if surface.get("type") == "anatomy":
-            files.add(AnatomySurface.model_validate(surface).file())
-    return {str(file): provenance.file_hash(file) for file in sorted(files) if file.is_file()}

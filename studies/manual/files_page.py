@@ -9,7 +9,7 @@ from docstring_parser import parse
 from simtest.dataset.fields import FIELDS as SAMPLE_FIELDS
 from simtest.dataset.index import HighlightRow, SampleRow
 from simtest.reconstruction.output_files import COLUMNS
-from simtest.simulation.frame_files import FIELDS, INSTRUMENT_FIELDS
+from simtest.simulation.frame_files import FIELDS, FILES, INSTRUMENT_FIELDS
 from simtest.validation.column_meanings import MEANINGS
 from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import RunRecord
@@ -25,9 +25,9 @@ the commands read.
 
 ## A rendered frame
 
-`simtest render` writes frame.png, radiance.exr, truth.npz, frame.json, camera.toml and calibration.toml. Names without
-a file below are arrays of truth.npz; frame.json holds the same list under its key `fields`. `instrument` and
-`visible_highlights.instrument` exist where the scene lists instruments.
+`simtest render` writes @FILES.
+Names without a file below are arrays of truth.npz; frame.json holds the same list under its key `fields`. `instrument`
+and `visible_highlights.instrument` exist where the scene lists instruments.
 
 @FRAME
 
@@ -110,7 +110,9 @@ def files_page() -> str:
         (code(own.name), code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.encoding)
         for own in SAMPLE_FIELDS
     )
+    *most, last = FILES
     made = {
+        "FILES": f"{', '.join(most)} and {last}",
         "FRAME": table(("file, array or key", "meaning"), _coded({**FIELDS, **INSTRUMENT_FIELDS})),
         "NORMALS": table(meaning, _coded(NORMALS)),
         "SPECULARITY": table(meaning, _coded(SPECULARITY)),

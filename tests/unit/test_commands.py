@@ -13,9 +13,11 @@ from simtest.cli import commands, main, manners, printing, progress
 from simtest.cli.listing import HEADINGS, names_of
 from simtest.cli.options import gather_settings
 from simtest.dataset import verify as verifying
+from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.estimators.installed import ESTIMATORS
 from simtest.rendering import backend_check
 from simtest.rendering.backend import BackendReport
+from simtest.runtime.entry_points import OWN
 from simtest.runtime.resources import suggestion
 from simtest.spec import load_dataset, load_experiment, load_profile, load_scene
 
@@ -78,6 +80,13 @@ def test_one_kind_is_listed_alone(here):
     ]
 
 
+def test_estimators_have_one_description():
+    lines = {name: line.rstrip(".") for name, line in DESCRIPTIONS.items()}
+    assert names_of("estimators").items() >= lines.items()
+    assert f"{OWN}:cone_axis" not in names_of("estimators")
+    assert describe_estimators([f"{OWN}:cone_axis"]) == {f"{OWN}:cone_axis": DESCRIPTIONS["cone_axis"]}
+
+
 def test_estimators_are_described_without_being_imported():
     code = (
         "import sys; from simtest.cli.listing import names_of; print(names_of('estimators')['inverse_rendering'])\n"
@@ -85,7 +94,7 @@ def test_estimators_are_described_without_being_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("a quadric patch fitted by differentiating the renderer")
+    assert done.stdout.startswith(DESCRIPTIONS["inverse_rendering"].rstrip("."))
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -134,6 +143,11 @@ def test_every_command_has_its_help(here):
         ("render plane --out x --set surfase.tilt_deg=3", "(did you mean surface?)"),
         ("render plane --out x --set reflectance.type=phonk", "(did you mean phong?)"),
         ("render plane --out x --variant lvm", "(did you mean llvm?)"),
+        ("validate overview --set realisation=1", "(did you mean realisations?)"),
+        ("validate overview --set surfase.tilt_deg=3", "(did you mean surface?)"),
+        ("doctor --verbse", 'Did you mean "--verbose"?'),
+        ("render plane --out x --quite", 'Did you mean "--quiet"?'),
+        ("doctor --quiet=1", "simtest: --quiet: takes no value"),
     ],
 )
 def test_a_mistyped_name_is_guessed(here, tmp_path, line, meant):

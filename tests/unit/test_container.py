@@ -45,6 +45,12 @@ def test_the_command_runs_as_a_user():
     assert ("ENTRYPOINT", '["simtest"]') in instructions()
 
 
+def test_the_manual_mounts_the_folder_that_the_command_works_in():
+    (folder,) = [value for name, value in instructions() if name == "WORKDIR" and value != "/src"]
+    for file in (FILE, ROOT / "docs/reference/stable.md"):
+        assert re.findall(r'-v "\$PWD:([^"]+)"', file.read_text(encoding="utf-8")) == [folder]
+
+
 def test_the_build_sees_all_that_the_package_is_built_from():
     seen = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -37,6 +37,16 @@ def test_an_example_makes_its_picture(script, tmp_path):
     assert pixels.std() > 10
 
 
+def test_a_picture_without_a_highlight_ends_in_one_line(tmp_path):
+    Image.fromarray(np.full((60, 80, 3), 40, np.uint8)).save(tmp_path / "dark.png")
+    (script,) = (script for script in EXAMPLES if script.name.startswith("07_"))
+    command = [sys.executable, str(script), str(tmp_path / "dark.png"), "--out", str(tmp_path / "made")]
+    own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert done.stderr == f"{tmp_path / 'dark.png'}: no highlight with a normal: none found\n"
+
+
 def test_examples_are_short_numbered_and_listed():
     listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     assert [script.name[:2] for script in EXAMPLES] == [f"{n:02}" for n in range(1, len(EXAMPLES) + 1)]

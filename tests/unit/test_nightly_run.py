@@ -30,7 +30,7 @@ from simtest.nightly.storage import BASELINE_ROWS, save_run
 from simtest.runtime.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
-from simtest.validation.runner import definition
+from simtest.validation.fingerprints import definition
 from tests.unit.nightly_samples import STARTED, canary, make_rows, make_run, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -1,8 +1,10 @@
 """Notebook manners: short texts, HTML with pictures, overrides by the last name of a key, results of runs."""
 
+import copy
 import json
 import os
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 import simtest
 from simtest.calibration import Priors, Uniform
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.across import tilt_deg
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import BrownConrady, Camera, ViewMask
 from simtest.pages.notebook import normal_html, picture_html, table_html
@@ -19,7 +22,8 @@ from simtest.report.run_results import RunResults
 from simtest.runtime.short_repr import LONGEST, short
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.preview import SURFACE_LEVEL, preview
-from simtest.spec.short_keys import full_keys
+from simtest.spec.short_keys import full_keys, scene_models
+from simtest.validation.cases import expand
 
 SIZE = 160
 LIMIT = 300
@@ -119,6 +123,17 @@ def test_the_ellipse_of_errors_has_the_covariance_s_axes():
     assert abs(float(re.search(r"rotate\((-?[\d.]+)\)", html)[1])) == pytest.approx(90)
 
 
+def test_the_ellipse_of_an_estimate_holds_95_percent():
+    sd = 0.02
+    normal = np.array([0.0, 0.0, -1.0])
+    answer = Estimate(normal, normal[None], np.array([80.0, 60.0]), covariance=sd**2 * np.eye(2))
+    reach = float(re.search(r'<circle r="([\d.]+)" fill="none"', answer._repr_html_())[1])
+    (radius,) = {float(v) for v in re.findall(r' r[xy]="([\d.]+)"', answer._repr_html_())}
+    # Of two dimensions, the 95 % radius of a normal distribution is sqrt(-2 ln 0.05) standard deviations.
+    assert radius == pytest.approx(reach * sd * np.sqrt(-2 * np.log(0.05)), abs=0.01)
+    assert tilt_deg(answer) == 0
+
+
 # Overrides --------------------------------------------------------------------------------------------------------
 
 
@@ -150,6 +165,40 @@ def test_names_that_mean_several_keys_or_none(name, parts):
     for part in parts:
         assert part in str(told.value)
     assert len(str(told.value)) < LIMIT
+
+
+@pytest.mark.parametrize(("name", "meant"), [("realisation", "realisations"), ("estimator", "estimators")])
+def test_a_mistyped_key_of_an_experiment_is_guessed(tmp_path, name, meant):
+    with pytest.raises(InputError, match=rf"did you mean {meant}\?"):
+        simtest.validate("overview", tmp_path / "run", **{name: 1})
+    with pytest.raises(InputError, match=rf"did you mean {meant}\?"):
+        simtest.load_experiment("overview", {name: 1})
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("scene", ["cylinder", simtest.load_scene("cylinder")], ids=["by name", "object"])
+def test_another_type_drops_the_keys_of_the_former(scene):
+    kind = {"reflectance.type": "rough_conductor"}
+    made = simtest.render(scene, kind, width=32, height=32, alpha=0.2).scene.reflectance
+    assert (made.type, made.alpha) == ("rough_conductor", 0.2)
+
+
+def test_a_sweep_may_change_the_type(tmp_path):
+    file = tmp_path / "both.toml"
+    file.write_text(
+        'title = "t"\nestimators = ["cone_axis"]\n[[groups]]\nscene = "cylinder"\n'
+        'sweep = [{"reflectance.type" = ["phong", "rough_conductor"]}]\n'
+    )
+    cases = expand(simtest.load_experiment(file))
+    assert [case.data["reflectance"]["type"] for case in cases] == ["phong", "rough_conductor"]
+    assert "exponent" not in cases[1].data["reflectance"]
+    # Short names find the keys of a type that a group sets.
+    file.write_text(
+        'title = "t"\nestimators = ["cone_axis"]\n[[groups]]\nscene = "cylinder"\n'
+        'set = {"reflectance.type" = "rough_conductor"}\n'
+    )
+    models = scene_models(simtest.load_experiment(file))
+    assert full_keys(models, {"alpha": 0.2}) == {"reflectance.alpha": 0.2}
 
 
 @pytest.mark.render
@@ -206,6 +255,20 @@ def test_results_of_a_run_are_read_when_asked(tmp_path):
     html = run._repr_html_()
     assert "0.25" in html
     assert "and 28 more settings" in html
+
+
+def test_results_of_a_run_still_do_what_the_path_of_the_page_did(tmp_path):
+    (tmp_path / "index.html").write_text("page")
+    run = RunResults(tmp_path / "index.html")
+    with pytest.warns(DeprecationWarning, match=r"RunResults.read_text is deprecated and goes in 0.3.0; use .page"):
+        assert run.read_text() == "page"
+    with pytest.warns(DeprecationWarning, match=r"use .page.parent"):
+        assert run.parent == tmp_path
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert copy.copy(run) == run
+        assert not hasattr(run, "_ipython_display_")
+        assert not hasattr(run, "results_of")
 
 
 @pytest.mark.slow

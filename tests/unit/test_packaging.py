@@ -7,6 +7,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 from benchmarks.__main__ import NAMES
 
@@ -54,3 +55,19 @@ def test_data_are_found_by_name_from_another_folder(wheel, tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_benchmarks_fit_the_package(name):
     assert callable(importlib.import_module(f"benchmarks.{name}").figures)
+
+
+@pytest.mark.skipif(not (ROOT / ".github").is_dir(), reason="the checkout's workflows are not there")
+def test_every_file_of_a_release_has_its_sum(tmp_path):
+    workflow = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8"))
+    (step,) = [step for step in workflow["jobs"]["build"]["steps"] if "constraints" in step.get("run", "")]
+    # What `make release-check` and `make hashed-constraints` leave behind.
+    (tmp_path / "dist").mkdir()
+    (tmp_path / "dist/a.whl").write_text("wheel")
+    subprocess.run("cd dist && sha256sum a.whl > SHA256SUMS", shell=True, cwd=tmp_path, check=True)
+    (tmp_path / "constraints-cp311.txt").write_text("pinned")
+    commands = step["run"].replace("make hashed-constraints", "true")
+    subprocess.run(["bash", "-e", "-c", commands], cwd=tmp_path, check=True)
+    subprocess.run("sha256sum --check SHA256SUMS", shell=True, cwd=tmp_path / "dist", check=True, capture_output=True)
+    listed = {line.split()[1] for line in (tmp_path / "dist/SHA256SUMS").read_text().splitlines()}
+    assert listed == {"a.whl", "constraints-cp311.txt"}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from simtest.calibration.response import srgb_encode
 from simtest.errors import Failure, InputError
 from simtest.pages.palette import estimator_order
 from simtest.reconstruction.pipeline import reconstruct
@@ -117,7 +118,7 @@ def _visible(
         from simtest.surfaces.tissue_pattern import make_pattern
 
         albedo = make_pattern(session.surface, tissue).albedo(session.to_model(position[valid]))
-        colour = _srgb(BRIGHTEST * albedo / np.quantile(albedo.max(axis=1), 0.99))
+        colour = srgb_encode(np.clip(BRIGHTEST * albedo / np.quantile(albedo.max(axis=1), 0.99), 0, 1))
     lit = _lit(session, seen, position[valid], np.asarray(truth.normal_base, dtype=float)[valid])
     return position[valid], faces, curvature[valid], normal, colour, lit
 
@@ -129,15 +130,8 @@ def _lit(session: Session, seen: RenderedView, points: Array, normals: Array) ->
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
     specular, own = seen.radiance.specular, seen.radiance.diffuse + seen.radiance.indirect
     matt = matt_light(points, normals, np.asarray(seen.scene.rig.true_mm(), dtype=float))
-    return _srgb(
-        np.asarray(expose(coloured(specular)[at], coloured(own)[at], matt, np.ones(len(points), dtype=bool)), float)
-    )
-
-
-def _srgb(linear: Array) -> Array:
-    """Return linear values as sRGB's, from 0 to 1."""
-    value = np.clip(linear, 0, 1)
-    return np.asarray(np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+    seen_light = expose(coloured(specular)[at], coloured(own)[at], matt, np.ones(len(points), dtype=bool))
+    return srgb_encode(np.clip(np.asarray(seen_light, float), 0, 1))
 
 
 def _estimates(session: Session, seen: RenderedView) -> list[tuple[str, Array, Array]]:
