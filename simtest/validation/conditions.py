@@ -3,7 +3,7 @@
 They are read from the scenes, so they hold what no column of results tells, and stand in summary.json by setting.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 
 from simtest.runtime.files import Json
@@ -100,24 +100,25 @@ def conditions_of(cases: Iterable[Case]) -> dict[str, Conditions]:
     found: dict[str, Conditions] = {}
     for case in cases:
         if not case.is_paper and case.setting not in found:
-            found[case.setting] = conditions(scene_from_dict(case.data, case.where))
+            found[case.setting] = conditions(scene_from_dict(case.data, case.where), case.random)
     return found
 
 
-def conditions(scene: Scene) -> Conditions:
-    """Return the conditions of a scene."""
+def conditions(scene: Scene, drawn: Collection[str] = ()) -> Conditions:
+    """Return the conditions of a scene, of which the values of some keys are drawn for each realisation."""
     half_width = getattr(scene.reflectance, "half_width", None)
     return Conditions(
-        _told(scene), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
+        _told(scene, drawn), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
         LOBES.get(scene.reflectance.type, scene.reflectance.type), _emission(scene),
         None if half_width is None else float(half_width), float(scene.camera.fx),
     )  # fmt: skip
 
 
-def _told(scene: Scene) -> str:
+def _told(scene: Scene, drawn: Collection[str]) -> str:
     if not scene.known.lights:
         return "position not known"
-    has_distance = scene.known.distance_mm is not None or scene.known.distance_error is not None
+    keys = ("distance_mm", "distance_error")
+    has_distance = any(getattr(scene.known, key) is not None or f"known.{key}" in drawn for key in keys)
     told = "position and distance known" if has_distance else "position known"
     wrong = any(light.position_error_mm for light in scene.rig.lights)
     return f"{told}, the position with an error" if wrong else told

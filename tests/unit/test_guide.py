@@ -341,6 +341,9 @@ def test_conditions_come_from_the_scene():
     assert "bounced light" in found.render
     told = load_scene("plane", {"known.distance_error": 0.0})
     assert conditions(told).told == "position and distance known"
+    # A distance whose error is drawn for each realisation is known as well.
+    known = conditions_of(expand(load_experiment("known_light")))
+    assert {found.told for found in known.values()} == {"position and distance known"}
 
 
 # A change of each key that sets situations apart, with what it needs beside.
