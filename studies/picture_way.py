@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from simtest.cli.main import APP
+from simtest.cli.commands import APP
 from simtest.detection import Region
 from simtest.detection.blobs import Highlight
 from simtest.estimators import Estimate
