@@ -45,6 +45,17 @@ def basis_across(normal: Array) -> Array:
     return np.array([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]])
 
 
+def covariance_across(normal: Array, covariance: Array) -> Array:
+    """Return the covariance of a normal's x and y, camera frame, of that in its tangent basis; both of shape (2, 2)."""
+    basis = basis_across(normal)[:, :2]
+    return np.asarray(basis.T @ covariance @ basis)
+
+
+def tilt_deg(normal: Array) -> float:
+    """Return the angle between a unit normal, camera frame, and the direction against the optical axis, deg."""
+    return float(np.degrees(np.arccos(np.clip(-normal[2], -1, 1))))
+
+
 def tangent_coordinates(normal: Array, other: Array) -> Array:
     """Return the rotation from one unit vector, shape (3,), to another in the first one's tangent basis.
 

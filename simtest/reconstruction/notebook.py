@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from simtest.errors import Failure
-from simtest.estimators.across import tilt_deg
 from simtest.estimators.protocol import Estimate
+from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import note_html, picture_html, table_html
 from simtest.pages.pixels import displayed
 from simtest.reconstruction.description import Drawing, SpecularityRecord, describe
@@ -86,4 +86,4 @@ def _row(name: str, result: Estimate | Failure) -> tuple[object, ...]:
         return (name, "no normal", "", "", str(result.reason))
     x, y, z = result.normal
     deviation = "–" if result.deviation_deg is None else f"{result.deviation_deg:.3g}"
-    return (name, f"{x:.3f}, {y:.3f}, {z:.3f}", f"{tilt_deg(result):.1f}", deviation, ", ".join(result.flags))
+    return (name, f"{x:.3f}, {y:.3f}, {z:.3f}", f"{tilt_deg(result.normal):.1f}", deviation, ", ".join(result.flags))

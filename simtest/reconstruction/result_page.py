@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.estimators.across import CHI95, covariance_across, tilt_deg
 from simtest.estimators.budget import deviations
+from simtest.geometry import chi_squared
+from simtest.geometry.vectors import covariance_across, tilt_deg
 from simtest.pages.html import write_page
 from simtest.pages.pixels import jpeg_address
 from simtest.pages.style import colours
@@ -55,7 +56,7 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_address(picture),
         title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
-        others=len(data["others"]), parts=explanations.PARTS, chi95=CHI95,
+        others=len(data["others"]), parts=explanations.PARTS, chi95=chi_squared.quantile(0.95, 2),
     )  # fmt: skip
 
 
@@ -132,7 +133,7 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
     return {
         "status": "ok",
         "normals": _rounded(result.candidates, 4),
-        "tilt": round(tilt_deg(result), 2),
+        "tilt": round(tilt_deg(result.normal), 2),
         "margin": result.choice_margin,
         "look": [v if np.isfinite(v) else None for v in _rounded(result.look_px, 2)],
         "isophotes": [lines.index(points) for _, points in traced],
@@ -149,8 +150,10 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
 
 def _across(result: Estimate) -> list[float] | None:
     """Return the covariance of the normal's part across the view: xx, xy and yy."""
-    seen = covariance_across(result)
-    return None if seen is None else [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
+    if result.covariance is None:
+        return None
+    seen = covariance_across(result.normal, result.covariance)
+    return [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
 
 
 def _cloud(result: Estimate) -> JsonObject | None:

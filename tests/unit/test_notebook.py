@@ -13,9 +13,9 @@ import pytest
 import simtest
 from simtest.calibration import Priors, Uniform
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.across import tilt_deg
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import BrownConrady, Camera, ViewMask
+from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import normal_html, picture_html, table_html
 from simtest.rendering.frames import Radiance
 from simtest.report.run_results import RunResults
@@ -131,7 +131,7 @@ def test_the_ellipse_of_an_estimate_holds_95_percent():
     (radius,) = {float(v) for v in re.findall(r' r[xy]="([\d.]+)"', answer._repr_html_())}
     # Of two dimensions, the 95 % radius of a normal distribution is sqrt(-2 ln 0.05) standard deviations.
     assert radius == pytest.approx(reach * sd * np.sqrt(-2 * np.log(0.05)), abs=0.01)
-    assert tilt_deg(answer) == 0
+    assert tilt_deg(normal) == 0
 
 
 # Overrides --------------------------------------------------------------------------------------------------------
