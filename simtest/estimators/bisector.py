@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from simtest.geometry.vectors import basis_across, bisect
 STEP = 1e-4
 """Step of the differences of the normal, rad, and as a share of the distance."""
 
+NARROW = 0.15
+"""Standard deviation of a told distance, as a share of it, up to which the light's angle is taken as linear in it; at
+0.3 a surface at half the distance would lie three stated deviations off."""
+
 DISTANCES = (np.arange(32) + 0.5) / 32
 """Shares of a prior on the distance at which the normal is computed."""
 
@@ -31,9 +36,9 @@ class Bisector:
     falloff with the distance from the light. That falloff has the slope g = -2 grad log|L - P|, so the peak lies g/H
     towards the light; 1/H are the lobe's moments, known from the isophotes.
 
-    A distance that is told with a normal error moves the normal by its derivative. Over any other distribution, such as
-    the working range where no distance is told, the normal is the mean over the distribution, and the part ``distance``
-    of the budget its spread.
+    A distance that is told with a small normal error moves the normal by its derivative. Over any other distribution,
+    such as the working range where no distance is told, the normal is the mean over the distribution, and the part
+    ``distance`` of the budget its spread.
 
     Parameters
     ----------
@@ -91,9 +96,14 @@ class Bisector:
 bisector = Bisector()
 
 
+def _is_narrow(distance: Distribution) -> TypeGuard[Normal]:
+    """Whether a distance is known so well that the normal moves with it along a line."""
+    return isinstance(distance, Normal) and distance.sd <= NARROW * distance.mean
+
+
 def _mean_normal(family: HighlightAxis, light: Array, distance: Distribution) -> tuple[Array, Array]:
     """Return normal and sightline of the BP: at the distance's mean, or their mean over a distribution of any shape."""
-    if isinstance(distance, Normal):
+    if _is_narrow(distance):
         normals, sightlines = _normals(family, light, np.array([distance.mean]))
     else:
         normals, sightlines = _normals(family, light, distance.quantile(DISTANCES))
@@ -136,7 +146,7 @@ def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal:
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:
     """Return the covariance of the normal by the distance, shape (2, 2), rad^2, in the basis `across`."""
-    if isinstance(distance, Normal):
+    if _is_narrow(distance):
         near_and_far = distance.mean * np.array([1.0, 1 + STEP])
         normals = _normals(family, light, near_and_far)[0]
         by_distance = across @ (normals[1] - normals[0]) / (STEP * distance.mean) * distance.sd

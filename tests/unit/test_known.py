@@ -346,6 +346,20 @@ def test_an_untold_distance_is_the_working_range():
     assert 0.9 <= inside.mean() < 1
 
 
+@pytest.mark.parametrize("sd", [2.0, 8.0, 12.0])
+def test_regions_hold_over_a_normal_prior_on_the_distance(sd):
+    # The light's angle goes with 1/d, which is no line over a wide prior: linear propagation would cover 18 of 20.
+    light, prior = (4.0, 0.0, 0.0), Normal(40.0, sd)
+    stated = bisector.estimate(lobe(0.001), CAMERA, Priors((light,), prior, falloff_power=None))
+    held = []
+    for distance in prior.quantile((np.arange(20) + 0.5) / 20):
+        true = bisector.estimate(lobe(0.001), CAMERA, Priors((light,), exactly(float(distance)), falloff_power=None))
+        moved = tangent_coordinates(stated.normal, true.normal)
+        held.append(moved @ np.linalg.solve(stated.covariance, moved) <= 5.991)
+    assert sum(held) >= 19
+
+
+
 def test_lights_that_are_not_told_apart_are_in_the_budget():
     lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
     found = bisector.estimate(lobe(0.01), CAMERA, Priors(lights, exactly(20.0), falloff_power=None))
