@@ -359,7 +359,6 @@ def test_regions_hold_over_a_normal_prior_on_the_distance(sd):
     assert sum(held) >= 19
 
 
-
 def test_lights_that_are_not_told_apart_are_in_the_budget():
     lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
     found = bisector.estimate(lobe(0.01), CAMERA, Priors(lights, exactly(20.0), falloff_power=None))
