@@ -279,8 +279,10 @@ def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, over
     def replaced(values: dict[str, Any]) -> Scene:
         if not isinstance(scene, Scene):
             return load_scene(scene, values)
+        if not values:
+            return scene
         data = scene.model_dump(mode="json", exclude_unset=True)
-        return scene_from_dict(replace_values(Scene, data, values, "scene")) if values else scene
+        return scene_from_dict(replace_values(Scene, data, values, "scene"))
 
     described = replaced(values := dict(settings or {}))
     if not overrides:
