@@ -1,6 +1,7 @@
-"""What tests share: the rendering backend's cache, and where the reference meshes lie."""
+"""What tests share: the rendering backend's cache, where the reference meshes lie, and commands in this process."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,3 +18,20 @@ def shared_data():
     if not SHARED.is_dir():
         pytest.skip(f"no reference data at ../shared/data (looked beside {SHARED.parents[1].name})")
     return SHARED
+
+
+@pytest.fixture
+def here(monkeypatch, capfd, tmp_path):
+    """Run a command in this process, in an empty folder; gives exit code, output and error lines."""
+    from simtest.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["simtest", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        output, errors = capfd.readouterr()
+        return stop.value.code, output, errors.splitlines()
+
+    return run

@@ -55,7 +55,7 @@ def print_lines(lines: Sequence[str]) -> None:
 
 
 def print_rest(count: int, rest: str = "", tell: Callable[[str], object] = print) -> None:
-    """Say how many rows are left out, if any, and where else they can be read; `tell` prints it."""
+    """Report through `tell` how many rows are left out, if any, and where else they can be read."""
     if count:
         tell(f"and {count} more; --verbose prints them all{rest and f', {rest}'}")
 

@@ -139,7 +139,7 @@ def _mean(figures: MethodFigures) -> str:
 
 
 def _breaks(advice: Advice) -> str:
-    """Say in which settings a situation's best method breaks, or how far it is from that."""
+    """Return in words in which settings a situation's best method breaks, or how far it is from that."""
     settings = advice.by_setting
     if not advice.broken:
         where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
@@ -158,7 +158,7 @@ def _breaks(advice: Advice) -> str:
 def _span(
     advice: Advice, names: Sequence[str], form: str, told: Callable[[MethodFigures], str], beyond: str
 ) -> str:  # fmt: skip
-    """Say at which settings, the mildest first, a method breaks in one way; empty where it does not."""
+    """Return in words at which settings, the mildest first, a method breaks in one way; empty where it does not."""
     if not names:
         return ""
     count = len(advice.by_setting)
@@ -174,7 +174,7 @@ def _span(
 
 
 def _why(figures: MethodFigures) -> str:
-    """Say why a method breaks."""
+    """Return in words why a method breaks."""
     told = [f"mean {_mean(figures)}"] if figures.errs else []
     told += [f"{_share(figures)} answered"] if figures.is_silent else []
     return ", ".join(told)
@@ -199,7 +199,7 @@ def method_rows(guide: Guide, about: Mapping[str, str]) -> list[MethodRow]:
 
 
 def _broken(name: str, own: Sequence[Advice]) -> str:
-    """Say in how many situations a method breaks as a whole, and in which least and most."""
+    """Return in words in how many situations a method breaks as a whole, and in which least and most."""
     broken = [each for each in own if each.methods[name].breaks]
     if not broken:
         return "in none as a whole"
@@ -211,7 +211,7 @@ def _broken(name: str, own: Sequence[Advice]) -> str:
 
 
 def shared_sentence(guide: Guide) -> str:
-    """Say what holds in all situations, and what ε/d is where one names it; empty where there is nothing to say."""
+    """Return a sentence on what holds in all situations, and on ε/d where one names it; else an empty one."""
     told = [f"In every situation: {', '.join(guide.shared)}."] if guide.shared else []
     if any("ε/d" in text for text in (*guide.shared, *(each.situation.circumstances for each in guide.advice))):
         told.append("ε/d is the light's distance from the camera over that of the surface.")

@@ -9,7 +9,7 @@ from simtest.report.series import LineFigure, law_misses
 
 
 def headline(run: Run, figures: list[LineFigure]) -> list[str]:
-    """Say in a few sentences what a run counted, and how many points the closed-form laws predict."""
+    """Return in a few sentences what a run counted, and how many points the closed-form laws predict."""
     rows = run.results
     if rows.is_empty():
         return ["The run has no rows: nothing was measured."]

@@ -1,4 +1,4 @@
-"""Tells whether a run's page is up to date: what it was made of, and its files, stand in a note at its end."""
+"""Whether a run's page is up to date: what it was made of, and its files, stand in a note at its end."""
 
 import hashlib
 import json

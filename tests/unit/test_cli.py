@@ -48,21 +48,6 @@ def cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture
-def here(monkeypatch, capfd, tmp_path):
-    """Run a command in this process, in an empty folder; gives exit code, output and error lines."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["simtest", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            command_line.main()
-        output, errors = capfd.readouterr()
-        return stop.value.code, output, errors.splitlines()
-
-    return run
-
-
 def child(*arguments, folder=None):
     command = [sys.executable, "-c", MAIN, *map(str, arguments)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from simtest.cli import commands, main, manners, printing, progress
+from simtest.cli import commands, manners, printing, progress
 from simtest.cli.listing import HEADINGS, names_of
 from simtest.cli.options import gather_settings
 from simtest.dataset import verify as verifying
@@ -30,21 +30,6 @@ def ordinary(monkeypatch):
     monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
     monkeypatch.setattr(manners.MANNERS, "quiet", False)
     monkeypatch.setattr(manners.MANNERS, "verbose", False)
-
-
-@pytest.fixture
-def here(monkeypatch, capfd, tmp_path):
-    """Run a command in this process, in an empty folder; gives exit code, output and error lines."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["simtest", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            main.main()
-        output, errors = capfd.readouterr()
-        return stop.value.code, output, errors.splitlines()
-
-    return run
 
 
 # Lists and completion --------------------------------------------------------------------------------------------
