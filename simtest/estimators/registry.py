@@ -1,7 +1,7 @@
 """Estimators by name: those of packages, through the entry-point group ``simtest.estimators``, and cores by command."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from simtest.calibration import Priors
@@ -10,7 +10,6 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.resources import shown
 
 
 @dataclass(frozen=True)
@@ -61,38 +60,17 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
     for name in estimators:
-        short = core_name(name) if is_core(name) else name
+        # Raises where the name is not clear.
+        short, given = _core(name) if is_core(name) else (name, ESTIMATORS.load(name))
         if short in loaded:
             raise InputError(f"estimator {short!r}: given twice")
-        loaded[short] = _core(name) if is_core(name) else as_estimator(name, ESTIMATORS.load(name))
+        loaded[short] = as_estimator(name, given)
     return loaded
 
 
-def short_names(estimators: Iterable[str]) -> tuple[str, ...]:
-    """Return the names under which estimators stand in results: those of cores shortened, all others as they are."""
-    return tuple(core_name(name) if is_core(name) else name for name in estimators)
-
-
-def core_name(name: str) -> str:
-    """Return a core's short name.
-
-    Raises
-    ------
-    InputError
-        If the core's name is malformed, or it is that of an installed estimator, for which it would be taken.
-    """
-    from simtest.estimators.process.command import parse_core
-
-    short = parse_core(name).name
-    if short in ESTIMATORS.names():
-        raise InputError(
-            f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise in a "
-            "TOML file (core.name)"
-        )
-    return short
-
-
-def _core(name: str) -> AnyEstimator:
+def _core(name: str) -> tuple[str, object]:
+    """Return a core's short name and its estimator; imported at need, since few runs name one."""
     from simtest.estimators.process.estimator import load_core
+    from simtest.estimators.process.naming import core_name
 
-    return load_core(name)
+    return core_name(name), load_core(name)

@@ -4,6 +4,7 @@ import atexit
 import itertools
 import os
 import threading
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -28,7 +29,7 @@ MAX_FAULTS = 5
 """After so many faults in a row a core is not started again."""
 
 KEPT_CORES = 8
-"""Cores that stay started between two runs of a process."""
+"""Cores that are kept at once; the one that was named last stays longest."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,7 @@ class Core:
                 self._end()
                 raise
             self.hello = hello
+            _started.add(self)
             return hello
 
     def ask(self, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Message:
@@ -187,6 +189,15 @@ class Core:
                 raise
             self._faults = 0
             return answer
+
+    def record(self) -> dict[str, object]:
+        """Return what a run's record says of the core."""
+        hello = self.start() if self.hello is None else self.hello
+        command = self.command
+        return {
+            "command": command.text, "name": hello.name, "version": hello.version, "kind": hello.kind,
+            "transport": hello.transport, "time_limit_s": command.time_limit_s, "files": command.hashes(),
+        }  # fmt: skip
 
     def close(self) -> None:
         """End the core; the next request starts it again."""
@@ -232,12 +243,15 @@ def _check_answer(header: Mapping[str, Any], number: int, kind: str) -> None:
         raise broken(f"an answer of type {_told(stated)}; must be {' or '.join(allowed)}")
 
 
+_started: "weakref.WeakSet[Core]" = weakref.WeakSet()
+"""All cores of this process that were ever started; one that was closed may be started again by who holds it."""
+
 _kept: dict[str, tuple[tuple[object, ...], Core]] = {}
-"""The cores of this process, by the name that a user gives them, with what changes when their files do."""
+"""Cores whose greeting is known, by the name that a user gives them, with what changes when their files do."""
 
 
 def kept_core(text: str) -> Core:
-    """Return the started core of a name; the same one again, as long as its files are the same.
+    """Return the core of a name, which was started once at least; the same one, as long as its files are the same.
 
     Raises
     ------
@@ -265,6 +279,5 @@ def kept_core(text: str) -> Core:
 @atexit.register
 def close_cores() -> None:
     """End all cores of this process; those that are asked again are started again."""
-    for _, core in list(_kept.values()):
+    for core in list(_started):
         core.close()
-    _kept.clear()

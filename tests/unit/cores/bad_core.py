@@ -72,8 +72,9 @@ def changed(number):
         "nan": {"normal": [float("nan")] * 3}, "zero": {"normal": [0, 0, 0]}, "long": {"normal": [0, 0, -2]},
         "away": {"normal": [0, 0, 1]}, "text": {"normal": ["0", "0", "-1"]}, "two": {"normal": [0, -1]},
         "no_look": {"look_px": None}, "indefinite": {"covariance": [[1, 0], [0, -1]]},
-        "target": {"target": "liver"}, "flags": {"flags": ["a b"]}, "infinite_covariance": {"covariance": [[1e999, 0], [0, 1]]},
-        "candidates": {"candidates": [[0, 0.6, -0.8]]}, "basis": {"covariance": [[1, 0], [0, 1]], "basis": [[1, 0, 0], [1, 0, 0]]},
+        "target": {"target": "liver"}, "flags": {"flags": ["a b"]}, "candidates": {"candidates": [[0, 0.6, -0.8]]},
+        "infinite_covariance": {"covariance": [[1e999, 0], [0, 1]]},
+        "basis": {"covariance": [[1, 0], [0, 1]], "basis": [[1, 0, 0], [1, 0, 0]]},
     }[FAULT]  # fmt: skip
     answer = good(number)
     if KIND == "frame":
@@ -111,54 +112,56 @@ def frame_counts(number):
     return True
 
 
+def half_array(number):
+    entry = {"name": "look_px", "dtype": "<f8", "shape": [2]}
+    send({"type": "estimate", "id": number, "normal": [0, 0, -1], "arrays": [entry]}, b"\0" * 5)
+    hang()
+
+
+def flood(_):
+    while True:
+        os.write(1, b"x" * 65536)
+
+
+def flood_stderr(number):
+    for _ in range(200):
+        os.write(2, b"warning \x1b[31m\n" * 8192)
+    send(good(number))
+
+
+def leave(_):
+    print("no licence for this highlight", file=sys.stderr, flush=True)
+    os._exit(3)
+
+
+ACTIONS = {
+    "kill": lambda _: os.kill(os.getpid(), signal.SIGKILL),
+    "segfault": lambda _: os.kill(os.getpid(), signal.SIGSEGV),
+    "exit": leave,
+    "hang": lambda _: hang(),
+    "ignores_term": lambda _: hang(),
+    "half_line": lambda _: (send(b'{"type": "estimate", "id"'), hang()),
+    "half_array": half_array,
+    "flood": flood,
+    "flood_after": lambda number: (send(good(number)), flood(number)),
+    "flood_stderr": flood_stderr,
+    "exit_after": lambda number: (send(good(number)), os._exit(0)),
+    "closes_stdout": lambda _: (os.close(1), hang()),
+    "late": lambda number: (time.sleep(2), send(good(number))),
+    "grandchild": lambda _: (grandchild(), os._exit(0)),
+}
+
+
 def break_down(number):
     """Do what the fault says instead of answering."""
-    if wire(number) or frame_counts(number):
-        return
-    if FAULT == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    elif FAULT == "segfault":
-        os.kill(os.getpid(), signal.SIGSEGV)
-    elif FAULT == "exit":
-        print("no licence for this highlight", file=sys.stderr, flush=True)
-        os._exit(3)
-    elif FAULT in ("hang", "ignores_term"):
-        hang()
-    elif FAULT == "half_line":
-        send(b'{"type": "estimate", "id"')
-        hang()
-    elif FAULT == "half_array":
-        entry = {"name": "look_px", "dtype": "<f8", "shape": [2]}
-        send({"type": "estimate", "id": number, "normal": [0, 0, -1], "arrays": [entry]}, b"\0" * 5)
-        hang()
-    elif FAULT == "flood":
-        while True:
-            os.write(1, b"x" * 65536)
-    elif FAULT == "flood_after":
-        send(good(number))
-        while True:
-            os.write(1, b"x" * 65536)
-    elif FAULT == "flood_stderr":
-        for _ in range(200):
-            os.write(2, b"warning \x1b[31m\n" * 8192)
-        send(good(number))
-    elif FAULT == "exit_after":
-        send(good(number))
-        os._exit(0)
-    elif FAULT == "closes_stdout":
-        os.close(1)
-        hang()
-    elif FAULT == "late":
-        time.sleep(2)
-        send(good(number))
-    elif FAULT == "grandchild":
-        grandchild()
-        os._exit(0)
-    else:
+    if FAULT in ACTIONS:
+        ACTIONS[FAULT](number)
+    elif not wire(number) and not frame_counts(number):
         send(changed(number))
 
 
-def main():
+def begin():
+    """Read the greeting and answer it, or break down before."""
     if FAULT == "exit_at_start":
         print("no such model", file=sys.stderr)
         sys.exit(4)
@@ -168,20 +171,20 @@ def main():
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     receive()
-    if FAULT == "half_hello":
-        send(b'{"type": "hello"')
-        hang()
-    if FAULT == "no_hello":
-        send(b"Welcome to the core!\n")
+    if FAULT in ("half_hello", "no_hello"):
+        send(b'{"type": "hello"' if FAULT == "half_hello" else b"Welcome to the core!\n")
         hang()
     send(hello())
     if FAULT == "exit_after_hello":
         os._exit(5)
-    if FAULT == "closes_stdin":
-        os.close(0)
+    if FAULT in ("closes_stdin", "reads_nothing"):
+        if FAULT == "closes_stdin":
+            os.close(0)
         hang()
-    if FAULT == "reads_nothing":
-        hang()
+
+
+def main():
+    begin()
     answered = 0
     while (asked := receive()) is not None:
         if FAULT in ("none", "stays") or answered < SPARED:
