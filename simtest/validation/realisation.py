@@ -67,13 +67,18 @@ class Realiser:
         self, experiment: Experiment, case: Case, number: int, estimators: Mapping[str, AnyEstimator]
     ) -> Realisation:
         """Make one realisation of a case; `session` is then at its scene."""
+        view, drawn = self.view(experiment, case, number)
+        return realise(self.session, experiment, case, number, view, drawn, estimators)
+
+    def view(self, experiment: Experiment, case: Case, number: int) -> tuple[RenderedView, dict[str, float]]:
+        """Render the scene of a realisation, at which `session` then is; return it with the values drawn for it."""
         scene, drawn = case.scene(experiment, number)
         # A scene without drawn values is rendered once for all realisations.
         if self._view is None:
             self.session = Session(scene, self._variant)
         if self._view is None or scene != self._view.scene:
             self._view = render_view(self.session, scene)
-        return realise(self.session, experiment, case, number, self._view, drawn, estimators)
+        return self._view, drawn
 
 
 def realise(

@@ -38,6 +38,10 @@ RESULTS = "results.parquet"
 MOST_DIGEST_BYTES = 1000
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
+EXPORT = "export.json"
+"""What was exported of a run (`simtest.dataset.export`); it stands in the run's folder."""
+EXPORTING = "exporting"
+"""Folder of the lists of a run's export that is not finished."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -369,7 +373,8 @@ def _check_folder(folder: Path) -> None:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     # What is no part of a run.
     held.pop(LOCK, None)
-    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html", PARTS}
+    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html"}
+    own |= {PARTS, EXPORT, EXPORTING}
     strangers = sorted(held.keys() - own)
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
