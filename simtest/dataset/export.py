@@ -197,7 +197,8 @@ def _write_tables(out: Path, made: Sequence[Exported]) -> None:
 
     Frames stand in the order of their names, which are hashes, so that the order tells nothing.
     """
-    frames = dict(sorted((each["frame"], each) for each in made))
+    by_name = {each["frame"]: each for each in made}
+    frames = {name: by_name[name] for name in sorted(by_name)}
     listed: list[Sequence[object]] = []
     found: list[Sequence[object]] = []
     for name, f in frames.items():

@@ -15,7 +15,7 @@ from simtest.validation.cases import Case
 from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
-from simtest.validation.results_table import ResultRow
+from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.rough_truth import rough_truth
 
 
@@ -82,7 +82,7 @@ class Realiser:
 
 
 def realise(
-    session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, float],
+    session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, Value],
     estimators: Mapping[str, AnyEstimator],
 ) -> Realisation:  # fmt: skip
     """Make one realisation of a case from its rendered view, at whose scene the session must be.

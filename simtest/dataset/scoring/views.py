@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
+from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
@@ -107,7 +107,7 @@ class ShardViews:
         return len(Plan(self.dataset).shards[self.key].indices)
 
     def __iter__(self) -> Iterator[Shown]:
-        maker = Maker(Plan(self.dataset), self.variant)
+        maker = maker_of(self.dataset.model_dump_json(), self.variant)
         for index in maker.plan.shards[self.key].indices:
             drawn, view, session = maker.view(index)
             values: dict[str, Value] = {
