@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import simtest
 from simtest.calibration import CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
@@ -161,3 +162,27 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
     with pytest.raises(InputError, match="--target top"):
         Options(fov_deg=53.0, target="top")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("distance_mm", [30.0, 60.0, 80.0])
+@pytest.mark.parametrize("surface", ["plane", "cylinder"])
+def test_the_best_without_a_distance_errs_least_at_every_working_distance(surface, distance_mm):
+    """Lights told, distance not: the named estimator is measured best too, near and far."""
+    settings = {
+        "surface.distance_mm": distance_mm, "surface.tilt_deg": 14.0, "sensor.noise_sigma": 0.03, "sensor.seed": 9071,
+        "rig.lights.0.offset_mm": 4.0, "rig.lights.0.azimuth_deg": 205.0,
+    }  # fmt: skip
+    frame = simtest.render(surface, settings)
+    calibration = frame.calibration
+    assert calibration.priors.lights_mm
+    assert calibration.priors.distance_mm is None
+    (found,) = simtest.reconstruct(
+        frame.image, calibration, estimators=["bisector", "curved", "cone_axis", "brightest_point"]
+    )
+    true = frame.highlights[0].normal
+    errors = {name: np.degrees(np.arccos(min(1.0, each.normal @ true))) for name, each in found.estimates.items()}
+    best, _ = best_of(found.estimates)
+    assert best == min(errors, key=errors.get)
+    # And it says how far it may be off.
+    assert errors[best] <= 2.5 * np.degrees(np.sqrt(np.trace(found.estimates[best].covariance)))
