@@ -14,8 +14,14 @@ import psutil
 import pytest
 
 import simtest
+from simtest.dataset.manifest import new_manifest
+from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators.process.naming import close_cores
+from simtest.runtime.provenance import file_hash
+from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.paper import PaperSetting
+from simtest.validation.paper.gallery_item import reproduce_command
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
 
 EXPERIMENT = """
@@ -277,6 +283,22 @@ def test_a_changed_program_is_another_run(tmp_path, published):
         simtest.validate(published, tmp_path / "run", **arguments)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
+
+
+@pytest.mark.parametrize("extra", ["", "'$HOME' '\"!'"])
+def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
+    core = command(BAD_CORE, "none", extra)
+    line = reproduce_command(PaperSetting(), (core,), 7)
+    done = subprocess.run(["bash", "-c", line.replace("python -c", f"{sys.executable} -c", 1)], capture_output=True,
+                          text=True, timeout=60, check=True)  # fmt: skip
+    assert "bad_core" in done.stdout
+    assert "Estimate(normal=(0, 0, -1)" in done.stdout
+
+
+def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores():
+    dataset = load_dataset("smooth").model_copy(update={"estimators": (command(BAD_CORE, "none"),)})
+    inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
+    assert inputs["core bad_core: bad_core.py"] == file_hash(BAD_CORE)
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
