@@ -104,6 +104,19 @@ def test_an_estimator_of_ours_gives_the_same_rows_as_a_core_in_rendered_frames(t
 
 
 @pytest.mark.render
+def test_a_frame_core_answers_for_the_highlight_that_it_looks_at(tmp_path, experiment):
+    core = command(CORES / "brightest_core.py")
+    run = simtest.validate(experiment, tmp_path / "run", realisations=1, estimators=["brightest_point", core])
+    found = {name: rows for (name,), rows in run.results.group_by("estimator")}
+    assert set(found) == {"brightest_point", "brightest_core"}
+    own, others = found["brightest_core"], found["brightest_point"]
+    assert set(own["status"]) == {"ok"}
+    # The brightest pixel's centre against the sub-pixel peak.
+    assert np.abs(own["look_x_px"].to_numpy() - others["look_x_px"].to_numpy()).max() < 0.75
+    assert np.abs(own["error_deg"].to_numpy() - others["error_deg"].to_numpy()).max() < 0.5
+
+
+@pytest.mark.render
 @pytest.mark.slow
 def test_two_workers_give_the_same_rows_as_one(tmp_path, experiment, monkeypatch):
     monkeypatch.chdir(CORES)
@@ -122,14 +135,15 @@ def patterns(value):
 
 
 @pytest.mark.render
-def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment):
+@pytest.mark.parametrize("kind", ["patch", "frame"])
+def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment, kind):
     spied = tmp_path / "spied.bin"
     out = tmp_path / "peculiar-output-folder"
-    run = simtest.validate(experiment, out, estimators=[command(CORES / "spy_core.py", spied)])
+    run = simtest.validate(experiment, out, estimators=[command(CORES / "spy_core.py", spied, f"--{kind}")])
     content = spied.read_bytes()
-    rows = run.results.filter(pl.col("status") == "ok")
-    assert len(rows) == 4
-    assert content.count(b'"type":"patch"') == 4
+    rows = run.results
+    assert "ok" in rows["status"]
+    assert content.count(f'"type":"{kind}"'.encode()) == 4
     truths = ["truth_x", "truth_y", "truth_z", "bp_true_x_px", "bp_true_y_px", "kd_min", "kd_max", "eps_over_d"]
     values = {v for name in (*truths, "surface.tilt_deg") for v in rows[name].drop_nulls().to_list()}
     # A round number, such as 0, says nothing.
@@ -138,8 +152,8 @@ def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment):
     found = [v for v in telling for pattern in patterns(v) if pattern in content]
     assert found == []
     # Searched for rightly: what it was told is found.
-    told = rows["look_x_px"].to_list()
-    assert [v for v in told if repr(v)[:9].encode() in content] == told
+    told = rows["look_x_px"].to_list() if kind == "patch" else ['"width":200', '"K":[[']
+    assert [v for v in told if str(v)[:9].encode() in content] == told
     words = ["7481927361", "peculiar", "aslant", "cylinder", "realisation", "truth", "setting", "seed", "noise_sigma"]
     words += [str(seed) for seed in rows["seed"].to_list()]
     assert [word for word in words if word.encode() in content] == []

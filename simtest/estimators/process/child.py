@@ -187,7 +187,11 @@ class Child:
         """Return whether the process has ended; it stays as a zombie, so that its group's number is not used again."""
         if self.process.returncode is not None:
             return True
-        return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        try:
+            return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        except ChildProcessError:
+            # Where the user's program ignores SIGCHLD nothing is left of a process that has ended.
+            return True
 
     def close(self, wait_s: float = END_S) -> None:
         """Close the core's standard input, wait for its end, then kill what is left of its process group."""
