@@ -39,7 +39,7 @@ class CoreDriver:
 
     def ask(self, header, arrays):
         described = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in arrays.items()]
-        header = {**header, "arrays": described}
+        header = {**header, "arrays": described} if described else header
         if self.hello.get("transport") != "files":
             return self._exchange(header, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays.values()))
         room = self.folder / f"request_{header['id']}"

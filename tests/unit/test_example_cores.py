@@ -145,6 +145,6 @@ def test_the_frame_core_finds_highlights_itself(tmp_path):
     looks = np.array([estimate["look_px"] for estimate in answer["estimates"]])
     assert len(got) == 2
     order = np.argsort(looks[:, 0])
-    np.testing.assert_allclose(looks[order], [[40.0, 40.0], [120.5, 70.25]], atol=0.05)
-    assert np.degrees(np.arccos(np.clip(np.sum(got[order] * normals, axis=1), -1, 1))).max() < 0.02
+    np.testing.assert_allclose(looks[order], [[40.0, 40.0], [120.5, 70.25]], atol=0.1)
+    assert np.degrees(np.arccos(np.clip(np.sum(got[order] * normals, axis=1), -1, 1))).max() < 0.05
     assert (dark["type"], dark["reason"]) == ("failure", "no_estimate")

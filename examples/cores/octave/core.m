@@ -43,8 +43,8 @@ function answer_requests(transport)
       send(sprintf('{"type":"done","id":%d}', header.id));
     else
       rays = [];
-      for k = 1:numel(header.arrays)  % one array at most: the only one that the hello asks for
-        shape = header.arrays(k).shape(:)';
+      if isfield(header, 'arrays') && ~isempty(header.arrays)  % one at most: the only one that the hello asks for
+        shape = header.arrays(1).shape(:)';
         rays = reshape(fread(in, prod(shape), 'double', 0, 'ieee-le'), fliplr(shape))';
       end
       send(estimate(rays, header.id));

@@ -107,7 +107,7 @@ def main():
             send(HELLO)
             continue
         arrays = {}
-        for entry in header["arrays"]:
+        for entry in header.get("arrays", []):
             dtype = np.dtype(entry["dtype"])
             content = requests.read(dtype.itemsize * int(np.prod(entry["shape"])))
             arrays[entry["name"]] = np.frombuffer(content, dtype).reshape(entry["shape"])
