@@ -1,6 +1,6 @@
 """The circle pose of a public script, as a core: the script's own functions run, from a clone of yours.
 
-The scripts https://github.com/k16makki/EndoMapper_UCA_Specularity of the method's authors have no licence, so nothing of
+The scripts of the method's authors, https://github.com/k16makki/EndoMapper_UCA_Specularity, have no licence: nothing of
 them is copied here. Clone them yourself, and name one of the scripts that define `Zisserman_method` and
 `fit_ellipse_lstsq`:
 
@@ -47,7 +47,7 @@ def estimate(request, arrays, theirs, branch):
     if request["camera"]["distortion"] is not None:
         return failure("not_known", "the script knows K alone; the lens must not distort")
     if ISOPHOTE not in arrays:
-        return failure("no_closed_isophote", request["missing"][ISOPHOTE])
+        return failure("no_closed_isophote", "the isophote was not sent")
     points = arrays[ISOPHOTE][:-1]  # the polygon is closed; its first point counts once
     if len(points) < LEAST_POINTS:
         return failure("too_few_points", f"{len(points)} points; at least {LEAST_POINTS} are needed")

@@ -38,7 +38,7 @@ def estimate(request, arrays):
         An estimate or a failure, without its id.
     """
     if ISOPHOTE not in arrays:
-        return failure("no_closed_isophote", request.get("missing", {}).get(ISOPHOTE, "the isophote was not sent"))
+        return failure("no_closed_isophote", "the isophote was not sent")
     rays = arrays[ISOPHOTE]
     if (rays[0] == rays[-1]).all():
         rays = rays[:-1]  # the polygon is closed; its first point counts once
