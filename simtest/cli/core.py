@@ -11,8 +11,8 @@ core = App(name="core", help="Check a reconstruction core that runs as a command
 def check(command: str, /, *, as_json: AsJson = False) -> int:
     """Check a core against the process protocol, step by step; exit 1 if a step is wrong.
 
-    The core is started, asked about highlights whose normals are known by formula, and ended. Each step has a line: ok, or
-    what is wrong and what is expected.
+    The core is started, asked about highlights whose normals are known by formula, and ended. Each step has a line:
+    ok, or what is wrong and what is expected.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -72,8 +73,13 @@ class CoreCase:
         return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def patch_cases() -> Iterator[CoreCase]:
-    """Return the requests for a core that takes single highlights."""
+@cache
+def core_cases(kind: str) -> tuple[CoreCase, ...]:
+    """Return the requests for a core of a kind, patch or frame; made once, since their frames take most of a check."""
+    return tuple(_patch_cases() if kind == "patch" else _frame_cases())
+
+
+def _patch_cases() -> Iterator[CoreCase]:
     first, second = _normals(PINHOLE, (220.2, 180.7), (460.4, 300.1))
     yield _case("plane", PINHOLE, [first])
     yield _case("another plane", PINHOLE, [second])
@@ -89,8 +95,7 @@ def patch_cases() -> Iterator[CoreCase]:
     yield _case("large region", PINHOLE, _normals(PINHOLE, (300.2, 250.9)), reach_px=200, radius_px=60.0)
 
 
-def frame_cases() -> Iterator[CoreCase]:
-    """Return the requests for a core that takes whole frames."""
+def _frame_cases() -> Iterator[CoreCase]:
     first, second = _normals(PINHOLE, (220.2, 180.7), (460.4, 300.1))
     yield _case("one highlight", PINHOLE, [first])
     yield _case("two highlights", PINHOLE, [first, second])
@@ -140,6 +145,11 @@ def _normals(camera: Camera, *pixels: tuple[float, float]) -> Array:
     return -camera.unproject(np.array(pixels))
 
 
+@cache
+def _rays(camera: Camera) -> Array:
+    return camera.unproject(camera.pixel_centres())
+
+
 def _lobe(camera: Camera, normal: Array, gains: tuple[float, float], radius_px: float) -> Array:
     """Return a highlight of peak 1, shape (H, W), with the light at the camera (theory.md section 3).
 
@@ -151,7 +161,7 @@ def _lobe(camera: Camera, normal: Array, gains: tuple[float, float], radius_px: 
     gains : tuple of float
         1 + d k along both principal directions.
     """
-    rays = camera.unproject(camera.pixel_centres())
+    rays = _rays(camera)
     first, second = basis_across(normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(-(rays @ normal) > 0, -(rays @ normal), np.nan)

@@ -19,7 +19,7 @@ from simtest.geometry import Array
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject
-from simtest.validation.core_cases import CoreCase, frame_cases, patch_cases
+from simtest.validation.core_cases import CoreCase, core_cases
 
 REPEATS = 20
 MOST_FAULTS = 3
@@ -97,8 +97,8 @@ class CoreReport:
         """Return the report for a terminal: the core, a line for each step, the time and the verdict."""
         if self.hello is not None:
             hello = self.hello
-            wanted = ", ".join(hello.arrays) or "no arrays"
-            yield f"core   {hello.name} {hello.version} (kind {hello.kind}, transport {hello.transport}; wants {wanted})"
+            kind = f"kind {hello.kind}, transport {hello.transport}"
+            yield f"core   {hello.name} {hello.version} ({kind}; wants {', '.join(hello.arrays) or 'no arrays'})"
         width = max(len(step.name) for step in self.steps)
         for step in self.steps:
             yield f"{'ok' if step.is_ok else 'WRONG':<6} {step.name:<{width}}  {step.text}".rstrip()
@@ -143,7 +143,7 @@ def _check_requests(core: Core, report: CoreReport) -> None:
     """Send the requests of the core's kind and judge each answer; stop where it breaks down again and again."""
     assert report.hello is not None
     of_patches = report.hello.kind == "patch"
-    cases = list(patch_cases() if of_patches else frame_cases())
+    cases = core_cases(report.hello.kind)
     ask: Callable[[CoreCase], Answer] = _ask_patch(core) if of_patches else _ask_frame(core)
     accurate: list[tuple[Array, Array]] = []
     faults = 0
