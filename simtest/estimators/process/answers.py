@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.process.core import Hello
+from simtest.estimators.isophote_fit import FittedIsophote
+from simtest.estimators.process.core import MAX_ISOPHOTES, Hello
 from simtest.estimators.process.wire import Message, excerpt
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Target
 from simtest.geometry import Array, Camera
@@ -103,6 +104,7 @@ def _estimate(fields: Mapping[str, Any], camera: Camera, target: Target) -> Esti
         candidates,
         _look(fields, camera),
         axis_ratio=_number(fields, "axis_ratio"),
+        isophotes=_isophotes(fields.get("isophotes")),
         choice_margin=_number(fields, "choice_margin"),
         flags=_flags(fields.get("flags")),
         curvature=_curvature(fields.get("curvature")),
@@ -156,6 +158,25 @@ def _covariance(fields: Mapping[str, Any], name: str, turn: Array) -> Array:
     if abs(given[0, 1] - given[1, 0]) > ROUNDED * size or np.linalg.eigvalsh(given).min() < -ROUNDED * size:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: must be symmetric and have no negative eigenvalue")
     return np.asarray(turn @ given @ turn.T)
+
+
+def _isophotes(given: object) -> tuple[FittedIsophote, ...]:
+    """Return the isophotes that an estimate says it was made of: isovalue and cone of sightlines of each."""
+    listed = [] if given is None else given
+    if not isinstance(listed, list) or len(listed) > MAX_ISOPHOTES or not all(isinstance(i, Mapping) for i in listed):
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"isophotes: {_told(given)}; must be at most {MAX_ISOPHOTES} objects")
+    return tuple(_isophote(each) for each in listed)
+
+
+def _isophote(given: Mapping[str, Any]) -> FittedIsophote:
+    isovalue = float(_numbers(given, "isovalue", ()))
+    cone, sightline = _numbers(given, "cone", (3, 3)), _unit(_numbers(given, "sightline", (3,)), "sightline")
+    if not 0 < isovalue < 1:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"isovalue {isovalue:g}: must be in (0, 1)")
+    made = FittedIsophote(isovalue, np.empty((0, 2)), None, cone, sightline)
+    if np.abs(cone - cone.T).max() > ROUNDED * np.abs(cone).max() or isinstance(made.pose(), Failure):
+        raise _Refused(Reason.ESTIMATOR_ERROR, "cone: must be symmetric, and an elliptic cone about the sightline")
+    return made
 
 
 def _curvature(given: object) -> EstimatedCurvature | None:

@@ -42,7 +42,7 @@ def hang():
 
 def grandchild():
     """Start a child that holds the pipes open, and tell its number on standard error."""
-    child = subprocess.Popen([sys.executable, "-S", "-c", f"import time; time.sleep({HANG_S})"])
+    child = subprocess.Popen([sys.executable, "-S", "-c", f"import time; time.sleep({HANG_S})", *sys.argv])
     print(f"grandchild {child.pid}", file=sys.stderr, flush=True)
 
 
