@@ -148,3 +148,72 @@ def test_the_frame_core_finds_highlights_itself(tmp_path):
     np.testing.assert_allclose(looks[order], [[40.0, 40.0], [120.5, 70.25]], atol=0.1)
     assert np.degrees(np.arccos(np.clip(np.sum(got[order] * normals, axis=1), -1, 1))).max() < 0.05
     assert (dark["type"], dark["reason"]) == ("failure", "no_estimate")
+
+
+STAND_IN = """
+import no_such_package
+
+print("the main part runs")
+
+def fit_ellipse_lstsq(contour):
+    print("a stray print")
+    return contour.mean(axis=0)
+
+def dual_conic(): pass
+def sorted_eigen(): pass
+def plane_normal(): pass
+
+def Zisserman_method(a, K, case="non-synthetic"):
+    ray = np.linalg.inv(K) @ [a[0], a[1], 1.0]
+    return (ray, ray) if case == "synthetic" else (ray + [0.5, 0, 0], -ray + [0.5, 0, 0])
+
+def normal_disambiguiting(N1, N2, I):
+    return N2
+
+raise SystemExit("the main part runs")
+"""
+
+
+def ask_script(folder, text, *options, distortion=None):
+    """Ask the core of the published scripts, with a script of this text, about a square isophote."""
+    script = folder / "script.py"
+    script.write_text(text)
+    camera = {"K": [[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]], "distortion": distortion}
+    turns = np.linspace(0, 2 * np.pi, 13)
+    contour = np.stack([60 + 5 * np.cos(turns), 40 + 5 * np.sin(turns)], axis=1)
+    contour[-1] = contour[0]
+    command = [sys.executable, str(CORES / "authors" / "core.py"), str(script), *options]
+    with core_driver.CoreDriver(command, folder) as core:
+        return core.ask({"type": "patch", "id": 5, "camera": camera, "missing": {}}, {"isophote_0.5": contour})
+
+
+def test_the_scripts_functions_run_without_their_main_part(tmp_path):
+    answer = ask_script(tmp_path, STAND_IN)
+    assert (answer["type"], answer["id"], answer["flags"]) == ("estimate", 5, [])
+    ray = np.array([0.1, -0.1, 1.0])
+    expected = np.array([[0.4, 0.1, -1.0], [-0.6, 0.1, -1.0]])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    # The chosen one first, each turned so that it faces the camera.
+    np.testing.assert_allclose(answer["candidates"], expected, atol=1e-12)
+    np.testing.assert_allclose(answer["normal"], expected[0], atol=1e-12)
+    np.testing.assert_allclose(answer["look_ray"], ray / np.linalg.norm(ray), atol=1e-12)
+
+
+def test_one_vector_for_both_normals_is_flagged(tmp_path):
+    answer = ask_script(tmp_path, STAND_IN, "--branch", "eigenvector")
+    assert answer["flags"] == ["one_normal"]
+    assert len(answer["candidates"]) == 1
+
+
+def test_a_lens_that_the_script_does_not_know_is_refused(tmp_path):
+    answer = ask_script(tmp_path, STAND_IN, distortion={"model": "brown_conrady", "k1": -0.1})
+    assert (answer["type"], answer["reason"]) == ("failure", "not_known")
+
+
+def test_a_script_without_the_functions_is_told_which(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("def Zisserman_method(): pass\n")
+    command = [sys.executable, str(CORES / "authors" / "core.py"), str(script)]
+    done = subprocess.run(command, input="", capture_output=True, text=True, timeout=30)
+    assert done.returncode == 1
+    assert "defines no function dual_conic, fit_ellipse_lstsq, normal_disambiguiting" in done.stderr
