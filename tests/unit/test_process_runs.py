@@ -249,6 +249,21 @@ def test_a_run_tells_of_its_cores(tmp_path, published):
     assert "bad_core" in (tmp_path / "run" / "index.html").read_text()
 
 
+def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
+    from simtest.nightly.measure import measure_run, plan_run
+    from simtest.spec.profile import load_profile
+
+    core = command(BAD_CORE, "none")
+    published.write_text(PUBLISHED.replace('"cone_axis"', json.dumps(core)))
+    assert simtest.load_experiment(published).estimators == (core,)
+    profile = tmp_path / "profile.toml"
+    entry = f'[[experiments]]\nexperiment = "{published}"\nestimators = ["cone_axis", {json.dumps(core)}]\n'
+    profile.write_text(f"canaries = false\ncosts = false\n{entry}")
+    planned = plan_run(load_profile(profile))
+    made = measure_run(load_profile(profile), tmp_path / "scratch", "a", planned=planned)
+    assert set(made.figures["estimator"]) >= {"cone_axis", "bad_core"}
+
+
 def test_a_changed_program_is_another_run(tmp_path, published):
     script = tmp_path / "core.py"
     script.write_text(BAD_CORE.read_text())
