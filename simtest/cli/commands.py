@@ -28,6 +28,7 @@ COMMANDS = {
     "fit": "Fit the ranges of a dataset recipe to real frames.",
     "core": "Check a reconstruction core that runs as a command of its own.",
     "validate": "Run an experiment and write its report.",
+    "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
