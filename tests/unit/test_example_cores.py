@@ -1,6 +1,7 @@
 """The example cores in other languages: each answers as the one in Python does, on the same requests."""
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import pytest
 import simtest
 from simtest.errors import Reason
 from simtest.estimators.isophote_fit import fit_isophotes
+from simtest.validation.core_check import check_core
+from studies.authors_core import Agreement
 
 CORES = Path(__file__).resolve().parents[2] / "examples" / "cores"
 PYTHON = [sys.executable, str(CORES / "python" / "core.py")]
@@ -217,3 +220,28 @@ def test_a_script_without_the_functions_is_told_which(tmp_path):
     done = subprocess.run(command, input="", capture_output=True, text=True, timeout=30)
     assert done.returncode == 1
     assert "defines no function dual_conic, fit_ellipse_lstsq, normal_disambiguiting" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["cpp", "octave"])
+def test_the_other_languages_pass_the_check(kind, request):
+    require("octave-cli", "octave") if kind == "octave" else None
+    named = CORES / "octave" / "core.toml" if kind == "octave" else shlex.join(request.getfixturevalue("compiled"))
+    report = check_core(str(named))
+    assert report.is_ok, list(report.lines())
+
+
+def test_the_comparison_with_the_scripts_takes_the_pairs_in_any_order():
+    def pair(*tilts_deg, flags=()):
+        angles = np.radians(tilts_deg)
+        normals = np.stack([np.sin(angles), np.zeros(2), -np.cos(angles)], axis=1)
+        return simtest.Estimate(normals[0], normals, np.zeros(2), flags=flags)
+
+    agreement = Agreement()
+    agreement.add(pair(20.0, -10.0), pair(-10.1, 20.05))
+    assert agreement.gaps_deg == pytest.approx([0.1])
+    assert agreement.proposed_deg == pytest.approx([30.1])
+    assert agreement.from_axis_deg == pytest.approx([15.1])
+    agreement.add(pair(20.0, -20.0), pair(90.0, 90.0, flags=("one_normal",)))
+    agreement.add(pair(20.0, -20.0), simtest.Failure(Reason.NOT_KNOWN))
+    assert (agreement.single, agreement.unanswered) == (1, 1)
+    assert agreement.lines()[-1] == "proposed normal along the cone's axis: 0, across it: 1"
