@@ -1,5 +1,6 @@
 """The example cores in other languages: each answers as the one in Python does, on the same requests."""
 
+import ast
 import os
 import shlex
 import shutil
@@ -245,3 +246,13 @@ def test_the_comparison_with_the_scripts_takes_the_pairs_in_any_order():
     agreement.add(pair(20.0, -20.0), simtest.Failure(Reason.NOT_KNOWN))
     assert (agreement.single, agreement.unanswered) == (1, 1)
     assert agreement.lines()[-1] == "proposed normal along the cone's axis: 0, across it: 1"
+
+
+@pytest.mark.parametrize(
+    "script", sorted(CORES.glob("*/*.py")), ids=lambda script: script.relative_to(CORES).as_posix()
+)
+def test_the_python_cores_need_numpy_alone(script):
+    tree = ast.parse(script.read_text(encoding="utf-8"), feature_version=(3, 9))
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert {name.partition(".")[0] for name in imported} <= {*sys.stdlib_module_names, "numpy"}
