@@ -252,7 +252,7 @@ def test_the_comparison_with_the_scripts_takes_the_pairs_in_any_order():
     "script", sorted(CORES.glob("*/*.py")), ids=lambda script: script.relative_to(CORES).as_posix()
 )
 def test_the_python_cores_need_numpy_alone(script):
-    tree = ast.parse(script.read_text(encoding="utf-8"), feature_version=(3, 9))
+    tree = ast.parse((CORES / script).read_text(encoding="utf-8"), feature_version=(3, 9))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert {name.partition(".")[0] for name in imported} <= {*sys.stdlib_module_names, "numpy"}
