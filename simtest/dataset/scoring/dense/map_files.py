@@ -139,6 +139,8 @@ def read_map(one: MapFile, size: tuple[int, int]) -> RawMap:
     kind = one.kind or kind_of(values)
     if kind == "normal" and values.ndim == 2:
         raise InputError(f"{shown(path)}: has one channel; a normal map has three")
+    if kind == "normal" and values.dtype.kind in "iu" and values.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{shown(path)}: normals are {values.dtype}; must be uint8, uint16 or floats")
     if kind == "depth" and values.ndim == 3:
         if (values != values[:, :, :1]).any():
             raise InputError(f"{shown(path)}: channels differ; a depth map has one, or equal ones")
