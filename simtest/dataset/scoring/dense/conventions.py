@@ -108,19 +108,26 @@ class Evidence:
             self.depth.add(depth[known], truth.distance.ravel()[chosen][known], factors)
 
     def _add_normals(self, raw: RawMap, normal: Array, chosen: "np.typing.NDArray[np.intp]") -> None:
-        stated = [name for name in ENCODINGS if name == self.options.encoding]
-        for encoding in stated or candidates(raw):
+        for encoding in (self._stated,) if self._stated else candidates(raw):
             vectors = channel_vectors(raw, encoding).reshape(-1, 3)[chosen]
-            self.lengths.setdefault(encoding, []).append(length_error(vectors))
+            # A frame without an answer says nothing.
+            if np.isfinite(off := length_error(vectors)):
+                self.lengths.setdefault(encoding, []).append(off)
             vectors = unit(vectors)
             known = np.isfinite(vectors).all(axis=1)
             self.axes.setdefault(encoding, AxesEvidence()).add(vectors[known], normal[known])
 
     @property
+    def _stated(self) -> Encoding | None:
+        return next((name for name in ENCODINGS if name == self.options.encoding), None)
+
+    @property
     def encoding(self) -> Encoding:
-        """The encoding whose vectors are nearest to length 1; the first where several are."""
-        finite = {name: np.mean(own) for name, own in self.lengths.items() if np.isfinite(own).all()}
-        return min(finite, key=lambda name: finite[name]) if finite else "unit"
+        """The encoding stated, or whose vectors are nearest to length 1; the first where several are."""
+        means = {name: float(np.mean(own)) for name, own in self.lengths.items()}
+        if (stated := self._stated) is not None:
+            return stated
+        return min(means, key=lambda name: means[name]) if means else "unit"
 
     def provisional(self) -> Conventions:
         """Return the conventions that fit the frames so far, clear or not."""

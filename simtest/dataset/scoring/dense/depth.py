@@ -9,6 +9,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.files import JsonObject
+from simtest.runtime.seeds import from_integer
 from simtest.validation.depth_maps import depth_normals
 
 DepthKind = Literal["z", "ray"]
@@ -20,8 +21,11 @@ ALIGNMENTS: tuple[Alignment, ...] = ("none", "scale", "affine")
 """As stated; times a factor a frame; times a factor plus a shift a frame."""
 
 ROUNDS = 20
-TUNING = 1.345
-"""Of Huber's weights, in standard deviations: 95 % as efficient as least squares on normal errors."""
+TUNING = 4.685
+"""Of Tukey's weights, in standard deviations: 95 % as efficient as least squares on normal errors."""
+
+TRIALS, JUDGED = 100, 2000
+"""Pairs of pixels that the affine start tries, and pixels that judge each, at least."""
 
 MAD_TO_SIGMA = 1.4826
 LEAST_PIXELS = 3
@@ -41,8 +45,9 @@ def depth_factor(camera: Camera, kind: DepthKind) -> Array:
 def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
     """Return the factor and the shift, in the truth's unit, that bring depths to the truth.
 
-    They minimise the relative residuals (a depth + b - t) / t by iteratively reweighted least squares with Huber's
-    weights [Holland & Welsch 1977], so that a few pixels do not pull them.
+    They minimise the relative residuals (a depth + b - t) / t by iteratively reweighted least squares with Tukey's
+    weights [Beaton & Tukey 1974], from a least-median start [Rousseeuw 1984]: up to nearly half of the pixels may be
+    wrong.
 
     Parameters
     ----------
@@ -61,18 +66,35 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
     if len(depth) < LEAST_PIXELS:
         return float("nan"), float("nan")
     columns = [depth / truth] if how == "scale" else [depth / truth, 1 / truth]
-    design, wanted = np.stack(columns, axis=1), np.ones(len(depth))
-    # A median ratio is a start that outliers do not spoil.
-    fitted = np.array([np.median(truth / depth), 0.0])[: len(columns)]
+    design = np.stack(columns, axis=1)
+    fitted = _start(design)
     for _ in range(ROUNDS):
-        residual = np.abs(design @ fitted - wanted)
-        sigma = MAD_TO_SIGMA * float(np.median(residual))
-        weight = np.minimum(1.0, TUNING * sigma / np.maximum(residual, 1e-300)) if sigma > 0 else np.ones(len(depth))
-        root = np.sqrt(weight)
-        last, fitted = fitted, np.linalg.lstsq(design * root[:, None], wanted * root, rcond=None)[0]
+        residual = np.abs(design @ fitted - 1)
+        reach = TUNING * max(MAD_TO_SIGMA * float(np.median(residual)), 1e-12)
+        weight = np.where(residual < reach, (1 - (residual / reach) ** 2) ** 2, 0.0)
+        weighed = design * weight[:, None]
+        last, fitted = fitted, np.linalg.lstsq(weighed.T @ design, weighed.sum(axis=0), rcond=None)[0]
         if np.allclose(last, fitted, rtol=1e-10, atol=1e-12):
             break
     return float(fitted[0]), float(fitted[1]) if how == "affine" else 0.0
+
+
+def _start(design: Array) -> Array:
+    """Return the fit through one or two pixels with the least median residual, among `TRIALS` draws."""
+    if design.shape[1] == 1:
+        return np.array([1 / np.median(design[:, 0])])
+    rng = from_integer(0)
+    tried = design[:: max(1, len(design) // JUDGED)]
+    best, least = np.array([1 / np.median(design[:, 0]), 0.0]), np.inf
+    for _ in range(TRIALS):
+        pair = design[rng.choice(len(design), 2, replace=False)]
+        if abs(np.linalg.det(pair)) < 1e-12:
+            continue
+        fitted = np.linalg.solve(pair, np.ones(2))
+        median = float(np.median(np.abs(tried @ fitted - 1)))
+        if median < least:
+            best, least = fitted, median
+    return best
 
 
 def normals_of_distance(distance: Array, rays: Array) -> Array:

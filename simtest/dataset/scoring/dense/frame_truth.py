@@ -1,6 +1,6 @@
 """The truth of one frame, as far as dense maps are scored against it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,9 @@ from simtest.runtime.short_repr import short_repr
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps
     from simtest.simulation.rendered_view import RenderedView
+
+Progress = Callable[[int, int, str], None]
+"""Called with frames done, frames in all, and the frame's name."""
 
 SURFACES = ("fine", "base")
 """The two truths: with relief and without. They are equal where a scene has none."""

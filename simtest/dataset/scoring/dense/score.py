@@ -10,7 +10,7 @@ import numpy.typing as npt
 from simtest.dataset.scoring.dense.cells import BINS, ZONE_MEANINGS
 from simtest.dataset.scoring.dense.conventions import Answer, Conventions, Evidence, MapOptions
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS
-from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth
+from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth, Progress
 from simtest.dataset.scoring.dense.methods import Method, open_method
 from simtest.dataset.scoring.dense.pictures import Shown, picture_row
 from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, Key, Scorer, depth_source
@@ -18,6 +18,7 @@ from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
@@ -28,9 +29,6 @@ MOST_SHOWN, LEAST_SHOWN = 6, 3
 
 Frames = Callable[[], Iterable[FrameTruth]]
 """Yields the frames anew at each call, in the same order."""
-
-Progress = Callable[[int, str], None]
-"""Called with the frames done and the name of the frame."""
 
 
 @dataclass
@@ -104,9 +102,7 @@ class DenseScore:
         }  # fmt: skip
 
 
-def score_frames(
-    frames: Frames, method: Method, options: MapOptions, on: str = "", progress: Progress | None = None
-) -> DenseScore:
+def score_frames(frames: Frames, method: Method, options: MapOptions, on: str = "") -> DenseScore:
     """Score a method's maps on frames, one at a time.
 
     Conventions that nobody stated are those that fit the truth of all frames best. The frames are scored by those
@@ -122,14 +118,14 @@ def score_frames(
     evidence = Evidence(options)
     names: list[str] = []
     sources = _sources(method)
-    score = _pass(frames, method, options, None, evidence, sources, progress, names)
+    score = _pass(frames, method, options, None, evidence, sources, names)
     method.check(names)
     what = f"maps {shown(method.name)}"
     if score is None:
         raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
     final = evidence.decide(what)
     if final != score.conventions:
-        again = _pass(frames, method, options, final, None, sources, progress, [])
+        again = _pass(frames, method, options, final, None, sources, [])
         assert again is not None
         score = again
     score.name, score.on, score.evidence = options.name or method.name, on, evidence
@@ -144,7 +140,7 @@ def _sources(method: Method) -> tuple[str, ...]:
 
 def _pass(
     frames: Frames, method: Method, options: MapOptions, conventions: Conventions | None, evidence: Evidence | None,
-    sources: tuple[str, ...], progress: Progress | None, names: list[str],
+    sources: tuple[str, ...], names: list[str],
 ) -> DenseScore | None:  # fmt: skip
     """Score all frames by given conventions, or by those of the evidence; None without frames.
 
@@ -165,8 +161,6 @@ def _pass(
         _count(score.counts, truth, answer)
         normals = score.scorer.add(truth, answer)
         _show(score, truth, normals)
-        if progress:
-            progress(len(names), truth.name)
     return score
 
 
@@ -215,7 +209,7 @@ def score_maps(
     maps : str or Path
         Folder of the maps, each called as its frame, or "shading" for the baseline.
     on : Path
-        Folder of the run or dataset.
+        Folder of the run or dataset, whose frames were exported.
     out : Path
         Gets dense.parquet, dense.json and index.html.
     options : MapOptions, optional
@@ -223,18 +217,30 @@ def score_maps(
     command : str
         How the scoring was called.
     progress : callable, optional
-        Called with the frames done and the frame's name.
+        Called with the frames done, frames in all, and the frame's name.
 
     Raises
     ------
     InputError
         If a folder or a map cannot be read, no convention fits, or two fit alike.
     """
-    from simtest.dataset.scoring.dense.from_folder import frames_of
+    from simtest.dataset.scoring.dense.from_folder import count_frames, frames_of
 
-    score = score_frames(lambda: frames_of(on), open_method(maps), options or MapOptions(), str(on), progress)
-    write_score(score, out, command)
+    options = options or MapOptions()
+    options.check()
+    method = open_method(maps)
+    total = count_frames(on)
+    _refuse_run(out)
+    with exclusive_folder(out):
+        score = score_frames(lambda: frames_of(on, progress, total), method, options, str(on))
+        write_score(score, out, command)
     return score
+
+
+def _refuse_run(out: Path) -> None:
+    """Raise `InputError` where a folder for figures holds something else that has a page."""
+    if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
+        raise InputError(f"--out {shown(out)}: holds another page; must be an empty folder or one of such figures")
 
 
 __all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]

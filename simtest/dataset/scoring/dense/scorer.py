@@ -1,6 +1,5 @@
 """Scores maps frame by frame: angles and depth errors go into tallies, and each frame leaves its rows."""
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -55,6 +54,8 @@ class Scorer:
     alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     sources: tuple[str, ...] = ()
     """Sources that some frame has; a frame without one counts as unanswered there."""
+    _cells: list[tuple[Key, JsonObject]] = field(default_factory=list)
+    _told_rows: int = 0
 
     def add(self, truth: FrameTruth, answer: Answer) -> dict[str, Array]:
         """Score a frame; return the normals of each source, shape (H, W, 3), NaN where it has none."""
@@ -136,10 +137,14 @@ class Scorer:
             summary[how] = own
         return summary
 
-    def cells(self) -> Iterator[tuple[Key, Mapping[str, object]]]:
-        """Yield the figures of every cell that holds a pixel."""
-        for key, tally in self.tallies.items():
-            for number, cell in enumerate(CELLS):
-                found = tally.figures(number)
-                if found["n"]:
-                    yield key, {"group": cell.group, "label": cell.label, "scope": cell.scope, **found}
+    def cells(self) -> list[tuple[Key, JsonObject]]:
+        """Return the figures of every cell that holds a pixel."""
+        if len(self.rows) != self._told_rows:
+            self._cells = [
+                (key, {"group": cell.group, "label": cell.label, "scope": cell.scope, **tally.figures(number)})
+                for key, tally in self.tallies.items()
+                for number, cell in enumerate(CELLS)
+                if tally.frames[number]
+            ]
+            self._told_rows = len(self.rows)
+        return self._cells

@@ -124,15 +124,17 @@ class Tally:
         """Return the 95 % interval of each figure over the bootstrap's replicates."""
         coarse = self.counts[cell].reshape(_COARSE, PER_COARSE).sum(axis=1)
         means = self.totals[cell].reshape(_COARSE, PER_COARSE).sum(axis=1) / np.maximum(coarse, 1)
-        drawn: dict[str, list[float]] = {}
-        for sums, counts in zip(self._weighed[:, cell], self._weighed_counts[:, cell], strict=True):
-            # A replicate that holds none of the frames tells nothing.
-            if sums[0] > 0:
-                figures = named(sums, self.below)
-                figures |= {"median": _quantile(counts, means, 0.5), "p95": _quantile(counts, means, 0.95)}
-                for name, value in figures.items():
-                    drawn.setdefault(name, []).append(value)
-        return {name: np.percentile(values, [2.5, 97.5]).tolist() for name, values in drawn.items() if len(values) > 1}
+        # A replicate that holds none of the frames tells nothing.
+        holds = self._weighed[:, cell, 0] > 0
+        if holds.sum() < 2:
+            return {}
+        rows = [named(sums, self.below) for sums in self._weighed[holds, cell]]
+        drawn = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        cumulated = np.cumsum(self._weighed_counts[holds, cell], axis=1, dtype=float)
+        for name, share in (("median", 0.5), ("p95", 0.95)):
+            number = (cumulated < share * cumulated[:, -1:]).sum(axis=1)
+            drawn[name] = means[np.minimum(number, _COARSE - 1)]
+        return {name: np.percentile(values, [2.5, 97.5]).tolist() for name, values in drawn.items()}
 
 
 def named(sums: Array, below: Sequence[float]) -> JsonObject:
