@@ -20,13 +20,27 @@ estimators = ["brightest_point"]
 [[groups]]
 scene = "tissue_liver"
 label = "tissue"
-set = { "camera.width" = 128, "camera.height" = 96, "camera.fx" = 90.0, "camera.fy" = 90.0, "camera.view_mask.radius" = 55.0, "camera.distortion.type" = "brown_conrady", "camera.distortion.k1" = -0.1, "render.samples_per_pixel" = 1 }
 pool = [{ "surface.viewpoint" = [21, 22] }]
+[groups.set]
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 90.0
+"camera.fy" = 90.0
+"camera.view_mask.radius" = 55.0
+"camera.distortion.type" = "brown_conrady"
+"camera.distortion.k1" = -0.1
+"render.samples_per_pixel" = 1
 
 [[groups]]
 scene = "cylinder"
 label = "fisheye"
-set = { "camera.width" = 128, "camera.height" = 96, "camera.fx" = 60.0, "camera.fy" = 60.0, "camera.distortion.type" = "kannala_brandt", "surface.tilt_deg" = 20.0 }
+[groups.set]
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 60.0
+"camera.fy" = 60.0
+"camera.distortion.type" = "kannala_brandt"
+"surface.tilt_deg" = 20.0
 """
 
 
