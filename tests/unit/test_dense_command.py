@@ -145,3 +145,10 @@ def test_a_run_is_not_written_over(run, here, tmp_path):
     code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", run[0])
     assert code != 0
     assert "holds another page" in errors[-1]
+
+
+def test_the_command_knows_the_methods():
+    from simtest.cli.dense_score import WORDS
+    from simtest.dataset.scoring.dense import METHODS
+
+    assert set(WORDS) == set(METHODS)
