@@ -61,9 +61,9 @@ class Bisector:
         The candidates are those of the lights that may have made the highlight, the proposed one first. With several
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
-        mean square of what the single lights would give, over the distances. Fails as `cone_axis` does, and with ``not_known`` without
-        lights. In a highlight too small for isophotes s is the sightline of its centre, flagged ``unresolved``, and no
-        axis ratio is stated.
+        mean square of what the single lights would give, over the distances. Fails as `cone_axis` does, and with
+        ``not_known`` without lights. In a highlight too small for isophotes s is the sightline of its centre, flagged
+        ``unresolved``, and no axis ratio is stated.
         """
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
