@@ -207,6 +207,20 @@ def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
     assert wait_until(lambda: not os.path.exists(folder))
 
 
+def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
+    mark = f"--mark={tmp_path.name}"
+    started = parent("time.sleep(60)", command(BAD_CORE, "stays", mark))
+    folder = started.stdout.readline().strip()
+    process = psutil.Process(started.pid)
+    (core,) = process.children(recursive=True)
+    for each in (core, process):
+        each.kill()
+    started.wait()
+    started.stdout.close()
+    assert wait_until(lambda: not os.path.exists(folder))
+    assert wait_until(lambda: not processes_with(folder))
+
+
 @pytest.mark.parametrize("then", ["", "raise SystemExit(1)", "import os; os._exit(0)"])
 def test_a_core_ends_with_its_parent(tmp_path, then):
     mark = f"--mark={tmp_path.name}"
