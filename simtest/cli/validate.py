@@ -79,7 +79,8 @@ def validate(
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         run(described, folder, None, command, variant, progress, engine=chosen, export=export)
     if as_json:
-        print_run(folder, meshes=meshes)
+        exported = {} if export is None else {"export": export / "README.md"}
+        print_run(folder, meshes=meshes, **exported)
         return
     print(*meshes, sep="\n", end="\n" * bool(meshes))
     print_guide(folder)
