@@ -1,0 +1,139 @@
+"""Runs the benchmark: each part by the ordinary runner, then the figures and the certificate."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from simtest.bench.certificate import FORMAT, KIND, environment, suite_record, write_certificate
+from simtest.bench.cores import check_core, core_record, time_core
+from simtest.bench.draws import Seeds, experiment_of
+from simtest.bench.scores import score_part
+from simtest.bench.suite import Suite
+from simtest.errors import InputError
+from simtest.runtime.engines import Engine
+from simtest.runtime.files import JsonObject, make_folder
+from simtest.runtime.resources import shown
+from simtest.validation.runner import Progress, run_experiments
+
+HIGHLIGHTS = "highlights"
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """A finished run of the benchmark.
+
+    Parameters
+    ----------
+    certificate : Path
+        Its file.
+    content : dict
+        As in the file, without its hash.
+    """
+
+    certificate: Path
+    content: JsonObject
+
+
+def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
+    """Return the parts that are run: those asked for, or all whose unit is the highlight.
+
+    Raises `InputError` for a part that is unknown, named twice, or scored by maps.
+    """
+    if not wanted:
+        return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    for name in wanted:
+        if suite.part(name).kind != HIGHLIGHTS:
+            raise InputError(
+                f"--part {name}: is scored by maps of normals or depth, which a core of highlights has not"
+            )
+        if list(wanted).count(name) > 1:
+            raise InputError(f"--part {shown(name, 60)}: named twice")
+    return [part.name for part in suite.spec.parts if part.name in wanted]
+
+
+def run_bench(
+    suite: Suite,
+    core: str,
+    folder: Path,
+    seeds: Seeds,
+    parts: Sequence[str] | None = None,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+    variant: str | None = None,
+) -> BenchRun:
+    """Run a core on a suite and write its certificate; a stopped run goes on.
+
+    Parameters
+    ----------
+    suite : Suite
+        What to run.
+    core : str
+        An installed estimator, or a command.
+    folder : Path
+        Gets a run's folder for each part, and certificate.json.
+    seeds : Seeds
+        Public or sealed.
+    parts : sequence of str, optional
+        Default all that are scored by highlights.
+    engine, progress, variant
+        See `simtest.validate`. The figures do not depend on the engine.
+
+    Raises
+    ------
+    InputError
+        If a part or the core is unknown, or the folder holds something else.
+    """
+    check_core(core)
+    chosen = chosen_parts(suite, parts)
+    told = core_record(core)
+    make_folder(folder)
+    scores: dict[str, JsonObject] = {}
+    durations: dict[str, float] = {}
+    frames = {case.spec.name: case.spec.realisations for case in suite.cases}
+    for part in chosen:
+        clock = time.monotonic()
+        experiment = experiment_of(suite, part, core, seeds)
+        # Part by part: the colours that one part needs are not those that another is rendered in.
+        (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
+        durations[part] = round(time.monotonic() - clock, 1)
+        scores[part] = score_part(run.results, frames).to_json()
+    content: JsonObject = {
+        "kind": KIND,
+        "format": FORMAT,
+        "suite": suite_record(suite),
+        "cases": {name: digest for name, digest in suite.hashes.items() if name.partition("/")[0] in chosen},
+        "seeds": _seeds_record(suite, seeds),
+        "core": told,
+        "environment": environment(),
+        "parts": scores,
+        "overall": overall_of(suite, scores),
+        # Of this machine; nothing that a verification compares.
+        "timing": {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)},
+    }
+    return BenchRun(write_certificate(folder, content), content)
+
+
+def _seeds_record(suite: Suite, seeds: Seeds) -> JsonObject:
+    if seeds.commitment is None:
+        return {"kind": "public", "seed": suite.spec.seed}
+    return {"kind": "sealed", "commitment": seeds.commitment}
+
+
+def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
+    """Return the headline: the mean over parts of the penalised mean error, where every part was run.
+
+    Its interval takes the parts' errors as independent. `parts` holds the figures as they stand in a certificate.
+    """
+    wanted = [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    told = [parts[part] for part in wanted if part in parts]
+    values = [part["penalised_deg"] for part in told if part["penalised_deg"] is not None]
+    if len(values) < len(wanted):
+        return {"complete": False, "penalised_deg": None, "penalised_interval": None}
+    mean = sum(values) / len(values)
+    spans = [part["penalised_interval"] for part in told if part["penalised_interval"] is not None]
+    if len(spans) < len(wanted):
+        return {"complete": True, "penalised_deg": mean, "penalised_interval": None}
+    half = math.hypot(*((high - low) / 2 for low, high in spans)) / len(spans)
+    return {"complete": True, "penalised_deg": mean, "penalised_interval": [max(0.0, mean - half), mean + half]}
