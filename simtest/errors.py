@@ -72,6 +72,9 @@ class Reason(StrEnum):
     NOT_KNOWN = "not_known"
     NO_ESTIMATE = "no_estimate"
     ESTIMATOR_ERROR = "estimator_error"
+    CORE_DIED = "core_died"
+    CORE_TIMEOUT = "core_timeout"
+    CORE_PROTOCOL = "core_protocol"
 
     @property
     def meaning(self) -> str:
@@ -94,6 +97,9 @@ _MEANINGS = {
     Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
     Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
     Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
+    Reason.CORE_DIED: "the core's process ended before it answered",
+    Reason.CORE_TIMEOUT: "the core gave no answer within its time limit",
+    Reason.CORE_PROTOCOL: "the core wrote what the process protocol does not allow",
 }
 
 

@@ -17,6 +17,7 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
 from simtest.estimators.prior_parts import to_base
+from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
@@ -178,7 +179,7 @@ def _choose(
     smoothing = choose_smoothing(smoothing_px, finder)
     made = _run(image, known, finder, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
-    return made, Choices(kind, known.saturation_level, name, smoothing, tuple(estimators), known.priors)
+    return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
 
 
 def reconstruct_colour(

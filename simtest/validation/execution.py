@@ -15,7 +15,7 @@ from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.gallery_item import save_realisation
-from simtest.validation.paper.rows import paper_rows
+from simtest.validation.paper.rows import paper_rows, pipeline_with
 from simtest.validation.realisation import Realiser
 from simtest.validation.results_table import ResultRow, Value, completed, table
 
@@ -61,6 +61,7 @@ def forget() -> None:
     """Let this process's rendering session and estimators go."""
     _realiser.cache_clear()
     _estimators.cache_clear()
+    pipeline_with.cache_clear()
 
 
 def parts_of(

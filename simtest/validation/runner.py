@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.estimators.process.naming import absolute_names, close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -38,6 +39,9 @@ RESULTS = "results.parquet"
 MOST_DIGEST_BYTES = 1000
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
+
+Cores = dict[str, dict[str, object]]
+"""What a record says of each core, by the estimator's name."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -87,6 +91,8 @@ class RunRecord:
         How the run was called.
     inputs : dict
         SHA-256 by input file.
+    cores : dict
+        Command, greeting and files of each estimator that is a core of its own process.
     results : str
         SHA-256 of results.parquet.
     """
@@ -100,6 +106,7 @@ class RunRecord:
     duration_s: float
     command: str
     inputs: dict[str, str]
+    cores: Cores
     results: str = ""
 
     def to_json(self) -> Json:
@@ -164,14 +171,17 @@ def run_experiments(
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
     left = [job for job in jobs if job.folder not in finished]
     # Check: everything that may be refused is refused before a folder is touched.
-    _check_estimators(left)
+    cores = _check_estimators(left)
     for job in jobs:
         _check_folder(job.folder)
     # Run what is not finished.
     for job in left:
         _warn_of_another(job)
         _prepare(job.folder, job.digest)
-    resumed = _work(left, variant, engine or make_engine(), progress)
+    try:
+        resumed = _work(left, variant, engine or make_engine(), progress)
+    finally:
+        close_cores()
     # Write results and summaries.
     for job in left:
         record = RunRecord(
@@ -184,6 +194,7 @@ def run_experiments(
             duration_s=round(time.monotonic() - clock, 1),
             command=command,
             inputs=input_hashes(job.cases),
+            cores=cores[job.folder],
         )
         finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
@@ -203,12 +214,16 @@ class _Job:
         return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
 
 
-def _check_estimators(jobs: Sequence[_Job]) -> None:
-    """Raise `InputError` for unknown estimators. The workers load them; a finished run names none that is unknown."""
+def _check_estimators(jobs: Sequence[_Job]) -> dict[Path, Cores]:
+    """Raise `InputError` for unknown estimators; return what the records of the runs, by folder, say of cores.
+
+    The workers load them; a finished run names none that is unknown.
+    """
     if jobs:
         from simtest.estimators.registry import load_estimators
     for job in jobs:
         load_estimators(job.experiment.estimators)
+    return {job.folder: core_records(job.experiment.estimators) for job in jobs}
 
 
 def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
@@ -243,9 +258,12 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     parts: list[tuple[_Job, int, Part]] = []
     for job in jobs:
         in_gallery, swept = _in_gallery(job.cases), swept_example(job.cases)
+        # A worker, on another machine of a cluster for one, may have another current folder.
+        absolute = absolute_names(job.experiment.estimators)
+        experiment = job.experiment.model_copy(update={"estimators": absolute})
         for index in missing[job.folder]:
             item = job.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
-            parts += [(job, index, part) for part in parts_of(job.experiment, job.cases[index], swept, item, variant)]
+            parts += [(job, index, part) for part in parts_of(experiment, job.cases[index], swept, item, variant)]
     case_of = [(job.folder, index) for job, index, _ in parts]
     waiting = Counter(case_of)
     made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {case: {} for case in waiting}
