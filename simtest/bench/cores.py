@@ -12,6 +12,8 @@ from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.process import is_core
+from simtest.estimators.process.naming import core_hashes, core_name, core_records
 from simtest.estimators.protocol import BatchEstimator, Estimator
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.pipeline import reconstruct
@@ -38,37 +40,18 @@ def core_record(text: str) -> JsonObject:
         If it is unknown or cannot be started.
     """
     name, _ = load_core(text)
-    if not _is_command(text):
+    if not is_core(text):
         ((_, package),) = ESTIMATORS.distributions([text]).items()
         return {"name": name, "kind": "installed", "version": package, "sha256": None}
-    from simtest.estimators.process.command import parse_core
-
-    command = parse_core(text)
-    # Names without folders: the same core lies elsewhere on another machine.
-    files = sorted((Path(file).name, digest) for file, digest in command.hashes().items())
+    (record,) = core_records([text]).values()
+    # Files by name, without folders: the same core lies elsewhere on another machine.
+    ((_, hashes),) = core_hashes([text]).items()
+    files = sorted([Path(file).name, digest] for file, digest in hashes.items())
+    version = record.get("version")
     return {
-        "name": name,
-        "kind": "command",
-        "version": _stated_version(text),
-        "sha256": digest_of([list(f) for f in files]),
-    }
-
-
-def _stated_version(text: str) -> str | None:
-    """Return the version that a command's greeting states."""
-    from simtest.estimators.process.core import kept_core
-
-    version = getattr(kept_core(text).start(), "version", None)
-    return None if version is None else str(version)
-
-
-def _is_command(text: str) -> bool:
-    """Return whether a core is a command, or a file that names one, and not an installed estimator."""
-    try:
-        from simtest.estimators.process.command import is_core
-    except ImportError:
-        return False
-    return bool(is_core(text))
+        "name": core_name(text), "kind": "command", "version": None if version is None else str(version),
+        "sha256": digest_of(files),
+    }  # fmt: skip
 
 
 class _Timed:
@@ -126,26 +109,20 @@ def time_core(suite: Suite, part: str, text: str, seeds: Seeds, variant: str | N
     else:
         timed = _TimedBatches(core) if isinstance(core, BatchEstimator) else _TimedPatches(core)
     experiment = experiment_of(suite, part, text, seeds)
-    cases = expand(experiment)[:: max(1, len(expand(experiment)) // TIMED_FRAMES)][:TIMED_FRAMES]
+    every = expand(experiment)
     realiser = Realiser(variant)
-    for count, case in enumerate(cases):
+    for count, case in enumerate(every[:: max(1, len(every) // TIMED_FRAMES)][:TIMED_FRAMES]):
         number = case.numbers()[0]
         view = realiser.make(experiment, case, number, {}).view
         if count == 1:
             timed.taken.clear()
-        reconstruct(
-            view.frame(case.noise_seed(experiment, number)), view.calibration, {name: timed}, isolated=case.isolated
-        )  # type: ignore[dict-item]
-    ms = 1e3 * np.array(timed.taken)
+        frame = view.frame(case.noise_seed(experiment, number))
+        reconstruct(frame, view.calibration, {name: timed}, isolated=case.isolated)
     unit = "highlight" if isinstance(core, Estimator) else "frame"
-    if not len(ms):
+    if not timed.taken:
         return {"unit": unit, "n": 0, "median_ms": None, "max_ms": None}
-    return {
-        "unit": unit,
-        "n": len(ms),
-        "median_ms": round(float(np.median(ms)), 4),
-        "max_ms": round(float(ms.max()), 4),
-    }
+    ms = [round(1e3 * float(figure), 4) for figure in (np.median(timed.taken), max(timed.taken))]
+    return {"unit": unit, "n": len(timed.taken), "median_ms": ms[0], "max_ms": ms[1]}
 
 
 def check_core(text: str) -> None:

@@ -60,9 +60,15 @@ class Board:
         """Return the ranks by core."""
         return {
             "seeds": self.seeds,
-            "overall": {row.certificate.core["name"]: row.rank for row in self.overall},
-            "parts": {part: {row.certificate.core["name"]: row.rank for row in rows} for part, rows in self.parts.items()},
-        }  # fmt: skip
+            "overall": _names(self.overall),
+            "parts": {part: _names(rows) for part, rows in self.parts.items()},
+        }
+
+
+def _names(rows: list[Ranked]) -> JsonObject:
+    """Return the ranks of a table, by core and version, best first."""
+    cores = [(row.certificate.core, row.rank) for row in rows]
+    return {f"{core['name']} {core['version'] or ''}".strip(): rank for core, rank in cores}
 
 
 def read_entries(folder: Path, suite: Suite) -> list[Board]:
@@ -89,7 +95,7 @@ def read_entries(folder: Path, suite: Suite) -> list[Board]:
 
 
 def _is_certificate(file: Path) -> bool:
-    """Return whether a file is meant as a certificate: by its name, in a folder of runs; else by what it begins with."""
+    """Return whether a file is meant as a certificate: by its name, or by what it begins with."""
     if file.name == CERTIFICATE:
         return True
     try:
