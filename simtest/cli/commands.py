@@ -27,6 +27,7 @@ COMMANDS = {
     "realism": "Measure how far generated frames are from real ones.",
     "fit": "Fit the ranges of a dataset recipe to real frames.",
     "validate": "Run an experiment and write its report.",
+    "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "bench": "Run the frozen benchmark, verify its certificates, make a table of them.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",

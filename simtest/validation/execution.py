@@ -46,7 +46,7 @@ class Part:
 
 
 @lru_cache(maxsize=1)
-def _realiser(variant: str | None) -> Realiser:
+def realiser_of(variant: str | None) -> Realiser:
     """Return this process's realiser, which stays from part to part."""
     return Realiser(variant)
 
@@ -59,7 +59,7 @@ def _estimators(names: tuple[str, ...]) -> dict[str, AnyEstimator]:
 
 def forget() -> None:
     """Let this process's rendering session and estimators go."""
-    _realiser.cache_clear()
+    realiser_of.cache_clear()
     _estimators.cache_clear()
     pipeline_with.cache_clear()
 
@@ -88,7 +88,7 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
 
 
 def _rendered(part: Part, tell: OnStep) -> list[ResultRow]:
-    experiment, case, realiser = part.experiment, part.case, _realiser(part.variant)
+    experiment, case, realiser = part.experiment, part.case, realiser_of(part.variant)
     estimators = _estimators(tuple(experiment.estimators))
     rows: list[ResultRow] = []
     for number in part.numbers:
