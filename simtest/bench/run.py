@@ -5,17 +5,21 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from simtest.bench.certificate import FORMAT, KIND, environment, suite_record, write_certificate
 from simtest.bench.cores import check_core, core_record, time_core
 from simtest.bench.draws import Seeds, experiment_of
 from simtest.bench.scores import score_part
-from simtest.bench.suite import Suite
+from simtest.bench.suite import Suite, frames_of
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject, make_folder
 from simtest.runtime.resources import shown
 from simtest.validation.runner import Progress, run_experiments
+
+if TYPE_CHECKING:
+    from simtest.dataset.scoring.dense.conventions import MapOptions
 
 HIGHLIGHTS = "highlights"
 
@@ -45,9 +49,7 @@ def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
         return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
     for name in wanted:
         if suite.part(name).kind != HIGHLIGHTS:
-            raise InputError(
-                f"--part {name}: is scored by maps of normals or depth, which a core of highlights has not"
-            )
+            raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
         if list(wanted).count(name) > 1:
             raise InputError(f"--part {shown(name, 60)}: named twice")
     return [part.name for part in suite.spec.parts if part.name in wanted]
@@ -91,26 +93,56 @@ def run_bench(
     make_folder(folder)
     scores: dict[str, JsonObject] = {}
     durations: dict[str, float] = {}
-    frames = {case.spec.name: case.spec.realisations for case in suite.cases}
     for part in chosen:
         clock = time.monotonic()
         experiment = experiment_of(suite, part, core, seeds)
         # Part by part: the colours that one part needs are not those that another is rendered in.
         (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
         durations[part] = round(time.monotonic() - clock, 1)
-        scores[part] = score_part(run.results, frames).to_json()
+        scores[part] = score_part(run.results, frames_of(suite)).to_json()
+    timing: JsonObject = {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)}
+    return _certified(suite, seeds, folder, told, scores, timing)
+
+
+def run_maps(
+    suite: Suite,
+    maps: str | Path,
+    folder: Path,
+    seeds: Seeds,
+    options: "MapOptions | None" = None,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+) -> BenchRun:
+    """Score a method's maps on the dense part and write its certificate; see `run_bench`.
+
+    `maps` is a folder of maps, each called as its frame (`simtest.bench.maps.export_frames`), or "shading".
+    """
+    from simtest.bench.maps import PART, maps_record, score_dense
+
+    clock = time.monotonic()
+    make_folder(folder)
+    score, figures = score_dense(suite, maps, folder / PART, seeds, options, engine, progress)
+    durations = {PART: round(time.monotonic() - clock, 1)}
+    timing: JsonObject = {"parts_s": durations, "request": {"unit": "frame", "n": 0, "median_ms": None, "max_ms": None}}
+    return _certified(suite, seeds, folder, maps_record(maps, score), {PART: figures}, timing)
+
+
+def _certified(
+    suite: Suite, seeds: Seeds, folder: Path, core: JsonObject, scores: dict[str, JsonObject], timing: JsonObject
+) -> BenchRun:
+    """Write the certificate of a run's figures by part."""
     content: JsonObject = {
         "kind": KIND,
         "format": FORMAT,
         "suite": suite_record(suite),
-        "cases": {name: digest for name, digest in suite.hashes.items() if name.partition("/")[0] in chosen},
+        "cases": {name: digest for name, digest in suite.hashes.items() if name.partition("/")[0] in scores},
         "seeds": _seeds_record(suite, seeds),
-        "core": told,
+        "core": core,
         "environment": environment(),
         "parts": scores,
         "overall": overall_of(suite, scores),
         # Of this machine; nothing that a verification compares.
-        "timing": {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)},
+        "timing": timing,
     }
     return BenchRun(write_certificate(folder, content), content)
 

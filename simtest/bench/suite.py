@@ -207,6 +207,11 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     return suite
 
 
+def frames_of(suite: Suite) -> dict[str, int]:
+    """Return how many frames each case's scenes are taken in, by case."""
+    return {case.spec.name: case.spec.realisations for case in suite.cases}
+
+
 def _read_case(folder: Path, spec: CaseSpec) -> FrozenCase:
     file = folder / spec.part / f"{spec.name}.toml"
     scene = read_toml(file)

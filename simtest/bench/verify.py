@@ -8,9 +8,11 @@ import polars as pl
 
 from simtest.bench.certificate import Certificate, check_suite
 from simtest.bench.draws import Seeds
-from simtest.bench.run import overall_of, run_bench
+from simtest.bench.maps import BASELINE, MAPS, SHADING
+from simtest.bench.run import overall_of, run_bench, run_maps
 from simtest.bench.scores import score_part
-from simtest.bench.suite import Suite
+from simtest.bench.suite import Suite, frames_of
+from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject
@@ -99,11 +101,6 @@ def _against_results(
     return [f"{part}: {key} does not follow from the results" for key in off]
 
 
-def frames_of(suite: Suite) -> dict[str, int]:
-    """Return how many frames each case's scenes are taken in, by case."""
-    return {case.spec.name: case.spec.realisations for case in suite.cases}
-
-
 def _differing(first: JsonObject, second: JsonObject, tolerance: float) -> list[str]:
     """Return the keys whose values differ, numbers by more than a share of themselves."""
     return [key for key, value in first.items() if not _alike(value, second.get(key), tolerance)]
@@ -125,6 +122,7 @@ def verify_run(
     folder: Path,
     seeds: Seeds,
     core: str | None = None,
+    maps: Path | None = None,
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> Verified:
@@ -142,17 +140,23 @@ def verify_run(
         Public, or the opened ones.
     core : str, optional
         How the core is started here; default the certificate's name, where it is an installed estimator.
+    maps : Path, optional
+        Folder of the maps that a certificate of maps is of.
     engine, progress
         See `simtest.validate`.
     """
     check_seeds(certificate, suite, seeds)
     quick = check_quick(certificate, suite)
     told = certificate.core
-    if core is None:
-        if told["kind"] != "installed":
+    if told["kind"] in (MAPS, BASELINE):
+        if maps is None and told["kind"] == MAPS:
+            raise InputError(f"{shown(certificate.path)}: is of maps; --maps must name their folder")
+        options = MapOptions(name=str(told["name"]))
+        run = run_maps(suite, maps or SHADING, folder, seeds, options, engine, progress)
+    else:
+        if core is None and told["kind"] != "installed":
             raise InputError(f"{shown(certificate.path)}: is of a command; --core must say how to start it here")
-        core = str(told["name"])
-    run = run_bench(suite, core, folder, seeds, list(certificate.parts), engine, progress)
+        run = run_bench(suite, core or str(told["name"]), folder, seeds, list(certificate.parts), engine, progress)
     compared = compare(certificate.content, run.content)
     return Verified((*quick.problems, *compared.problems), (*quick.notes, *compared.notes))
 

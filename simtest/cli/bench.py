@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
+from simtest.cli.dense_score import MapDepth, MapEncoding, MapFrame, MapUnit, refuse_dense_options
 from simtest.cli.options import Address, AsJson, EngineName, Out, Workers, named_path
+from simtest.errors import InputError
 
 if TYPE_CHECKING:
     from simtest.bench.draws import Seeds
@@ -15,14 +17,24 @@ bench = App(name="bench", help="Run the frozen benchmark, verify its certificate
 
 SuiteVersion = Annotated[str, Parameter(name="--suite", help="Version of the suite.")]
 Sealed = Annotated[Path | None, Parameter(help="File of sealed seeds; default the public seeds.", converter=named_path)]
-Core = Annotated[str, Parameter(help='Estimator by name, or a command: "command: ./core --flag".')]
+Core = Annotated[str | None, Parameter(help='Estimator by name, or a command: "command: ./core --flag".')]
+Maps = Annotated[
+    Path | None,
+    Parameter(help="Folder of maps for the part dense, in place of a core; or shading.", converter=named_path),
+]
 
 
 @bench.command
 def run(
     *,
-    core: Core,
     out: Out,
+    core: Core = None,
+    maps: Maps = None,
+    name: Annotated[str | None, Parameter(help="Maps: name of the method; default that of the folder.")] = None,
+    encoding: MapEncoding = None,
+    frame: MapFrame = None,
+    depth: MapDepth = None,
+    unit_mm: MapUnit = None,
     parts: Annotated[
         list[str] | None, Parameter(name="--part", negative="", help="Run this part alone; may be repeated.")
     ] = None,
@@ -34,17 +46,27 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a core on the frozen cases; print its table and write certificate.json. A stopped run goes on."""
-    from simtest.bench.run import run_bench
+    from simtest.bench.run import run_bench, run_maps
     from simtest.bench.suite import load_suite
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
+    from simtest.dataset.scoring.dense.conventions import MapOptions
     from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
 
+    if (core is None) == (maps is None):
+        raise InputError("--core and --maps: give one of them; --maps runs the part dense, --core all others")
+    if core is None and parts not in (None, ["dense"]):
+        raise InputError(f"--part {parts[0] if parts else ''}: maps are scored on the part dense alone")
     read = load_suite(suite)
-    seeds = _seeds(read, sealed)
+    seeds, chosen = _seeds(read, sealed), make_engine(engine, workers, address)
     with exclusive_folder(out), progress_bar() as progress:
-        made = run_bench(read, core, out, seeds, parts, make_engine(engine, workers, address), progress)
+        if core is None:
+            options = MapOptions(name, encoding, frame, depth, unit_mm)
+            made = run_maps(read, maps or "", out, seeds, options, chosen, progress)
+        else:
+            refuse_dense_options(name=name, encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
+            made = run_bench(read, core, out, seeds, parts, chosen, progress)
     if as_json:
         print_files([made.certificate], True, **made.content)
         return
@@ -62,6 +84,9 @@ def verify(
     ] = None,
     core: Annotated[
         str | None, Parameter(help="How the core is started here; default the name in the certificate.")
+    ] = None,
+    maps: Annotated[
+        Path | None, Parameter(help="Folder of the maps that the certificate is of.", converter=named_path)
     ] = None,
     sealed: Sealed = None,
     quick: Annotated[bool, Parameter(negative="", help="Check hashes and consistency alone; run nothing.")] = False,
@@ -96,7 +121,8 @@ def verify(
     else:
         seeds = _seeds(suite, sealed)
         with TemporaryDirectory() if out is None else nullcontext(str(out)) as folder, progress_bar() as progress:
-            found = verify_run(told, suite, Path(folder), seeds, core, make_engine(engine, workers, address), progress)
+            chosen = make_engine(engine, workers, address)
+            found = verify_run(told, suite, Path(folder), seeds, core, maps, chosen, progress)
     if as_json:
         print_json(found.to_json())
     else:
@@ -143,6 +169,31 @@ def seal(*, out: Out, suite: SuiteVersion = "v1", as_json: AsJson = False) -> No
     if not as_json:
         print(f"commitment {commitment}")
     print_files([out / SEALED, out / COMMITMENT], as_json, **({"commitment": commitment} if as_json else {}))
+
+
+@bench.command
+def frames(
+    *,
+    out: Out,
+    suite: SuiteVersion = "v1",
+    sealed: Sealed = None,
+    engine: EngineName = "local",
+    workers: Workers = 1,
+    address: Address = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the frames of the part dense without their truth, for methods that give maps."""
+    from simtest.bench.maps import export_frames
+    from simtest.bench.suite import load_suite
+    from simtest.cli.printing import print_files
+    from simtest.cli.progress import progress_bar
+    from simtest.runtime.engines import make_engine
+    from simtest.runtime.locks import exclusive_folder
+
+    read = load_suite(suite)
+    with exclusive_folder(out), progress_bar() as progress:
+        folder = export_frames(read, out, _seeds(read, sealed), make_engine(engine, workers, address), progress)
+    print_files([folder], as_json)
 
 
 @bench.command

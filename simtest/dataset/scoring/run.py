@@ -128,6 +128,7 @@ def score_table(
                 duration_s=round(time.monotonic() - clock, 1),
                 command=command,
                 inputs={**inputs, **input_hashes(list(source.cases))},
+                cores={},
             )
             described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
             write_results(out, made, results, _summary(source, results, described))
