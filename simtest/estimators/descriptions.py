@@ -18,6 +18,11 @@ DESCRIPTIONS: dict[str, str] = {
 """Of this package's estimators, by name: in pages, `simtest list`, completion and the reference."""
 
 
+def is_own(name: str) -> bool:
+    """Whether an estimator of that name, maybe with its package's, is one of this package."""
+    return name.removeprefix(f"{OWN}:") in DESCRIPTIONS
+
+
 def describe_estimators(names: Sequence[str]) -> dict[str, str]:
     """Describe estimators by name: this package's own, and others by the first line of their docstring.
 

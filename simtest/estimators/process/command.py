@@ -104,7 +104,7 @@ def parse_core(text: str) -> CoreCommand:
     """Read a core's name: ``command: PROGRAM ARGUMENT...``, or the path of a TOML file with a table ``core``.
 
     Arguments that name existing files become absolute. Relative ones are looked for in the current folder; those of a
-    TOML file first in that file's folder.
+    TOML file in that file's folder.
 
     Raises
     ------
@@ -112,19 +112,18 @@ def parse_core(text: str) -> CoreCommand:
         If the file or the command is malformed, or the program is missing or cannot be run.
     """
     if text.startswith(PREFIX):
-        arguments, files, name = _resolved(text, text.removeprefix(PREFIX), (Path.cwd(),))
+        arguments, files, name = _resolved(text, text.removeprefix(PREFIX), Path.cwd())
         return CoreCommand(text, name, arguments, files)
     path = Path(text)
     table = validate(CoreFile, read_toml(path), str(path)).core
-    where = (path.absolute().parent, Path.cwd())
-    arguments, files, _ = _resolved(f"{shown(text)}: core.command", table.command, where)
+    arguments, files, _ = _resolved(f"{shown(text)}: core.command", table.command, path.absolute().parent)
     return CoreCommand(
         text, table.name, arguments, (*files, path.absolute()), table.time_limit_s, table.start_limit_s,
         table.environment, table.kind,
     )  # fmt: skip
 
 
-def _resolved(text: str, command: str, folders: tuple[Path, ...]) -> tuple[tuple[str, ...], tuple[Path, ...], str]:
+def _resolved(text: str, command: str, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...], str]:
     """Return a command's absolute arguments, the files among them, and the name that they give it."""
     what = f"estimator {shown(text, 120)!r}"
     try:
@@ -135,11 +134,11 @@ def _resolved(text: str, command: str, folders: tuple[Path, ...]) -> tuple[tuple
         raise InputError(f"{what}: names no program; must be {PREFIX!r}, a program and its arguments")
     if "\0" in command:
         raise InputError(f"{what}: holds a zero byte; must be text")
-    program = _program(what, words[0], folders)
+    program = _program(what, words[0], folder)
     arguments, files = [str(program)], [program]
     for word in words[1:]:
         option, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
-        found = next((folder / value for folder in folders if value and _exists(folder / value)), None)
+        found = folder / value if value and _exists(folder / value) else None
         arguments.append(word if found is None else f"{option}{equals}{os.path.normpath(found)}")
         if found is not None and found.is_file():
             files.append(Path(os.path.normpath(found)))
@@ -156,17 +155,17 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _program(what: str, word: str, folders: tuple[Path, ...]) -> Path:
+def _program(what: str, word: str, folder: Path) -> Path:
     """Return the absolute path of a program; raise `InputError` where it is missing or cannot be run."""
     if "/" not in word:
         found = shutil.which(word)
         # A directory of the name beside the user is no program, but a likely mistake.
         if found is None:
-            near = " (a program in this folder is named ./ and its name)" if _exists(folders[-1] / word) else ""
+            near = " (a program in this folder is named ./ and its name)" if _exists(folder / word) else ""
             raise InputError(f"{what}: no program {shown(word, 80)!r} on PATH{near}")
         return Path(os.path.abspath(found))
-    path = next((folder / word for folder in folders if _exists(folder / word)), None)
-    if path is None:
+    path = folder / word
+    if not _exists(path):
         raise InputError(f"{what}: {shown(word, 200)} does not exist; must be a program")
     if not path.is_file():
         raise InputError(

@@ -2,12 +2,15 @@
 
 import sys
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.estimators.process.command import parse_core
 from simtest.runtime.resources import shown
+
+if TYPE_CHECKING:
+    from simtest.estimators.process.command import CoreCommand
 
 
 def short_names(estimators: Iterable[str]) -> tuple[str, ...]:
@@ -23,7 +26,7 @@ def core_name(name: str) -> str:
     InputError
         If the core's name is malformed, or it is that of an installed estimator, for which it would be taken.
     """
-    short = parse_core(name).name
+    short = _parsed(name).name
     if short in ESTIMATORS.names():
         raise InputError(
             f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise in a "
@@ -34,7 +37,7 @@ def core_name(name: str) -> str:
 
 def absolute_names(estimators: Iterable[str]) -> tuple[str, ...]:
     """Return names that mean the same estimators in a process with another current folder."""
-    return tuple(parse_core(name).absolute if is_core(name) else name for name in estimators)
+    return tuple(_parsed(name).absolute if is_core(name) else name for name in estimators)
 
 
 def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
@@ -46,7 +49,7 @@ def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
 
 def core_hashes(estimators: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return the SHA-256 of the files of the cores among estimators, by name and path."""
-    return {name: parse_core(name).hashes() for name in estimators if is_core(name)}
+    return {name: _parsed(name).hashes() for name in estimators if is_core(name)}
 
 
 def close_cores() -> None:
@@ -54,3 +57,10 @@ def close_cores() -> None:
     # Where no core was named the module is not even loaded.
     if loaded := sys.modules.get("simtest.estimators.process.core"):
         loaded.close_cores()
+
+
+def _parsed(name: str) -> "CoreCommand":
+    """Return the command of a core; what reads it is imported at need, since few runs name one."""
+    from simtest.estimators.process.command import parse_core
+
+    return parse_core(name)
