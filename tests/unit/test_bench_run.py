@@ -6,15 +6,18 @@ import platform
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 
 from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
-from simtest.bench.draws import Seeds, public_seeds
+from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
-from simtest.bench.run import BenchRun, chosen_parts, run_bench
+from simtest.bench.maps import export_frames
+from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
 from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, load_suite, read_suite, resolved_tables
 from simtest.bench.verify import check_quick, check_seeds, compare, verify_run
+from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import write_json
@@ -43,17 +46,24 @@ draws = 3
 realisations = 2
 [cases.draw]
 "surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
+[[cases]]
+part = "dense"
+name = "plane"
+draws = 2
+[cases.draw]
+"surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
 """
 
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     folder = tmp_path_factory.mktemp("suites") / "v1"
-    (folder / "smooth").mkdir(parents=True)
     small = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
     tables = resolved_tables(load_scene("plane", small | {"sensor.noise_sigma": 0.02}))
     tables.pop("name")
-    (folder / "smooth" / "plane.toml").write_text(toml_tables(tables))
+    for part in ("smooth", "dense"):
+        (folder / part).mkdir(parents=True)
+        (folder / part / "plane.toml").write_text(toml_tables(tables))
     (folder / SUITE).write_text(SUITE_TEXT)
     read = read_suite(folder)
     write_json(folder / HASHES, {"suite": read.digest, "cases": read.hashes})
@@ -77,7 +87,7 @@ def _copied(made: BenchRun, folder: Path, change: Any = None) -> Path:
 @pytest.mark.render
 def test_a_certificate_tells_what_was_run(suite: Suite, made: BenchRun) -> None:
     told = read_certificate(made.certificate).content
-    assert told["cases"] == suite.hashes
+    assert told["cases"] == {"smooth/plane": suite.hashes["smooth/plane"]}
     assert told["core"]["name"] == "cone_axis"
     assert told["core"]["version"].startswith("simtest ")
     assert told["seeds"] == {"kind": "public", "seed": 5}
@@ -234,6 +244,32 @@ def test_a_core_without_a_figure_has_no_rank(tmp_path: Path) -> None:
     held = [Certificate(tmp_path / name, {"value": value}) for name, value in (("a", None), ("b", 1.0))]
     rows = ranked(held, lambda certificate: (certificate.content["value"], None))
     assert [(row.certificate.path.name, row.rank) for row in rows] == [("b", "1"), ("a", "–")]
+
+
+@pytest.mark.render
+def test_maps_are_scored_on_the_dense_part(suite: Suite, tmp_path: Path) -> None:
+    """A stranger gets frames without truth, and maps that face the camera err by the tilt."""
+    frames = export_frames(suite, tmp_path / "given", public_seeds(suite))
+    pictures = sorted(file.stem for file in (frames / "frames").iterdir())
+    assert len(set(pictures)) == 2
+    assert not [file for file in frames.rglob("*") if "truth" in file.name]
+    maps = tmp_path / "facing"
+    maps.mkdir()
+    for name in set(pictures):
+        np.save(maps / f"{name}.npy", np.tile([0.0, 0.0, -1.0], (96, 96, 1)))
+    options = MapOptions(encoding="components", frame="opencv")
+    made = run_maps(suite, maps, tmp_path / "run", public_seeds(suite), options)
+    told = read_certificate(made.certificate)
+    tilts = experiment_of(suite, "dense", "x", public_seeds(suite)).groups[0].pool[0]["surface.tilt_deg"]
+    part = told.parts["dense"]
+    assert part["mean_deg"] == pytest.approx(np.mean(tilts), abs=1e-3)
+    assert part["n"] == part["answered"] == part["zones"]["all"]["n"] > 10_000
+    assert told.core["kind"] == "maps"
+    assert not told.content["overall"]["complete"]
+    assert check_quick(told, suite).holds
+    with pytest.raises(InputError, match="--maps must name their folder"):
+        verify_run(told, suite, tmp_path / "again", public_seeds(suite))
+    assert read_entries(tmp_path / "run", suite)[0].parts["dense"][0].rank == "1"
 
 
 def test_parts_that_cannot_be_run_are_told(suite: Suite) -> None:
