@@ -14,11 +14,14 @@ import polars as pl
 from scipy.stats import kendalltau
 
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
+from simtest.bench.phrases import NONE, degrees
 from simtest.bench.scores import score_part
-from simtest.bench.suite import FrozenCase, Suite, load_suite
+from simtest.bench.suite import FrozenCase, Suite, frames_of, load_suite
 from simtest.validation.runner import run_experiments
 
 ESTIMATORS = ("bisector", "cone_axis", "photometric", "curved", "brightest_point", "circle_pose")
+NARROW = 0.8
+"""A core that states this share of its covariance is to be marked."""
 
 
 def thinned(suite: Suite, scenes: int | None) -> Suite:
@@ -30,22 +33,36 @@ def thinned(suite: Suite, scenes: int | None) -> Suite:
     return replace(suite, cases=tuple(map(fewer, suite.cases)))
 
 
+def with_covariance(rows: pl.DataFrame, factor: float) -> pl.DataFrame:
+    """Return rows as if their estimator stated its covariances times a factor."""
+    return rows.with_columns(
+        *(pl.col(name) * factor for name in ("cov_11", "cov_12", "cov_22")), pl.col("mahalanobis2") / factor
+    )
+
+
+def percent(share: float | None) -> str:
+    """Return a share in %."""
+    return NONE if share is None else f"{100 * share:.1f} %"
+
+
 def penalised(suite: Suite, seeds: Seeds, parts: list[str], folder: Path) -> dict[str, list[float]]:
     """Run the estimators on a set of seeds; return the penalised error of each part, deg, by estimator."""
     found: dict[str, list[float]] = {name: [] for name in ESTIMATORS}
-    frames = {case.spec.name: case.spec.realisations for case in suite.cases}
+    frames = frames_of(suite)
     for part in parts:
         experiment = experiment_of(suite, part, ESTIMATORS[0], seeds).model_copy(update={"estimators": ESTIMATORS})
         (run,) = run_experiments([(experiment, folder / part)])
         for name in ESTIMATORS:
-            score = score_part(run.results.filter(pl.col("estimator") == name), frames)
+            rows = run.results.filter(pl.col("estimator") == name)
+            score, narrow = score_part(rows, frames), score_part(with_covariance(rows, NARROW), frames)
             assert score.penalised_deg is not None
             found[name].append(score.penalised_deg)
             stated = score.uncertainty
             print(
                 f"{folder.name:8} {part:10} {name:16} n {score.n:4} penalised {score.penalised_deg:7.3f} "
-                f"median {score.median_deg:.4f} answered {score.answered:4} coverage {stated.coverage} of {stated.n} "
-                f"{stated.verdict} inflation {stated.inflation}", flush=True,
+                f"median {degrees(score.median_deg)} answered {score.answered:4} "
+                f"coverage {percent(stated.coverage)} of {stated.n} {stated.verdict}, "
+                f"with {NARROW:g} of the covariance {narrow.uncertainty.verdict}", flush=True,
             )  # fmt: skip
     return found
 
