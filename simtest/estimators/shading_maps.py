@@ -30,7 +30,7 @@ SIDES_PX = (24, 48, 96)
 STEPS = 12
 """Gauss-Newton steps of a stage, at most."""
 
-CONVERGED = 1e-4
+CONVERGED, HALVINGS = 1e-4, 6
 SMOOTHNESS = 0.3
 """Weight of a second difference of log distance between neighbouring cells against a residual of log intensity."""
 
@@ -154,32 +154,47 @@ def _resized(values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _solve(cells: _Cells, start: Array) -> Array:
-    """Minimise the energy from a start, shape (h, w); return the log distance."""
+    """Minimise the energy from a start, shape (h, w), by Gauss-Newton steps that are halved until it falls."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
 
-    shape = start.shape
-    dx, dy, bends = _differences(shape)
+    dx, dy, bends = _differences(start.shape)
     g11, g12, g22 = (part.ravel() for part in cells.metric)
     area = np.maximum(g11 * g22 - g12**2, 1e-12)
     logs, known = cells.log_intensity.ravel(), cells.weight.ravel()
     smooth = SMOOTHNESS * (bends.T @ bends)
-    v = start.ravel().astype(float)
-    for _ in range(STEPS):
+
+    def judged(v: Array) -> tuple[float, Array, Array, Array, Array]:
+        """Return the energy, the residuals and their weights, and the slope's share along x and y."""
         vx, vy = dx @ v, dy @ v
         along_x, along_y = (g22 * vx - g12 * vy) / area, (g11 * vy - g12 * vx) / area
         slope2 = np.maximum(vx * along_x + vy * along_y, 0.0)
         residual = v + logs / 2 + np.log1p(slope2) / 4
-        weight = known * np.minimum(1.0, ROBUST / np.maximum(np.abs(residual), 1e-12))
+        size = np.abs(residual)
+        # Huber's loss and weights
+        loss = np.where(size < ROBUST, residual**2, 2 * ROBUST * size - ROBUST**2)
+        weight = known * np.minimum(1.0, ROBUST / np.maximum(size, 1e-12))
         share = 0.5 / (1 + slope2)
-        jacobian = sparse.identity(len(v)) + sparse.diags(share * along_x) @ dx + sparse.diags(share * along_y) @ dy
+        return float(known @ loss + v @ (smooth @ v)), residual, weight, share * along_x, share * along_y
+
+    v = start.ravel().astype(float)
+    energy, residual, weight, of_x, of_y = judged(v)
+    for _ in range(STEPS):
+        jacobian = sparse.identity(len(v)) + sparse.diags(of_x) @ dx + sparse.diags(of_y) @ dy
         weighted = sparse.diags(weight) @ jacobian
         system = jacobian.T @ weighted + smooth + 1e-6 * sparse.identity(len(v))
         step = spsolve(system.tocsc(), -(weighted.T @ residual + smooth @ v))
-        v = v + step
+        for _ in range(HALVINGS):
+            tried = judged(v + step)
+            if tried[0] < energy:
+                break
+            step = step / 2
+        else:
+            break
+        v, (energy, residual, weight, of_x, of_y) = v + step, tried
         if np.abs(step).max() < CONVERGED:
             break
-    return np.asarray(v.reshape(shape))
+    return np.asarray(v.reshape(start.shape))
 
 
 def _differences(shape: tuple[int, ...]) -> tuple[Any, Any, Any]:

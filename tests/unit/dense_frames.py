@@ -18,8 +18,8 @@ LENSES = {
 def sphere_truth(name="a", camera=LENSES["pinhole"], centre=(3.0, -2.0, 30.0), radius=14.0, eps=2.0, image=None):
     """Return the truth of a sphere seen from outside; the far wall of a sphere around the camera fills the rest."""
     rays = camera.unproject(camera.pixel_centres())
-    distance, normal, curvature = _hit(rays, np.array(centre), radius)
-    wall, wall_normal, wall_curvature = _hit(rays, np.array([1.0, 2.0, 5.0]), -60.0)
+    distance, normal, curvature = hit(rays, np.array(centre), radius)
+    wall, wall_normal, wall_curvature = hit(rays, np.array([1.0, 2.0, 5.0]), -60.0)
     inside = np.isfinite(distance)
     distance = np.where(inside, distance, wall)
     normal = np.where(inside[..., None], normal, wall_normal)
@@ -35,7 +35,7 @@ def sphere_truth(name="a", camera=LENSES["pinhole"], centre=(3.0, -2.0, 30.0), r
     )  # fmt: skip
 
 
-def _hit(rays, centre, radius):
+def hit(rays, centre, radius):
     """Return distance, normal and curvature of a sphere, of its far side where the radius is negative."""
     along = rays @ centre
     root = along**2 - centre @ centre + radius**2

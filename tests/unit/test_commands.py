@@ -212,10 +212,11 @@ def test_json_holds_neither_nan_nor_paths_that_break_it(capsys):
 
 def test_reports_are_json_on_request():
     """Each command that reports takes --json: whoever adds one is reminded."""
-    reports = {"doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
+    reports = {"core check", "score",
+               "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
                "mesh check", "mesh colon", "mesh liver", "bench run", "bench verify", "bench table", "bench seal",
-               "bench cases"}  # fmt: skip
+               "bench cases", "bench frames"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]

@@ -18,15 +18,31 @@ seed = 4242
 estimators = ["brightest_point"]
 
 [[groups]]
-scene = "tissue_liver"
+scene = "saddle"
 label = "tissue"
-set = { "camera.width" = 128, "camera.height" = 96, "camera.fx" = 90.0, "camera.fy" = 90.0, "camera.view_mask.radius" = 55.0, "camera.distortion.type" = "brown_conrady", "camera.distortion.k1" = -0.1, "render.samples_per_pixel" = 1 }
-pool = [{ "surface.viewpoint" = [21, 22] }]
+pool = [{ "surface.distance_mm" = [14.0, 18.0] }]
+[groups.set]
+"surface.relief" = { bands = [{ slope_deg = 4.0, wavelength_mm = 2.0 }] }
+reflectance = { type = "tissue", albedo = { preset = "liver_capsule" }, film = { index = 1.35, alpha = 0.05 } }
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 90.0
+"camera.fy" = 90.0
+"camera.view_mask.radius" = 55.0
+"camera.distortion.type" = "brown_conrady"
+"camera.distortion.k1" = -0.1
+"render.samples_per_pixel" = 1
 
 [[groups]]
 scene = "cylinder"
 label = "fisheye"
-set = { "camera.width" = 128, "camera.height" = 96, "camera.fx" = 60.0, "camera.fy" = 60.0, "camera.distortion.type" = "kannala_brandt", "surface.tilt_deg" = 20.0 }
+[groups.set]
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 60.0
+"camera.fy" = 60.0
+"camera.distortion.type" = "kannala_brandt"
+"surface.tilt_deg" = 20.0
 """
 
 
@@ -62,6 +78,7 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
     assert "wall" not in json.dumps(record["counts"])
 
 
+@pytest.mark.slow
 def test_maps_in_npy_are_exact(run, here, tmp_path):
     on, truths = run
     (tmp_path / "maps").mkdir()
@@ -74,6 +91,7 @@ def test_maps_in_npy_are_exact(run, here, tmp_path):
     np.testing.assert_allclose(means, 1.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_maps_in_exr_are_read(run, here, tmp_path):
     from simtest.rendering.bitmap import write_exr
 
@@ -88,6 +106,7 @@ def test_maps_in_exr_are_read(run, here, tmp_path):
     assert record["sources"]["depth_none"]["depth_percent"]["fine"][0]["p95"] < 1e-4
 
 
+@pytest.mark.slow
 def test_the_baseline_is_scored_by_its_name(run, here, tmp_path):
     code, output, _ = here("score", "shading", "--on", run[0], "--out", tmp_path / "scored")
     assert code == 0
@@ -126,3 +145,10 @@ def test_a_run_is_not_written_over(run, here, tmp_path):
     code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", run[0])
     assert code != 0
     assert "holds another page" in errors[-1]
+
+
+def test_the_command_knows_the_methods():
+    from simtest.cli.dense_score import WORDS
+    from simtest.dataset.scoring.dense import METHODS
+
+    assert set(WORDS) == set(METHODS)

@@ -27,6 +27,9 @@ TUNING = 4.685
 TRIALS, JUDGED = 100, 2000
 """Pairs of pixels that the affine start tries, and pixels that judge each, at least."""
 
+MOST_PIXELS = 20_000
+"""Pixels of a frame that fit its alignment, evenly spread."""
+
 MAD_TO_SIGMA = 1.4826
 LEAST_PIXELS = 3
 
@@ -65,6 +68,8 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
         return 1.0, 0.0
     if len(depth) < LEAST_PIXELS:
         return float("nan"), float("nan")
+    every = max(1, len(depth) // MOST_PIXELS)
+    depth, truth = depth[::every], truth[::every]
     columns = [depth / truth] if how == "scale" else [depth / truth, 1 / truth]
     design = np.stack(columns, axis=1)
     fitted = _start(design)

@@ -94,7 +94,9 @@ class Scorer:
                 aligned = (a * depth + b) / factor
                 aligned[~(aligned > 0)] = np.nan
                 distances[depth_source(how)] = aligned
-                normals[depth_source(how)] = normals_of_distance(aligned, rays)
+                # A factor turns no normal.
+                as_stated = normals.get(depth_source("none")) if b == 0 and a > 0 else None
+                normals[depth_source(how)] = normals_of_distance(aligned, rays) if as_stated is None else as_stated
         return normals, distances
 
     def _count(self, key: Key, truth: FrameTruth, values: Array, sorted_in: list[IntArray]) -> None:
