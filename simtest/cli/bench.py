@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 bench = App(name="bench", help="Run the frozen benchmark, verify its certificates, make a table of them.")
 
+WIDTH = 170
+"""Columns of the table of parts; in fewer its words would be cut."""
+
 SuiteVersion = Annotated[str, Parameter(name="--suite", help="Version of the suite.")]
 Sealed = Annotated[Path | None, Parameter(help="File of sealed seeds; default the public seeds.", converter=named_path)]
 Core = Annotated[str | None, Parameter(help='Estimator by name, or a command: "command: ./core --flag".')]
@@ -226,7 +229,9 @@ def _print_parts(content: dict[str, Any]) -> None:
     from simtest.cli.printing import print_table
 
     rows = [(part, *part_cells(told)) for part, told in content["parts"].items()]
-    print_table(("part", *COLUMNS), rows, title=f"{content['core']['name']} on {content['suite']['version']}")
+    print_table(
+        ("part", *COLUMNS), rows, title=f"{content['core']['name']} on {content['suite']['version']}", width=WIDTH
+    )
     print(*refusals(content["parts"]), sep="\n", end="\n" * bool(refusals(content["parts"])))
     request = content["timing"]["request"]
     if request["median_ms"] is not None:
