@@ -71,6 +71,7 @@ class Reason(StrEnum):
     UNRESOLVED = "unresolved"
     NOT_KNOWN = "not_known"
     NO_ESTIMATE = "no_estimate"
+    UNDECIDED = "undecided"
     ESTIMATOR_ERROR = "estimator_error"
 
     @property
@@ -92,6 +93,7 @@ _MEANINGS = {
     Reason.STREAK: "the spot is so long that its centre along it is not determined",
     Reason.UNRESOLVED: "the spot is too small to have a shape",
     Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
+    Reason.UNDECIDED: "the pictures do not tell the signs of the curvatures apart",
     Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
     Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
 }
