@@ -131,6 +131,20 @@ class RankedHypotheses:
         other = np.sign(self.hypotheses) != np.sign(self.hypotheses[0])
         return np.array([self._preferred[of].min(initial=np.inf) for of in other.T])
 
+    def told_bends(self, gain_sd: float = GAIN_SD) -> tuple[int, int]:
+        """Sign of the curvature k along each direction, 0 where it is not told.
+
+        An abs(1 + d k) below 1 is that of a concave surface, whatever its sign; where it is 1 within the noise, the
+        surface may be flat.
+        """
+        told = []
+        for i, sign in enumerate(self.told_signs):
+            gains = self.hypotheses[:, i]
+            gains = gains[np.sign(gains) == sign] if sign else gains
+            bends = np.sign(gains - 1) * (np.abs(gains - 1) > 2 * gain_sd * np.abs(gains))
+            told.append(int(bends[0]) if (bends == bends[0]).all() else 0)
+        return told[0], told[1]
+
     @cached_property
     def _preferred(self) -> Array:
         """By how much the best one is preferred to each, shape (H,)."""

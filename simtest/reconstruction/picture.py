@@ -47,6 +47,8 @@ class Options:
     target : {"fine", "base"}
         Which surface's normals are stated: those of the fine one, or of the base without its relief, whose slope is
         then in the uncertainty.
+    poses : Path, optional
+        Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
 
     Raises
     ------
@@ -64,6 +66,7 @@ class Options:
     detector: str = AUTO
     smoothing_px: float | None = None
     target: Target = "fine"
+    poses: Path | None = None
 
     def __post_init__(self) -> None:
         if self.detector != AUTO:
