@@ -71,6 +71,6 @@ ON_INSTRUMENT = "on_instrument"
 
 MOTION_COLUMNS = (
     "motion_over_d", "motion_sign_1", "motion_sign_2", "motion_gain_1", "motion_gain_2", "motion_margin_1",
-    "motion_margin_2", "motion_distance2",
+    "motion_margin_2", "motion_distance2", "motion_fits",
 )  # fmt: skip
 """Columns of results of scenes with further views, all numbers (docs/howto/motion.md)."""

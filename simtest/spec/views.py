@@ -57,10 +57,3 @@ class Views(Spec):
             Moved(translation_mm=(float(self.length_mm * np.cos(a)), float(self.length_mm * np.sin(a)), 0.0))
             for a in angles
         ]
-
-    def told_pose(self, true: Moved, rng: np.random.Generator) -> Array:
-        """Return view_from_first, shape (4, 4), as it is told: the true one with an error drawn."""
-        pose = true.pose()
-        pose[:3, 3] += self.translation_error * self.length_mm * rng.standard_normal(3)
-        pose[:3, :3] = pose[:3, :3] @ rotation(np.radians(self.rotation_error_deg) * rng.standard_normal(3))
-        return np.asarray(np.linalg.inv(pose))

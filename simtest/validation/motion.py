@@ -12,6 +12,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.two_views import EXACT, MovedView, PoseError, RankedHypotheses, rank_by_motions
+from simtest.geometry.vectors import rotation
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
@@ -73,7 +74,7 @@ class MotionResult:
         if ranked is not None and row.specularity is not None:
             for i, (sign, margin) in enumerate(zip(ranked.told_signs, ranked.sign_margins.tolist(), strict=True), 1):
                 values |= {f"motion_sign_{i}": float(sign), f"motion_margin_{i}": margin}
-            values["motion_distance2"] = float(ranked.distance2[0])
+            values |= {"motion_distance2": float(ranked.distance2[0]), "motion_fits": float(ranked.fits)}
             first = first_estimate(self.specularities[row.specularity].estimates)
             if truth is not None and isinstance(first, Estimate) and first.curvature is not None:
                 gains = true_gains(first.curvature.directions, truth).tolist()
@@ -135,9 +136,17 @@ def true_gains(directions: Array, truth: HighlightPoint) -> Array:
     return np.asarray(1 + (truth.kd_min * first**2 + truth.kd_max * other**2) / (first**2 + other**2))
 
 
+def told_pose(views: Views, true: Moved, rng: np.random.Generator) -> Array:
+    """Return view_from_first, shape (4, 4), as it is told: the true motion with an error drawn."""
+    pose = true.pose()
+    pose[:3, 3] += views.translation_error * views.length_mm * rng.standard_normal(3)
+    pose[:3, :3] = pose[:3, :3] @ rotation(np.radians(views.rotation_error_deg) * rng.standard_normal(3))
+    return np.asarray(np.linalg.inv(pose))
+
+
 def _seen(further: FurtherView, told: Views, case: Case, rng: np.random.Generator) -> MovedView:
     """Expose and reconstruct a further view; its pose is told with an error."""
-    pose = told.told_pose(further.moved, rng)
+    pose = told_pose(told, further.moved, rng)
     frame = further.view.frame(int(rng.integers(2**62)))
     error = EXACT
     if told.errors_told:

@@ -10,7 +10,7 @@ from simtest.calibration import Normal, Priors
 from simtest.errors import Failure, Reason
 from simtest.estimators.moved_patch import FirstPicture
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.estimators.two_views import WRONG_SHARE, MovedView, PoseError, rank_by_motions
+from simtest.estimators.two_views import EXACT, WRONG_SHARE, MovedView, PoseError, rank_by_motions
 from simtest.geometry.vectors import basis_across, rotation
 
 D, GAIN_SD, DISTANCE_SD, NORMAL_SD = 10.0, 0.03, 0.05, 1e-3
@@ -27,7 +27,7 @@ def pushed(normal, rng):
     return made / np.linalg.norm(made)
 
 
-def draw(rng, motions, pose=PoseError(), backwards=False):
+def draw(rng, motions, pose=EXACT, backwards=False):
     """Draw a patch, its estimate, and the views of it after some motions, mm; all as the method supposes."""
     gains = rng.choice([-1, 1], 2) * np.sort(rng.uniform([0.4, 1.2], [1.0, 2.5]))
     distance = D * (1 + DISTANCE_SD * rng.standard_normal())
@@ -58,7 +58,7 @@ def count(trials, seed, motions, blind=False, **options):
         if made is None:
             continue
         gains, first, views = made
-        views = [replace(view, error=PoseError()) for view in views] if blind else views
+        views = [replace(view, error=EXACT) for view in views] if blind else views
         ranked = rank_by_motions(first, views, PRIORS)
         if isinstance(ranked, Failure):
             continue
@@ -74,7 +74,7 @@ def beyond(wrong, trials, share=WRONG_SHARE):
 
 
 CASES = {
-    "short": ([0.05], PoseError()),
+    "short": ([0.05], EXACT),
     "one": ([0.3], PoseError(0.01, 0.0035)),
     "three": ([0.1, 0.2, 0.2], PoseError(0.01, 0.0035)),
 }
