@@ -5,7 +5,7 @@ import sys
 
 from benchmarks.measuring import Figure, print_figures
 
-NAMES = ("estimators", "published", "rendering", "colour", "camera_chain", "dataset")
+NAMES = ("estimators", "published", "rendering", "colour", "camera_chain", "dataset", "core_protocol")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (

@@ -33,7 +33,7 @@ for ratio in ratios:
 
 figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
 smooth = np.geomspace(min(ratios), max(ratios), 200)
-axis.plot(smooth, np.degrees(np.arccos(smooth / (smooth + 1))), "--", color="#7D828A", label="law: acos(R / (R + d))")
+axis.plot(smooth, np.degrees(np.arccos(smooth / (smooth + 1))), "--", color="#747981", label="law: acos(R / (R + d))")
 for (name, values), marker in zip(errors.items(), "so", strict=True):
     axis.plot(ratios, values, marker, color=COLOURS[name], label=name, markersize=7)
 axis.set(xscale="log", yscale="log", xlabel="R/d: radius of the cylinder over its distance")

@@ -38,7 +38,7 @@ for offset in offsets_mm:
 figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
 smooth = np.linspace(min(offsets_mm), max(offsets_mm), 200)
 law = np.degrees(np.arctan(smooth / DISTANCE_MM)) / 2
-axis.plot(smooth, law, "--", color="#7D828A", label="law: half the angle between light and camera")
+axis.plot(smooth, law, "--", color="#747981", label="law: half the angle between light and camera")
 for name, marker in zip(names, "^os", strict=True):
     axis.plot(offsets_mm, errors[name], marker, color=COLOURS[name], label=name, markersize=7)
 axis.set(yscale="log", xlabel=f"light beside the camera, mm, at {DISTANCE_MM:g} mm from the surface")

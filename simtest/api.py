@@ -204,6 +204,7 @@ def validate(
     progress: "Progress | None" = None,
     workers: int = 1,
     engine: "Engine | None" = None,
+    export: str | Path | None = None,
     **overrides: Any,
 ) -> "RunResults":
     """Run an experiment and write its report.
@@ -226,6 +227,8 @@ def validate(
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
         What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+    export : str or Path, optional
+        Folder for the frames without their truth, for methods that run elsewhere (docs/howto/score.md).
     **overrides
         Values by the last name of a key of the experiment, such as ``realisations=5``, or of its scenes.
 
@@ -256,12 +259,20 @@ def validate(
     from simtest.runtime.machine_errors import disk_problem, write_error
     from simtest.validation.runner import run_experiment
 
+    if export is not None:
+        from simtest.dataset.export import check_exportable, export_run
+
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
     with exclusive_folder(Path(out)):
         try:
+            if export is not None:
+                check_exportable(described)
             run = run_experiment(described, Path(out), command, variant, progress, chosen)
-            return RunResults(write_report(run.folder, progress))
+            page = write_report(run.folder, progress)
+            if export is not None:
+                export_run(run.folder, described, Path(export), chosen, progress)
+            return RunResults(page)
         except OSError as error:
             if disk_problem(error) is None:
                 raise

@@ -73,6 +73,9 @@ class Reason(StrEnum):
     NO_ESTIMATE = "no_estimate"
     UNDECIDED = "undecided"
     ESTIMATOR_ERROR = "estimator_error"
+    CORE_DIED = "core_died"
+    CORE_TIMEOUT = "core_timeout"
+    CORE_PROTOCOL = "core_protocol"
 
     @property
     def meaning(self) -> str:
@@ -96,6 +99,9 @@ _MEANINGS = {
     Reason.UNDECIDED: "the pictures do not tell the signs of the curvatures apart",
     Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
     Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
+    Reason.CORE_DIED: "the core's process ended before it answered",
+    Reason.CORE_TIMEOUT: "the core gave no answer within its time limit",
+    Reason.CORE_PROTOCOL: "the core wrote what the process protocol does not allow",
 }
 
 

@@ -27,6 +27,7 @@ COMMANDS = {
     "realism": "Measure how far generated frames are from real ones.",
     "fit": "Fit the ranges of a dataset recipe to real frames.",
     "validate": "Run an experiment and write its report.",
+    "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",

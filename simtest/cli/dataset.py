@@ -147,3 +147,27 @@ def preview(
     page = out or Path("preview.html")
     with exclusive_file(page):
         print_files([write_preview(folder, page, samples)], as_json)
+
+
+@dataset.command
+def export(
+    folder: Folder,
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="Folder for the frames; made if need be.", converter=named_path)],
+    engine: EngineName = "local",
+    workers: Workers = 1,
+    address: Address = None,
+    as_json: AsJson = False,
+) -> None:
+    """Export a dataset's frames without their truth, for methods that run elsewhere; `simtest score` takes answers."""
+    from simtest.cli.printing import print_files
+    from simtest.cli.progress import progress_bar
+    from simtest.dataset.export import export_dataset
+    from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
+    from simtest.runtime.engines import make_engine
+
+    with progress_bar("writing the tables") as progress:
+        chosen = make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS)
+        readme = export_dataset(folder, out, chosen, progress)
+    print_files([readme], as_json)

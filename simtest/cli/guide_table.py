@@ -2,7 +2,7 @@
 
 import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from simtest.cli.manners import MANNERS
 from simtest.cli.printing import MOST_ROWS, print_rest, read_guide
@@ -60,10 +60,17 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
         for row in group:
             tied = f"tied: {', '.join(row['ties'])}" if row["ties"] else ""
             best = "\n".join(text for text in (row["best"] or "none", tied) if text)
-            error = row["error"].replace(" (", "\n(")
-            answered = "\n".join((row["answered"], *filter(None, row["unanswered"].split(", "))))
-            part.add_row(*map(escape, (row["surface"], best, error, answered, row["breaks"])))
+            part.add_row(*map(escape, (row["surface"], best, *_figures(row))))
+            for guest in row.get("guests", ()):
+                own = f"{guest['estimator']}\n({guest['standing']})"
+                part.add_row(*map(escape, ("", own, *_figures(guest))))
         console.print(part)
     print_rest(len(rows) - len(kept), "as the page shows them", console.print)
     if guide["shared"]:
         console.print(escape(guide["shared"]))
+
+
+def _figures(row: "dict[str, Any]") -> tuple[str, str, str]:
+    """Return the cells on error, answers and breaks of a row, each part on a line of its own."""
+    answered = "\n".join((row["answered"], *filter(None, row["unanswered"].split(", "))))
+    return row["error"].replace(" (", "\n("), answered, row["breaks"]

@@ -90,7 +90,12 @@ Variant = Annotated[
 ]
 Estimators = Annotated[
     list[str] | None,
-    named("estimators", name="--estimator", negative="", help="Estimator by name; may be repeated."),
+    named(
+        "estimators",
+        name="--estimator",
+        negative="",
+        help="Estimator by name, or a core of your own: 'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
+    ),
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]

@@ -5,9 +5,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Protocol
 
 from simtest.cli.manners import MANNERS
+from simtest.cli.remaining import Remaining
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -103,15 +105,17 @@ class _Lines:
 
     def __init__(self) -> None:
         self.began = self.told = time.monotonic()
+        self.remaining = Remaining()
 
     def show(self, done: int, total: int, what: str) -> None:
         """Print a line where the last one is old enough."""
         now = time.monotonic()
+        left = self.remaining.seconds(done, total, now)
         if not MANNERS.verbose and now - self.told < LINE_EVERY_S:
             return
         self.told, passed = now, now - self.began
-        left = f", about {passed * (total - done) / done:.0f} s left" if 0 < done < total and passed >= 1 else ""
-        print(f"simtest: {done}/{total} {what} ({passed:.0f} s{left})", file=sys.stderr, flush=True)
+        about = f", about {left:.0f} s left" if left and done < total else ""
+        print(f"simtest: {done}/{total} {what} ({passed:.0f} s{about})", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Do nothing: the command says what came of it."""
@@ -122,15 +126,18 @@ class _Bar:
 
     def __init__(self) -> None:
         self.bar = _rich_bar()
-        self.task: TaskID = self.bar.add_task("starting", total=None)
+        self.remaining = Remaining()
+        self.task: TaskID = self.bar.add_task("starting", total=None, left="")
         self.bar.start()
 
     def show(self, done: int, total: int, what: str) -> None:
         """Move the bar, or begin the next."""
         if done < total and self.bar.tasks[-1].finished:
             self.bar.update(self.task, description="done")
-            self.task = self.bar.add_task(what, total=total)
-        self.bar.update(self.task, completed=done, total=total, description=what)
+            self.task = self.bar.add_task(what, total=total, left="")
+        seconds = self.remaining.seconds(done, total, time.monotonic())
+        left = f"about {timedelta(seconds=round(seconds))} left" if seconds and done < total else ""
+        self.bar.update(self.task, completed=done, total=total, description=what, left=left)
 
     def close(self) -> None:
         """Leave the bar as it stands."""
@@ -144,6 +151,6 @@ def _rich_bar() -> "Progress":
 
     columns = (
         rich.SpinnerColumn(finished_text=" "), rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(),
-        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+        rich.TextColumn("{task.fields[left]}"), rich.TextColumn("{task.description}"),
     )  # fmt: skip
     return rich.Progress(*columns, console=Console(stderr=True))

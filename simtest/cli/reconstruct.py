@@ -29,7 +29,16 @@ Calibrated = Annotated[
     Path | None,
     Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
 ]
-FieldOfView = Annotated[float | None, Parameter(help="Horizontal field of view in deg, where there is no calibration.")]
+FieldOfView = Annotated[
+    float | None,
+    Parameter(
+        help="Field of view in deg across the whole picture, where there is no calibration; crop black borders first."
+    ),
+]
+FieldOfViewOf = Annotated[
+    Literal["width", "height", "diagonal"],
+    Parameter(help="What --fov spans. Makers of endoscopes mostly state the diagonal."),
+]
 Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
 Encoding = Annotated[
     Literal["srgb", "linear"] | None,
@@ -79,6 +88,7 @@ def reconstruct(
     out: Out,
     camera: Calibrated = None,
     fov: FieldOfView = None,
+    fov_of: FieldOfViewOf = "width",
     estimators: Estimators = None,
     roi: Roi = None,
     encoding: Encoding = None,
@@ -111,7 +121,7 @@ def reconstruct(
         raise InputError(f"{image}: --poses is for a folder or a film")
     box = None if roi is None else parse_roi(roi)
     names = None if estimators is None else tuple(estimators)
-    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target, poses)
+    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target, fov_of, poses)
     if sequence:
         _sequence(image, out, options, as_json)
         return
@@ -126,7 +136,7 @@ def reconstruct(
         print(f"stated: {record.stated}")
         print(MEANING)
     _print_assumed(record.assumed)
-    print(f"{counted(len(record.specularities), 'specularity', 'specularities')} found in {image}")
+    _print_counts(record, image)
     print_files(files, as_json)
 
 
@@ -176,11 +186,12 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     from collections import Counter
     from statistics import median
 
+    from simtest.reconstruction.explanations import kind_name
     from simtest.reconstruction.ranking import deviation_deg
 
     groups: dict[tuple[str, str], list[SpecularityRecord]] = {}
     for spot in spots:
-        groups.setdefault((spot.kind or "", spot.best or "none"), []).append(spot)
+        groups.setdefault((kind_name(spot.kind), spot.best or "none"), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
         stated = [d for s in held if s.best_estimate and (d := deviation_deg(s.best_estimate)) is not None]
@@ -192,9 +203,31 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
 
 
 def _print_assumed(assumed: "Sequence[Assumption]") -> None:
-    """Print what nobody told, how it is taken, and how to narrow it."""
+    """Print what the normals are without the light's position; what nobody told, how it is taken, how to narrow it."""
+    from simtest.reconstruction.assumptions import light_note
+
+    if note := light_note(assumed):
+        print(f"note: {note}")
     for each in assumed:
         print(f"assumed: {each}")
+
+
+def _print_counts(record: "PictureRecord", image: Path) -> None:
+    """Print how many highlights were found, how many have a normal, and what the others are."""
+    from simtest.reconstruction.explanations import kinds_counted
+    from simtest.reconstruction.picture import BORDERED
+
+    if BORDERED in record.warnings:
+        print(f"note: {BORDERED}")
+
+    spots, others = record.specularities, record.other_highlights
+    answered = sum(spot.best is not None for spot in spots)
+    found = f"{counted(len(spots), 'specularity', 'specularities')} found in {image}"
+    print(found + (f", {answered} with a normal" if answered < len(spots) else ""))
+    if others:
+        kinds = kinds_counted(each.kind for each in others)
+        left = f"{counted(len(others), 'more highlight')} found and left out"
+        print(f"{left}, because no single normal can be read from them: {kinds} (index.html shows them)")
 
 
 def _pair(mean: float, spread: float | None) -> str:
@@ -202,6 +235,7 @@ def _pair(mean: float, spread: float | None) -> str:
 
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
+    from simtest.reconstruction.explanations import kind_name
     from simtest.reconstruction.ranking import deviation_deg
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
@@ -209,7 +243,7 @@ def _cells(spot: "SpecularityRecord") -> list[str]:
     deviation = None if best is None else deviation_deg(best)
     margin = None if published is None else published.choice_margin
     return [
-        str(spot.id), f"{x:.1f}", f"{y:.1f}", spot.kind or "", "" if spot.score is None else f"{spot.score:.2f}",
+        str(spot.id), f"{x:.1f}", f"{y:.1f}", kind_name(spot.kind), "" if spot.score is None else f"{spot.score:.2f}",
         spot.best or "none",
         " ".join(f"{v:+.3f}" for v in best.normal) if best else "", "" if deviation is None else f"{deviation:.2f}",
         "" if margin is None else f"{margin:.1f}", ", ".join(best.flags) if best else "",

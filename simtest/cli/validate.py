@@ -40,6 +40,10 @@ def validate(
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
+    export: Annotated[
+        Path | None,
+        Parameter(help="Folder for the frames without their truth, for methods elsewhere.", converter=named_path),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
@@ -73,10 +77,12 @@ def validate(
     with progress_bar() as progress:
         folder = out or DEFAULT_OUT / described.name
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
-        run(described, folder, command=command, variant=variant, progress=progress, engine=chosen)
+        run(described, folder, None, command, variant, progress, engine=chosen, export=export)
     if as_json:
         print_run(folder, meshes=meshes)
         return
     print(*meshes, sep="\n", end="\n" * bool(meshes))
     print_guide(folder)
     print(folder / "index.html")
+    if export is not None:
+        print(export / "README.md")

@@ -1,6 +1,7 @@
 """Makes samples: a scene is drawn and rendered, seen by the sensor, and estimated on."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -94,6 +95,11 @@ class Maker:
             meta["visible_highlights"] = cast("list[dict[str, JsonValue]]", spots)
         return Sample(meta, images)
 
+    def view(self, index: int) -> tuple[Drawn, RenderedView, Session]:
+        """Render a sample's scene as `make` does; return it with its view, and the session at it."""
+        drawn, _, seen, _ = self._choose(index)
+        return drawn, seen, self._at(drawn)
+
     def _choose(self, index: int) -> tuple[Drawn, int, RenderedView, Frame]:
         """Draw until the frame shows enough isolated highlights; the last draw is taken as it is.
 
@@ -152,6 +158,20 @@ class Maker:
         self, index: int, session: Session, seen: RenderedView, specularities: list[Specularity]
     ) -> list[EstimateMeta]:
         """Return the rows of results.parquet; true_id is the highlight's index in the list of all."""
+        estimates = []
+        for row in self.rows(index, session, seen, specularities, list(self._estimators)):
+            columns = row.to_row()
+            if row.status == MISSED:
+                # Shards list a missed highlight's status before its estimator.
+                columns["estimator"] = columns.pop("estimator")
+            estimates.append({key: _plain(value) for key, value in columns.items() if _plain(value) is not None})
+        return estimates
+
+    def rows(
+        self, index: int, session: Session, seen: RenderedView, specularities: Sequence[Specularity],
+        estimators: Sequence[str],
+    ) -> list[ResultRow]:  # fmt: skip
+        """Measure the estimates of a sample, at whose scene the session is; true_id is the index in the list of all."""
         scene = session.scene
         # Only isolated highlights count as truth, so the rows number these alone.
         counted = [i for i, truth in enumerate(seen.highlights) if truth.isolated]
@@ -163,24 +183,9 @@ class Maker:
             found = match(specularities, [spot.peak_px for spot in seen.visible_highlights])
             rough = rough_truth(session, seen, counted, found)
         matched = match(specularities, [truth.bp_px for truth in truths])
-        made = rows(
-            session,
-            common,
-            specularities,
-            truths,
-            matched,
-            list(self._estimators),
-            rough=rough,
-            on_instrument=on_instruments(specularities, matched, seen),
-        )
-        estimates = []
-        for row in made:
-            columns = row.to_row() | {"true_id": None if row.true_id is None else counted[row.true_id]}
-            if row.status == MISSED:
-                # Shards list a missed highlight's status before its estimator.
-                columns["estimator"] = columns.pop("estimator")
-            estimates.append({key: _plain(value) for key, value in columns.items() if _plain(value) is not None})
-        return estimates
+        metal = on_instruments(specularities, matched, seen)
+        made = rows(session, common, specularities, truths, matched, estimators, rough=rough, on_instrument=metal)
+        return [replace(row, true_id=None if row.true_id is None else counted[row.true_id]) for row in made]
 
     def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame, picture: AnyArray) -> dict[str, AnyArray]:
         radiance, scale = seen.radiance, seen.full_scale or 1.0

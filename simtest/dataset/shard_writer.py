@@ -185,14 +185,14 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
 
 
 @lru_cache(maxsize=1)
-def _maker(dataset: str, variant: str) -> Maker:
-    # A process that writes several shards keeps its rendering session.
+def maker_of(dataset: str, variant: str) -> Maker:
+    """Return this process's maker of a dataset, given as JSON: it keeps its rendering session from shard to shard."""
     return Maker(Plan(Dataset.model_validate_json(dataset)), variant)
 
 
 def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
     """Write a shard, or finish one that was begun; call `on_step` after each sample."""
-    folder, maker = Path(task.folder), _maker(task.dataset, task.variant)
+    folder, maker = Path(task.folder), maker_of(task.dataset, task.variant)
     shard = maker.plan.shards[task.number]
     with _one_line_errors(folder):
         entry = _write_shard(folder, maker, shard, on_step)

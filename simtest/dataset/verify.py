@@ -34,7 +34,7 @@ from simtest.runtime.engines import Engine
 from simtest.runtime.locks import LOCK
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.relief import Relief
-from simtest.validation.runner import Progress
+from simtest.validation.runner import EXPORT, EXPORTING, Progress
 
 MAX_DEPTH_NORMAL_DEG = 5.0
 """The median angle between a sample's normals and those of its depth map is far below this, whatever its noise."""
@@ -106,7 +106,7 @@ def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
     for name, entry in {**manifest.shards, **manifest.tables}.items():
         yield from _against(folder / name, entry)
     # files that do not belong
-    known = {NAME, LOCK, *manifest.shards, *manifest.tables, *planned}
+    known = {NAME, LOCK, EXPORT, EXPORTING, *manifest.shards, *manifest.tables, *planned}
     for path in sorted(folder.iterdir()):
         if path.name in known:
             continue

@@ -25,7 +25,7 @@ NARROW = 0.15
 0.3 a surface at half the distance would lie three stated deviations off."""
 
 DISTANCES = (np.arange(32) + 0.5) / 32
-"""Shares of a prior on the distance at which the normal is computed."""
+"""Shares of a prior on the distance at which the normal's moves are computed."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,11 @@ class Bisector:
     towards the light; 1/H are the lobe's moments, known from the isophotes.
 
     A distance that is told with a small normal error moves the normal by its derivative. Over any other distribution,
-    such as the working range where no distance is told, the normal is the mean over the distribution, and the part
-    ``distance`` of the budget its spread.
+    such as the working range where no distance is told, the normal is that at the distribution's median, and the part
+    ``distance`` of the budget holds the moves from there. The light's angle goes with 1/d, so this is the median of
+    the normals, with the smallest mean error; and it is nearer to the true one than the reversed sightline wherever the
+    surface is nearer than twice the median, which for a uniform distribution is everywhere. The mean of the normals
+    would follow the few near distances, and be worse than no correction beyond 55 of 5 to 80 mm.
 
     Parameters
     ----------
@@ -74,7 +77,7 @@ class Bisector:
             # What is seen is then usually the lights' common lobe.
             order.insert(0, lights.mean(axis=0))
             flags = (*flags, "ambiguous_light")
-        found = [_mean_normal(family, light, priors.distance) for light in order]
+        found = [_normal(family, light, priors.distance) for light in order]
         normal, sightline = found[0]
         candidates = np.array([candidate for candidate, _ in found])
         budget = _budget(family, order[0], priors.distance, normal)
@@ -101,14 +104,15 @@ def _is_narrow(distance: Distribution) -> TypeGuard[Normal]:
     return isinstance(distance, Normal) and distance.sd <= NARROW * distance.mean
 
 
-def _mean_normal(family: HighlightAxis, light: Array, distance: Distribution) -> tuple[Array, Array]:
-    """Return normal and sightline of the BP: at the distance's mean, or their mean over a distribution of any shape."""
-    if _is_narrow(distance):
-        normals, sightlines = _normals(family, light, np.array([distance.mean]))
-    else:
-        normals, sightlines = _normals(family, light, distance.quantile(DISTANCES))
-    normal, sightline = normals.mean(axis=0), sightlines.mean(axis=0)
-    return normal / np.linalg.norm(normal), sightline / np.linalg.norm(sightline)
+def _middle(distance: Distribution) -> float:
+    """Return the distance, mm, that the normal is taken at: the median, also the mean of a small normal error."""
+    return distance.mean if _is_narrow(distance) else float(distance.quantile(np.array([0.5]))[0])
+
+
+def _normal(family: HighlightAxis, light: Array, distance: Distribution) -> tuple[Array, Array]:
+    """Return normal and sightline of the BP in the middle of the distances."""
+    normals, sightlines = _normals(family, light, np.array([_middle(distance)]))
+    return normals[0], sightlines[0]
 
 
 def _normals(family: HighlightAxis, light: Array, distances: Array, turn: Array | None = None) -> tuple[Array, Array]:
@@ -136,10 +140,10 @@ def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal:
     """Return the budget of the normal: that of the axis at the peak, and the distance."""
     if family.peak_budget is None:
         return None
-    across, mean = basis_across(normal), np.array([distance.mean])
-    at_mean = _normals(family, light, mean)[0][0]
-    turned = [_normals(family, light, mean, STEP * unit)[0][0] for unit in np.eye(2)]
-    J = across @ (np.array(turned) - at_mean).T / STEP
+    across, middle = basis_across(normal), np.array([_middle(distance)])
+    unturned = _normals(family, light, middle)[0][0]
+    turned = [_normals(family, light, middle, STEP * unit)[0][0] for unit in np.eye(2)]
+    J = across @ (np.array(turned) - unturned).T / STEP
     own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
     return {**own, "distance": _distance_part(family, light, distance, across)}
 

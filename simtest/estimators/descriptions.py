@@ -18,18 +18,32 @@ DESCRIPTIONS: dict[str, str] = {
 """Of this package's estimators, by name: in pages, `simtest list`, completion and the reference."""
 
 
+def is_own(name: str) -> bool:
+    """Whether an estimator of that name, maybe with its package's, is one of this package."""
+    return name.removeprefix(f"{OWN}:") in DESCRIPTIONS
+
+
 def describe_estimators(names: Sequence[str]) -> dict[str, str]:
     """Describe estimators by name: this package's own, and others by the first line of their docstring.
 
-    A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description.
+    A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description. A core
+    stands under its short name.
     """
     from simtest.estimators.registry import load_estimators
 
     described = {}
     for name in names:
-        own = DESCRIPTIONS.get(name.removeprefix(f"{OWN}:"))
-        described[name] = own or _first_line(load_estimators([name])[name])
+        if own := DESCRIPTIONS.get(name.removeprefix(f"{OWN}:")):
+            described[name] = own
+        else:
+            described |= {short: _described(given) for short, given in load_estimators([name]).items()}
     return described
+
+
+def _described(estimator: object) -> str:
+    """Return what an estimator says of itself: its description, where it has one, else its docstring's first line."""
+    stated = getattr(estimator, "description", None)
+    return stated if isinstance(stated, str) else _first_line(estimator)
 
 
 def _first_line(estimator: object) -> str:

@@ -18,6 +18,7 @@ from simtest.estimators.protocol import (
     Estimator,
     FrameEstimator,
     PreparedEstimator,
+    RegionEstimator,
 )
 from simtest.geometry import Array, Camera, Patch
 
@@ -28,7 +29,7 @@ UNIT_TOLERANCE = 1e-6
 class FrameResults:
     """The results of one estimator: of each patch, and estimates of a frame that no patch takes.
 
-    A patch has None from an estimator whose estimates are of clouds of highlights.
+    A patch has None from an estimator whose estimates are of clouds of highlights, and where a table has no row.
     """
 
     of_patches: Sequence[Estimate | Failure | None]
@@ -108,6 +109,9 @@ def run_in_frame(
     camera = frame.calibration.camera
     if not isinstance(estimator, FrameEstimator):
         return FrameResults(run_each(estimator, patches, camera, priors))
+    if isinstance(estimator, RegionEstimator):
+        of_patches, elsewhere = estimator.estimate_regions(frame, patches)
+        return FrameResults([None if each is None else _checked(each, camera) for each in of_patches], [*elsewhere])
     try:
         returned = estimator.estimate_frame(frame, camera, priors)
         results: Failure | list[Estimate] = returned if isinstance(returned, Failure) else _all_sound(returned, camera)
@@ -137,23 +141,32 @@ def _all_sound(returned: Sequence[object], camera: Camera) -> list[Estimate] | F
 
 def _assigned(estimates: Sequence[Estimate], patches: Sequence[Patch | Failure]) -> FrameResults:
     """Assign the estimates of a frame to its patches."""
-    # candidates: pairs of a patch and an estimate that looks into it, with the distance from the peak
-    pairs = []
-    for p, patch in enumerate(patches):
-        if not isinstance(patch, Failure):
-            gaps = [float(np.hypot(*(estimate.look_px - patch.peak_px))) for estimate in estimates]
-            pairs += [(gap, p, e) for e, gap in enumerate(gaps) if _holds(patch, estimates[e].look_px)]
-    # the nearest first, each patch and each estimate once
-    taken: dict[int, int] = {}
-    for _, p, e in sorted(pairs):
-        if p not in taken and e not in taken.values():
-            taken[p] = e
+    taken = assign([estimate.look_px for estimate in estimates], patches)
     missing = Failure(Reason.NO_ESTIMATE, "the estimator has none in this region")
     of_patches = [
         estimates[taken[p]] if p in taken else patch if isinstance(patch, Failure) else missing
         for p, patch in enumerate(patches)
     ]
     return FrameResults(of_patches, [each for e, each in enumerate(estimates) if e not in taken.values()])
+
+
+def assign(points_px: Sequence[Array], patches: Sequence[Patch | Failure]) -> dict[int, int]:
+    """Return the index of a point, px, by index of the patch that holds it: the nearest to the patch's peak first.
+
+    Each patch has one point at most, and each point one patch.
+    """
+    # candidates: pairs of a patch and a point in it, with the distance from the peak
+    pairs = []
+    for p, patch in enumerate(patches):
+        if not isinstance(patch, Failure):
+            gaps = [float(np.hypot(*(point - patch.peak_px))) for point in points_px]
+            pairs += [(gap, p, e) for e, gap in enumerate(gaps) if _holds(patch, points_px[e])]
+    # the nearest first, each patch and each point once
+    taken: dict[int, int] = {}
+    for _, p, e in sorted(pairs):
+        if p not in taken and e not in taken.values():
+            taken[p] = e
+    return taken
 
 
 def _holds(patch: Patch, point: Array) -> bool:

@@ -222,4 +222,14 @@ class CloudEstimator(FrameEstimator, Protocol):
         """Fewest highlights of a cloud."""
 
 
+@runtime_checkable
+class RegionEstimator(FrameEstimator, Protocol):
+    """Answers for the regions of a frame by their numbers, as a table of answers made elsewhere does."""
+
+    def estimate_regions(
+        self, frame: Frame, patches: Sequence[Patch | Failure], /
+    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
+        """Return what there is for each patch, None where there is nothing, and estimates that belong to no patch."""
+
+
 AnyEstimator = Estimator | FrameEstimator

@@ -1,4 +1,4 @@
-"""Estimators by name, those of other packages too, through the entry-point group ``simtest.estimators``."""
+"""Estimators by name: those of packages, through the entry-point group ``simtest.estimators``, and cores by command."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
 
@@ -46,19 +47,30 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
 def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:
     """Load estimators by name, or take those of a mapping, in the given order.
 
-    A name is as registered, or "package:name" where two packages register it.
+    A name is as registered, or "package:name" where two packages register it; or it is a core's
+    (`simtest.estimators.process.command.parse_core`), which is started and stands under its short name.
 
     Raises
     ------
     InputError
-        If a name is unknown, ambiguous or given twice, its package cannot be imported, or an object is no estimator.
+        If a name is unknown, ambiguous or given twice, its package cannot be imported, an object is no estimator, or a
+        core cannot be started or has the name of an installed estimator.
     """
     if isinstance(estimators, Mapping):
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
     for name in estimators:
-        given = ESTIMATORS.load(name)  # raises where the name is not clear
-        if name in loaded:
-            raise InputError(f"estimator {name!r}: given twice")
-        loaded[name] = as_estimator(name, given)
+        # Raises where the name is not clear.
+        short, given = _core(name) if is_core(name) else (name, ESTIMATORS.load(name))
+        if short in loaded:
+            raise InputError(f"estimator {short!r}: given twice")
+        loaded[short] = as_estimator(name, given)
     return loaded
+
+
+def _core(name: str) -> tuple[str, object]:
+    """Return a core's short name and its estimator; imported at need, since few runs name one."""
+    from simtest.estimators.process.estimator import load_core
+    from simtest.estimators.process.naming import core_name
+
+    return core_name(name), load_core(name)

@@ -57,6 +57,8 @@ def _axis(axis: Axis, values: list[npt.ArrayLike]) -> PlotlyJson:
     if ticks is not None:
         made |= {"tickvals": [at for at, _ in ticks], "ticktext": [_text(text) for _, text in ticks], "tickangle": 0}
     if minor:
+        # The texts stand beyond the longer ticks; without these the shorter ones would run through them.
+        made |= {"ticks": "outside", "ticklen": 5}
         made["minor"] = {"ticks": "outside", "ticklen": 3, "tickvals": rounded(minor)}
     return made
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.pages import style
+from simtest.pages import palette, style
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ def environment() -> "Environment":
         "breakable": breakable,
         "capitalize_first": capitalize_first,
     }
+    # The templates' own marks take the palette's colours: these stand out on both grounds.
+    made.globals |= {"neutral": palette.NEUTRAL, "accents": palette.ESTIMATOR_COLOURS}
     return made
 
 

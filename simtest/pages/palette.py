@@ -1,32 +1,35 @@
 """The colours of the estimators and of what stands beside them: in pages, figures, the viewer and overlays.
 
 The colours are those of Okabe and Ito, moved so that every two of them, and the neutral grey, differ by at least
-`LEAST_DIFFERENCE` (CIEDE2000) for a normal observer, a protanope and a deuteranope, and stand out on white and on the
-pages' dark ground.
+`LEAST_DIFFERENCE` (CIEDE2000) for a normal observer, a protanope and a deuteranope, and have a contrast of at least
+`LEAST_CONTRAST` (WCAG 2) with white and with the pages' dark ground.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 
 ESTIMATOR_COLOURS: Mapping[str, str] = {
-    "cone_axis": "#15628C",
-    "circle_pose": "#CA5C12",
-    "brightest_point": "#179B6D",
-    "bisector": "#CA97BC",
-    "curved": "#09A9FF",
-    "photometric": "#E09916",
-    "inverse_rendering": "#7F62D8",
-    "cloud": "#794D25",
+    "cone_axis": "#166B90",
+    "circle_pose": "#B15912",
+    "brightest_point": "#109B6D",
+    "bisector": "#B486B1",
+    "curved": "#009AF8",
+    "photometric": "#CC8600",
+    "inverse_rendering": "#644FFA",
+    "cloud": "#7F5C43",
 }
 """Colour of each estimator: blue, vermilion, green, pink, sky blue, orange, violet, brown; hexadecimal."""
 
-NEUTRAL = "#7D828A"
+NEUTRAL = "#747981"
 """Grey of laws and truth in charts."""
 
 LEAST_DIFFERENCE = 12.0
 """Least CIEDE2000 between two of these colours, seen by any of the three observers; about 2 is a just visible step."""
 
-FURTHER = ("#B2478F", "#4E9A9A", "#9A9A2E", "#C08A7A", "#A6761D", "#5D6B2F")
+LEAST_CONTRAST = 3.0
+"""Least contrast between one of these colours and a ground: what WCAG 2 asks of marks that carry a meaning."""
+
+FURTHER = ("#B2478F", "#4E9A9A", "#98982E", "#BC8777", "#A6761D", "#5D6B2F")
 """Colours of estimators from other packages; text and symbols tell them apart too."""
 
 SERIES = tuple(ESTIMATOR_COLOURS.values())

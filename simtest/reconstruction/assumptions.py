@@ -1,9 +1,12 @@
 """What is assumed where nobody told: as priors of a picture known by its field of view, and as text for people."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
+from simtest.errors import InputError
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera
 
@@ -30,6 +33,17 @@ class Assumption:
         return f"{self.what}: {self.distribution} (to narrow: {self.how_to_narrow})"
 
 
+Extent = Literal["width", "height", "diagonal"]
+"""Extents of a picture that a stated field of view may span."""
+
+LIGHT = "light"
+
+LIGHT_AT_CAMERA = (
+    "The position of the light is not told, so each normal is the reversed line of sight to its highlight, as if the "
+    "light were at the camera. A light beside it turns the true normal away by half the angle between light and camera."
+)
+"""What a picture's normals are where nobody told the light; in pages and in the terminal."""
+
 NEAR_MISSES = Assumption(
     "highlights",
     "each holds a point whose normal bisects light and camera; where an organ folds about one in five only comes near: "
@@ -39,13 +53,18 @@ NEAR_MISSES = Assumption(
 """Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""
 
 
-def calibration_of_view(fov_deg: float, width: int, height: int) -> Calibration:
-    """Return the calibration of a camera of which the horizontal field of view alone is known, deg.
+def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent = "width") -> Calibration:
+    """Return the calibration of a camera of which the field of view alone is known, deg, across the whole picture.
 
-    Raises `InputError` if the angle is out of range.
+    `across` names the extent that the angle spans: the picture's width, height or diagonal. Raises `InputError` if the
+    angle or the extent is none of those allowed.
     """
     prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD)
-    return Calibration(Camera.from_fov(fov_deg, width, height), priors=Priors(camera=prior))
+    extents = {"width": width, "height": height, "diagonal": math.hypot(width, height)}
+    if across not in extents:
+        raise InputError(f"--fov-of {across}: must be one of {', '.join(extents)}")
+    focal = Camera.from_fov(fov_deg, width, height).fx * extents[across] / width
+    return Calibration(Camera(width, height, focal, focal, width / 2, height / 2), priors=Priors(camera=prior))
 
 
 def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
@@ -58,7 +77,7 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
     if not priors.lights_mm:
         made.append(
             Assumption(
-                "light", f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
+                LIGHT, f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
                 "[rig] lights_mm or light_offset_mm in a calibration file",
             )
         )  # fmt: skip
@@ -85,6 +104,11 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
+
+
+def light_note(assumed: Iterable[Assumption]) -> str:
+    """Return what the normals are if the light is among what is assumed; else an empty text."""
+    return LIGHT_AT_CAMERA if any(each.what == LIGHT for each in assumed) else ""
 
 
 def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:

@@ -4,6 +4,9 @@ The pages show these sentences where the names appear; docs/reference/estimators
 define the names.
 """
 
+from collections import Counter
+from collections.abc import Iterable
+
 from simtest.errors import Reason
 
 FLAGS = {
@@ -46,6 +49,9 @@ KINDS = {
 }
 """By kind of a highlight that was found by colour (docs/concepts/detection.md)."""
 
+KIND_NAMES = {"small": "few pixels", "inter_reflection": "inter-reflection"}
+"""Kinds as people read them, where files have another name: `small` is a flag too, of another meaning."""
+
 REASONS = {str(reason): reason.meaning for reason in Reason}
 """By reason of a failure."""
 
@@ -73,6 +79,17 @@ TERMS = {
     "smooth base surface; each glint alone carries the normal of the relief.",
 }
 """Terms that the page of a picture uses."""
+
+
+def kind_name(kind: str | None) -> str:
+    """Return the name of a kind of highlight for people; an empty one where nothing judged the highlight."""
+    return KIND_NAMES.get(kind or "", kind or "")
+
+
+def kinds_counted(kinds: Iterable[str]) -> str:
+    """Count highlights by kind, the most frequent first: "12 cluster, 3 border"."""
+    counts = Counter(kind_name(kind) for kind in kinds)
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 
 
 def known(table: dict[str, str], name: str) -> str:

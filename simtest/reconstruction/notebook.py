@@ -11,6 +11,7 @@ from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import note_html, picture_html, table_html
 from simtest.pages.pixels import displayed
 from simtest.reconstruction.description import Drawing, SpecularityRecord, describe
+from simtest.reconstruction.explanations import kind_name
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.pipeline import Reconstruction, Specularities, Specularity
 from simtest.reconstruction.ranking import best_of
@@ -74,7 +75,7 @@ def _moved(record: SpecularityRecord, found: Specularity, origin: Array) -> Spec
 
 def _best_row(record: SpecularityRecord) -> tuple[object, ...]:
     best = record.best_estimate
-    kind = record.kind or ("cloud" if best is not None and best.cloud is not None else "")
+    kind = kind_name(record.kind) or ("cloud" if best is not None and best.cloud is not None else "")
     if best is None:
         return (record.id, kind, "no normal", "", "", "", record.best_because)
     return (record.id, kind, record.best, *_row("", best)[1:])

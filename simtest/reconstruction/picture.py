@@ -8,7 +8,7 @@ from simtest.calibration import Calibration
 from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.reconstruction.assumptions import calibration_of_view
+from simtest.reconstruction.assumptions import Extent, calibration_of_view
 from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.pipeline import run_picture
@@ -18,6 +18,11 @@ from simtest.runtime.resources import shown
 TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
+
+BORDERED = (
+    "the picture has dark borders, and the field of view is taken across the whole picture: where it is that of the "
+    "visible part, crop the borders off by the same width on opposite sides"
+)
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,7 @@ class Options:
     camera : Path, optional
         Calibration or camera file; this or `fov_deg` must be given, not both.
     fov_deg : float, optional
-        Horizontal field of view, deg.
+        Field of view, deg, across the whole picture, black borders included.
     estimators : tuple of str, optional
         Names; default those of the package that need no more than the calibration states.
     roi : tuple of int, optional
@@ -47,6 +52,8 @@ class Options:
     target : {"fine", "base"}
         Which surface's normals are stated: those of the fine one, or of the base without its relief, whose slope is
         then in the uncertainty.
+    fov_of : {"width", "height", "diagonal"}
+        What the field of view spans.
     poses : Path, optional
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
 
@@ -66,6 +73,7 @@ class Options:
     detector: str = AUTO
     smoothing_px: float | None = None
     target: Target = "fine"
+    fov_of: Extent = "width"
     poses: Path | None = None
 
     def __post_init__(self) -> None:
@@ -102,8 +110,9 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
         calibration, cautions = load_calibration(options.camera), []
     else:
         assert options.fov_deg is not None
-        calibration = calibration_of_view(options.fov_deg, picture.shape[1], picture.shape[0])
-        cautions = [f"no calibration: all angles depend on the field of view of {options.fov_deg:g} deg being right"]
+        calibration = calibration_of_view(options.fov_deg, picture.shape[1], picture.shape[0], options.fov_of)
+        told = f"the field of view of {options.fov_deg:g} deg across the picture's {options.fov_of}"
+        cautions = [f"no calibration: all angles depend on {told} being right"]
     if calibration.response is not None and options.encoding is not None:
         raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
     return calibration, cautions
@@ -122,14 +131,16 @@ def reconstruct_values(
         picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,
         not options.every, options.target,
     )  # fmt: skip
+    view = made.detection.view
+    bordered = options.fov_deg is not None and view.seen is not None and not bool(view.seen.all())
     # describe
     return PictureRecord(
         image=name,
         camera=calibration.camera,
         encoding=choices.encoding,
         detector=choices.detector,
-        view=made.detection.view,
-        warnings=list(cautions),
+        view=view,
+        warnings=[*cautions, BORDERED] if bordered else list(cautions),
         specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
         assumed=choices.assumed,

@@ -17,6 +17,7 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
 from simtest.estimators.prior_parts import to_base
+from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
@@ -178,7 +179,7 @@ def _choose(
     smoothing = choose_smoothing(smoothing_px, finder)
     made = _run(image, known, finder, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
-    return made, Choices(kind, known.saturation_level, name, smoothing, tuple(estimators), known.priors)
+    return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
 
 
 def reconstruct_colour(
@@ -350,12 +351,14 @@ def _flagged(
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
     # An unresolved highlight states no shape that smoothing could have changed.
-    flags = ("small",) if small and UNRESOLVED not in result.flags else ()
+    flags: tuple[str, ...] = ("small",) if small and UNRESOLVED not in result.flags else ()
     flags = (*flags, "dim") if dim else flags
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
         flags = (*(name for name, mask in touched.items() if (mask & used).any()), *flags)
+    # Answers made elsewhere may state them already.
+    flags = tuple(flag for flag in flags if flag not in result.flags)
     return replace(result, flags=(*result.flags, *flags)) if flags else result
 
 

@@ -17,6 +17,7 @@ from simtest.pages.html import write_page
 from simtest.pages.pixels import jpeg_address
 from simtest.pages.style import colours
 from simtest.reconstruction import explanations
+from simtest.reconstruction.assumptions import light_note
 from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
 from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
@@ -41,12 +42,13 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
     data = {
         "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
         "others": [
-            {"kind": h.kind, "outline": _rounded(h.outline, 1), "peak": np.add(h.region.peak, 0.5).tolist(),
-             "score": h.score}
+            {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
+             "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score}
             for h in (*record.other_highlights, *(s.highlight for s in spots if s.highlight and s.peak_px is None))
         ],
         "colours": palette,
-        "words": {name: getattr(explanations, name.upper()) for name in ("flags", "kinds", "reasons", "parts")},
+        "words": {name: getattr(explanations, name.upper()) for name in ("flags", "reasons", "parts")}
+        | {"kinds": {explanations.kind_name(kind): text for kind, text in explanations.KINDS.items()}},
     }  # fmt: skip
     height, width = picture.shape[:2]
     best, stated = Counter(spot.best for spot in spots if spot.best), record.stated
@@ -56,7 +58,9 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_address(picture),
         title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
-        others=len(data["others"]), parts=explanations.PARTS, chi95=chi_squared.quantile(0.95, 2),
+        others=len(data["others"]), left_out=len(record.other_highlights),
+        left_out_kinds=explanations.kinds_counted(h.kind for h in record.other_highlights),
+        light_note=light_note(record.assumed), parts=explanations.PARTS, chi95=chi_squared.quantile(0.95, 2),
     )  # fmt: skip
 
 
@@ -113,7 +117,7 @@ def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
         "id": spot.id,
         "peak": _rounded(spot.position_px, 2),
         "size": max(spot.box_px[2:]),
-        "kind": spot.kind,
+        "kind": explanations.kind_name(spot.kind),
         "score": spot.score,
         "best": spot.best,
         "because": spot.best_because,

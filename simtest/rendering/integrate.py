@@ -40,6 +40,9 @@ PAINT_EVERY, SAME_PATCH = 3, 0.02
 """Samples that share an albedo, and how far apart they may lie, as a share of the distance. Every fourth sample of the
 sequence would stand in one column of the pixel."""
 
+SMALLEST_NORMAL = np.finfo(np.float32).tiny
+"""Of single precision; what is smaller is subnormal."""
+
 SUMMED = 64
 """Samples of a pixel that are summed in single precision; these sums are added in double precision."""
 
@@ -364,6 +367,9 @@ def as_radiance(parts: list[Image]) -> Radiance:
         own = parts[first * width : (first + 1) * width]
         if not own:
             own = [np.zeros_like(parts[0])] * width
-        return own[0] if width == 1 else np.stack(own, axis=-1)
+        made = own[0] if width == 1 else np.stack(own, axis=-1)
+        # Dr.Jit's own threads flush subnormal numbers to 0, a process of one thread does not. Left in the frame, they
+        # make its noise depend on the number of threads: a Poisson count of mean 0 draws nothing.
+        return np.where(np.abs(made) < SMALLEST_NORMAL, np.float32(0), made)
 
     return Radiance(image(0), image(1), image(2))

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from simtest.estimators.descriptions import is_own
 from simtest.pages.style import estimator_order, number
 from simtest.validation.guide import (
     BREAK_DEG,
@@ -19,6 +20,9 @@ from simtest.validation.statistics import PENALTY_DEG
 
 HEADS = ("situation", "best method", "median error", "answered", "where it breaks")
 
+NOTABLE_SHARE = 0.1
+"""A larger share of highlights without an answer is told beside where a method breaks."""
+
 RULES = (
     "Median error: the angle between the estimated and the true normal, of the answers. Its 95 % interval resamples "
     f"the frames of each setting; none is given where a setting has fewer than {LEAST_FRAMES} distinct frames.",
@@ -31,7 +35,9 @@ RULES = (
     "Frames whose errors are the same to the last bit, as without noise, count as one frame.",
     "Methods that state the normal of the base, the surface without its relief, are ranked in rows of their own.",
     f"A method breaks where the mean error of its answers exceeds {BREAK_DEG:g}°, or where it answers fewer than "
-    f"{100 * LEAST_ANSWERED:g} % of the highlights.",
+    f"{100 * LEAST_ANSWERED:g} % of the highlights. Where it breaks nowhere, but more than {100 * NOTABLE_SHARE:g} % "
+    "of the highlights have no answer, that is told first.",
+    "An estimator of another package or of your own has a line in each situation, best or not.",
 )
 """How the table is made."""
 
@@ -59,6 +65,20 @@ class GuideRow:
     unanswered: str  # why, where there are any
     breaks: str
     is_broken: bool  # whether the best method breaks in one of the settings
+    guests: "tuple[GuestRow, ...]" = ()  # a line of each method from elsewhere that is not the best
+
+
+@dataclass(frozen=True)
+class GuestRow:
+    """A line of a situation on a method that is not this package's; texts but for the name."""
+
+    estimator: str
+    standing: str  # "tied" or "not best"
+    error: str
+    answered: str
+    unanswered: str
+    breaks: str
+    is_broken: bool
 
 
 @dataclass(frozen=True)
@@ -79,6 +99,7 @@ def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Any]:
     rows = [
         vars(row)
         | {
+            "guests": [vars(guest) for guest in row.guests],
             "target": advice.target,
             "settings": advice.situation.settings,
             "methods": {name: _figures(figures) for name, figures in advice.methods.items()},
@@ -106,12 +127,22 @@ def guide_rows(guide: Guide) -> list[GuideRow]:
 
 def _row(advice: Advice) -> GuideRow:
     where = (_surface(advice), advice.situation.circumstances)
+    guests = tuple(_guest(advice, name) for name in advice.methods if not is_own(name) and name != advice.best)
     if advice.best is None:
-        return GuideRow(*where, None, (), "–", f"0 of {advice.n}", "", "no method answered", True)
+        return GuideRow(*where, None, (), "–", f"0 of {advice.n}", "", "no method answered", True, guests)
     best = advice.methods[advice.best]
     return GuideRow(
         *where, advice.best, advice.ties, _error(best), _share(best), _unanswered(best), _breaks(advice),
-        bool(advice.broken),
+        bool(advice.broken), guests,
+    )  # fmt: skip
+
+
+def _guest(advice: Advice, name: str) -> GuestRow:
+    figures = advice.methods[name]
+    why = f"here: {_why(figures)}" if figures.breaks else f"not as a whole (mean {_mean(figures)})"
+    return GuestRow(
+        name, "tied" if name in advice.ties else "not best", _error(figures) if figures.answered else "–",
+        _share(figures), _unanswered(figures), why, figures.breaks,
     )  # fmt: skip
 
 
@@ -143,7 +174,12 @@ def _breaks(advice: Advice) -> str:
     settings = advice.by_setting
     if not advice.broken:
         where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
-        return f"nowhere here (worst: {_mean(settings[advice.worst])}{where})"
+        nowhere = f"nowhere here (worst: {_mean(settings[advice.worst])}{where})"
+        best = advice.methods[advice.best or ""]
+        silent_share = 1 - best.answered / best.n
+        if silent_share <= NOTABLE_SHARE:
+            return nowhere
+        return f"{100 * silent_share:.0f} % of the highlights have no answer ({_unanswered(best)}); else {nowhere}"
     errs = {name: figures for name, figures in settings.items() if figures.errs}
     silent = {name: figures for name, figures in settings.items() if figures.is_silent}
     mildest_first = sorted(errs, key=lambda name: errs[name].mean_deg or 0.0)

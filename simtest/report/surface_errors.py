@@ -95,7 +95,8 @@ def _box(errors: Array, surface: str, estimator: str, middle: float, width: floa
 
 def surface_chart(data: SurfaceErrors, colours: Mapping[str, str]) -> Chart:
     """Describe the errors per surface."""
-    names = tuple((float(i), name) for i, name in enumerate(data.surfaces))
+    # On two lines where a name has two parts, or neighbours would overlap.
+    names = tuple((float(i), name.replace(", ", ",\n")) for i, name in enumerate(data.surfaces))
     x = Axis("", limits=(-0.6, len(names) - 0.4), named=names)
     y = Axis("angular error (deg)", "log", log_range([box.points for box in data.boxes]))
     marks = [mark for box in data.boxes for mark in _box_marks(box, colours[box.estimator])]

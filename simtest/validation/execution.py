@@ -15,7 +15,7 @@ from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.gallery_item import save_realisation
-from simtest.validation.paper.rows import paper_rows
+from simtest.validation.paper.rows import paper_rows, pipeline_with
 from simtest.validation.realisation import Realiser
 from simtest.validation.results_table import ResultRow, Value, completed, table
 
@@ -46,7 +46,7 @@ class Part:
 
 
 @lru_cache(maxsize=1)
-def _realiser(variant: str | None) -> Realiser:
+def realiser_of(variant: str | None) -> Realiser:
     """Return this process's realiser, which stays from part to part."""
     return Realiser(variant)
 
@@ -59,8 +59,9 @@ def _estimators(names: tuple[str, ...]) -> dict[str, AnyEstimator]:
 
 def forget() -> None:
     """Let this process's rendering session and estimators go."""
-    _realiser.cache_clear()
+    realiser_of.cache_clear()
     _estimators.cache_clear()
+    pipeline_with.cache_clear()
 
 
 def parts_of(
@@ -87,7 +88,7 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
 
 
 def _rendered(part: Part, tell: OnStep) -> list[ResultRow]:
-    experiment, case, realiser = part.experiment, part.case, _realiser(part.variant)
+    experiment, case, realiser = part.experiment, part.case, realiser_of(part.variant)
     estimators = _estimators(tuple(experiment.estimators))
     rows: list[ResultRow] = []
     for number in part.numbers:

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.process.naming import core_hashes
 from simtest.runtime import provenance
 from simtest.runtime.files import Json
 from simtest.spec import Experiment
@@ -20,6 +21,7 @@ def fingerprint(experiment: Experiment, cases: list[Case], variant: str) -> str:
             "scenes": [case.data for case in cases],
             "inputs": input_hashes(cases),
             "versions": provenance.versions() | ESTIMATORS.distributions(experiment.estimators),
+            "cores": core_hashes(experiment.estimators),
             "source": provenance.source_hash(),
             "variant": variant,
         }

@@ -16,7 +16,7 @@ from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.motion import MOTION, FurtherView, further_views, with_motion
-from simtest.validation.results_table import ResultRow
+from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.rough_truth import rough_truth
 
 
@@ -69,6 +69,11 @@ class Realiser:
         self, experiment: Experiment, case: Case, number: int, estimators: Mapping[str, AnyEstimator]
     ) -> Realisation:
         """Make one realisation of a case; `session` is then at its scene."""
+        view, drawn = self.view(experiment, case, number)
+        return realise(self.session, experiment, case, number, view, drawn, estimators, self._further)
+
+    def view(self, experiment: Experiment, case: Case, number: int) -> tuple[RenderedView, dict[str, float]]:
+        """Render the scene of a realisation, at which `session` then is; return it with the values drawn for it."""
         scene, drawn = case.scene(experiment, number)
         # A scene without drawn values is rendered once for all realisations.
         if self._view is None:
@@ -76,11 +81,11 @@ class Realiser:
         if self._view is None or scene != self._view.scene:
             self._further = further_views(self.session, scene)
             self._view = render_view(self.session, scene)
-        return realise(self.session, experiment, case, number, self._view, drawn, estimators, self._further)
+        return self._view, drawn
 
 
 def realise(
-    session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, float],
+    session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, Value],
     estimators: Mapping[str, AnyEstimator], further: Sequence[FurtherView] = (),
 ) -> Realisation:  # fmt: skip
     """Make one realisation of a case from its rendered view, at whose scene the session must be.

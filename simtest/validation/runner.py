@@ -7,7 +7,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.estimators.process.naming import absolute_names, close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -38,6 +39,13 @@ RESULTS = "results.parquet"
 MOST_DIGEST_BYTES = 1000
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
+EXPORT = "export.json"
+"""What was exported of a run (`simtest.dataset.export`); it stands in the run's folder."""
+EXPORTING = "exporting"
+"""Folder of the lists of a run's export that is not finished."""
+
+Cores = dict[str, dict[str, object]]
+"""What a record says of each core, by the estimator's name."""
 
 Progress = Callable[[int, int, str], None]
 """Called with realisations done, realisations in all, and the name of the setting."""
@@ -87,6 +95,8 @@ class RunRecord:
         How the run was called.
     inputs : dict
         SHA-256 by input file.
+    cores : dict
+        Command, greeting and files of each estimator that is a core of its own process.
     results : str
         SHA-256 of results.parquet.
     """
@@ -100,6 +110,7 @@ class RunRecord:
     duration_s: float
     command: str
     inputs: dict[str, str]
+    cores: Cores
     results: str = ""
 
     def to_json(self) -> Json:
@@ -164,14 +175,17 @@ def run_experiments(
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
     left = [job for job in jobs if job.folder not in finished]
     # Check: everything that may be refused is refused before a folder is touched.
-    _check_estimators(left)
+    cores = _check_estimators(left)
     for job in jobs:
-        _check_folder(job.folder)
+        check_folder(job.folder)
     # Run what is not finished.
     for job in left:
         _warn_of_another(job)
         _prepare(job.folder, job.digest)
-    resumed = _work(left, variant, engine or make_engine(), progress)
+    try:
+        resumed = _work(left, variant, engine or make_engine(), progress)
+    finally:
+        close_cores()
     # Write results and summaries.
     for job in left:
         record = RunRecord(
@@ -184,6 +198,7 @@ def run_experiments(
             duration_s=round(time.monotonic() - clock, 1),
             command=command,
             inputs=input_hashes(job.cases),
+            cores=cores[job.folder],
         )
         finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
@@ -203,28 +218,29 @@ class _Job:
         return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
 
 
-def _check_estimators(jobs: Sequence[_Job]) -> None:
-    """Raise `InputError` for unknown estimators. The workers load them; a finished run names none that is unknown."""
+def _check_estimators(jobs: Sequence[_Job]) -> dict[Path, Cores]:
+    """Raise `InputError` for unknown estimators; return what the records of the runs, by folder, say of cores.
+
+    The workers load them; a finished run names none that is unknown.
+    """
     if jobs:
         from simtest.estimators.registry import load_estimators
     for job in jobs:
         load_estimators(job.experiment.estimators)
+    return {job.folder: core_records(job.experiment.estimators) for job in jobs}
 
 
 def _finish(job: _Job, record: RunRecord, resumed: int) -> Run:
     """Join the parts of an experiment, and write its results and summary."""
     import polars as pl
 
-    from simtest.validation.run_summary import run_summary
+    from simtest.validation.run_summary import run_summary, write_results
 
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(_part_file(parts, i)) for i in range(len(job.cases))])
-    write_atomically(folder / RESULTS, results.write_parquet)
-    record = replace(record, results=provenance.file_hash(folder / RESULTS))
-    summary = run_summary(job.experiment, job.cases, results)
-    write_json(folder / "summary.json", {"run": record.to_json(), **summary})
+    write_results(folder, record, results, run_summary(job.experiment, job.cases, results))
     # The parts go last: until the summary stands, a run that is stopped can go on.
-    _remove(parts)
+    remove_folder(parts)
     return Run(folder, resumed, results)
 
 
@@ -242,10 +258,13 @@ def _work(jobs: Sequence[_Job], variant: str | None, engine: Engine, progress: P
     # Split the missing cases into parts, which an engine may run in any order.
     parts: list[tuple[_Job, int, Part]] = []
     for job in jobs:
-        in_gallery, swept = _in_gallery(job.cases), swept_example(job.cases)
+        in_gallery, swept = gallery_cases(job.cases), swept_example(job.cases)
+        # A worker, on another machine of a cluster for one, may have another current folder.
+        absolute = absolute_names(job.experiment.estimators)
+        experiment = job.experiment.model_copy(update={"estimators": absolute})
         for index in missing[job.folder]:
             item = job.folder / "gallery" / f"{index:04d}.npz" if index in in_gallery else None
-            parts += [(job, index, part) for part in parts_of(job.experiment, job.cases[index], swept, item, variant)]
+            parts += [(job, index, part) for part in parts_of(experiment, job.cases[index], swept, item, variant)]
     case_of = [(job.folder, index) for job, index, _ in parts]
     waiting = Counter(case_of)
     made: dict[tuple[Path, int], dict[int, pl.DataFrame]] = {case: {} for case in waiting}
@@ -294,7 +313,7 @@ def _told(cases: Sequence[Case]) -> list[str]:
     return names
 
 
-def _in_gallery(cases: list[Case]) -> set[int]:
+def gallery_cases(cases: list[Case]) -> set[int]:
     """Choose the cases whose first realisation is kept: evenly spaced ones, and the published protocol's defaults."""
     count = min(GALLERY_ITEMS, len(cases))
     chosen = set(np.linspace(0, len(cases) - 1, count).round().astype(int).tolist())
@@ -341,8 +360,8 @@ def _prepare(folder: Path, digest: str) -> None:
     try:
         if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
             # Results of an earlier run stay until the new ones replace them.
-            _remove(parts)
-            _remove(folder / "gallery")
+            remove_folder(parts)
+            remove_folder(folder / "gallery")
         parts.mkdir(parents=True, exist_ok=True)
         (folder / "gallery").mkdir(exist_ok=True)
         write_json(record, digest)
@@ -354,7 +373,7 @@ def _told_digest(record: Path) -> str:
     return record.read_text(encoding="utf-8", errors="replace").strip().strip('"')
 
 
-def _check_folder(folder: Path) -> None:
+def check_folder(folder: Path) -> None:
     """Raise `InputError` if a folder holds something other than a run; remove what a killed run was writing."""
     try:
         if folder.exists() and not folder.is_dir():
@@ -369,7 +388,8 @@ def _check_folder(folder: Path) -> None:
         raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
     # What is no part of a run.
     held.pop(LOCK, None)
-    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html", PARTS}
+    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html"}
+    own |= {PARTS, EXPORT, EXPORTING}
     strangers = sorted(held.keys() - own)
     # Folders of those names alone may be anyone's, and a run would replace them.
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
@@ -385,7 +405,7 @@ def _part_file(parts: Path, index: int) -> Path:
     return parts / f"case-{index:05d}.parquet"
 
 
-def _remove(folder: Path) -> None:
+def remove_folder(folder: Path) -> None:
     """Remove a folder of plain files that a run has made."""
     if folder.is_dir():
         for file in folder.iterdir():

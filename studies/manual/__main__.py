@@ -4,7 +4,8 @@
     python -m studies.manual links build/manual         dead links of the built site
     python -m studies.manual stale [PAGE...]            commands and Python that cannot work any more
     python -m studies.manual commands [PAGE...] [--quick] [--timeout S] [--log FILE]
-                                                        run every `sh` and `python` block, page by page
+                                                        run every `sh` and `python` block, page by page, and compare
+                                                        what they print with what the page shows
 
 Each exits with 1 where something is wrong, and names it.
 """

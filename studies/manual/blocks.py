@@ -1,7 +1,8 @@
 """The code blocks of the manual's pages, read as they stand.
 
 Convention: an `sh` or `python` block runs as written from the checkout's root, in the page's order; a `console` block,
-or one below the line `<!-- own files -->`, needs files of the reader's and is not run.
+or one below the line `<!-- own files -->`, needs files of the reader's and is not run. A `text` block may show what
+was printed: `studies.manual.outputs`.
 """
 
 import re
@@ -32,6 +33,8 @@ class Block:
         What it holds.
     runs : bool
         Whether it runs as written.
+    above : str
+        What stands between the block before it and this one.
     """
 
     page: Path
@@ -39,6 +42,7 @@ class Block:
     language: str
     code: str
     runs: bool
+    above: str = ""
 
     @property
     def place(self) -> str:
@@ -72,7 +76,7 @@ def blocks_of(path: Path) -> Iterator[Block]:
     """Yield the blocks of a page, fenced and indented."""
     page = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
     lines = path.read_text(encoding="utf-8").splitlines()
-    number = 0
+    number = ended = 0
     own = False
     while number < len(lines):
         line = lines[number]
@@ -82,13 +86,17 @@ def blocks_of(path: Path) -> Iterator[Block]:
             end = next((k for k in range(number + 1, len(lines)) if closing.match(lines[k])), len(lines))
             code = [text[len(fence["indent"]) :] for text in lines[number + 1 : end]]
             language = fence["info"].strip().partition(" ")[0]
-            yield Block(page, number + 2, language, "\n".join(code), language in ("sh", "python") and not own)
-            number, own = end + 1, False
+            runs = language in ("sh", "python") and not own
+            yield Block(page, number + 2, language, "\n".join(code), runs, "\n".join(lines[ended:number]))
+            number = ended = end + 1
+            own = False
         elif line.startswith("    ") and (number == 0 or not lines[number - 1].strip()) and COMMAND.match(line[4:]):
             end = next((k for k in range(number, len(lines)) if lines[k].strip() and lines[k][:4].strip()), len(lines))
             code = [text[4:] for text in lines[number:end]]
-            yield Block(page, number + 1, "indented", "\n".join(code).rstrip(), not own)
-            number, own = end, False
+            above = "\n".join(lines[ended:number])
+            yield Block(page, number + 1, "indented", "\n".join(code).rstrip(), not own, above)
+            number = ended = end
+            own = False
         else:
             own = line.strip() == OWN_FILES or (own and not line.strip())
             number += 1

@@ -1,4 +1,7 @@
-"""Run the manual's blocks as a reader would: page by page, in order, in a copy of the checkout."""
+"""Run the manual's blocks as a reader would: page by page, in order, in a copy of the checkout.
+
+Where a page shows a block's output, what is printed must be as shown (`studies.manual.outputs`).
+"""
 
 import json
 import os
@@ -16,6 +19,7 @@ from pathlib import Path
 from typing import TextIO
 
 from studies.manual.blocks import ROOT, Block, blocks_of, manual_pages
+from studies.manual.outputs import Shown, difference, with_outputs
 
 SLOW = ("simtest nightly", "simtest validate", "simtest fit", "simtest realism", "simtest dataset endoscopy",
         "simtest dataset learning", "simtest dataset smooth", "-m studies.", "-m benchmarks")  # fmt: skip
@@ -23,6 +27,9 @@ SLOW = ("simtest nightly", "simtest validate", "simtest fit", "simtest realism",
 
 NEVER = ("make ", "pip install", "docker ", "apptainer ", "crontab", "systemctl", "git clone", "-m venv", "activate")
 """What installs something, or changes the machine: run by CI's own steps, or by nobody."""
+
+WIDTH = "200"
+"""Columns of the terminal, so that no table is squeezed."""
 
 NAMESPACE = """
 import json, sys, traceback
@@ -40,12 +47,12 @@ for line in sys.stdin:
 
 
 def run_pages(pages: list[Path] | None, quick: bool, timeout_s: float, log: Path | None) -> int:
-    """Run all blocks of the pages; print a line for each, and return 1 if one failed."""
+    """Run all blocks of the pages; print a line for each, and return 1 if one failed or printed something else."""
     failed = 0
     with ExitStack() as stack:
         output = stack.enter_context(log.open("w", encoding="utf-8")) if log else None
         for page in pages or manual_pages():
-            blocks = [block for block in blocks_of(page) if block.runs]
+            blocks = list(with_outputs(list(blocks_of(page))))
             if blocks:
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="manual-")))
                 failed += _run_page(blocks, scratch, quick, timeout_s, output)
@@ -53,17 +60,22 @@ def run_pages(pages: list[Path] | None, quick: bool, timeout_s: float, log: Path
     return 1 if failed else 0
 
 
-def _run_page(blocks: list[Block], scratch: Path, quick: bool, timeout_s: float, log: TextIO | None) -> int:
-    """Run the blocks of a page in a copy of the checkout; return how many failed."""
+def _run_page(
+    blocks: list[tuple[Block, Shown | None]], scratch: Path, quick: bool, timeout_s: float, log: TextIO | None
+) -> int:
+    """Run the blocks of a page in a copy of the checkout; return how many failed or printed something else."""
     _copy_checkout(scratch)
     failed = 0
     unmade: list[str] = []
     with _Python(scratch) as python:
-        for block in blocks:
+        for block, shown in blocks:
+            printed = ""
+            complete = True
             for command in _pieces(block):
                 # What needs a result that was left out is left out too.
                 if any(word in command for word in NEVER + (SLOW if quick else ())) or reads(command, unmade):
                     unmade += outputs_of(command)
+                    complete = False
                     _tell(f"{'left out':>8}         {block.place}: {_first(command)}", log)
                     continue
                 started = time.monotonic()
@@ -71,12 +83,25 @@ def _run_page(blocks: list[Block], scratch: Path, quick: bool, timeout_s: float,
                 ok, text = run(command, scratch, timeout_s)
                 spent = time.monotonic() - started
                 failed += not ok
+                complete = complete and ok
+                printed += text
                 _tell(f"{'ok' if ok else 'FAILED':>8} {spent:6.1f} s {block.place}: {_first(command)}", log)
                 if log:
                     log.write(f"{command}\n{text}\n")
                 elif not ok:
                     print(text[-2000:])
+            if shown and complete:
+                failed += not _is_as_shown(shown, printed, log)
     return failed
+
+
+def _is_as_shown(shown: Shown, printed: str, log: TextIO | None) -> bool:
+    """Return whether a block printed what the page shows; tell how not."""
+    found = difference(shown, printed)
+    _tell(f"{'ok' if found is None else 'FAILED':>8}          {shown.block.place}: output as shown", log)
+    if found is not None:
+        _tell(found, log)
+    return found is None
 
 
 def _pieces(block: Block) -> Iterator[str]:
@@ -111,7 +136,7 @@ def _copy_checkout(scratch: Path) -> None:
 
 def _environment(scratch: Path) -> dict[str, str]:
     programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    return {**os.environ, "PATH": programs, "PYTHONPATH": str(scratch)}
+    return {**os.environ, "PATH": programs, "PYTHONPATH": str(scratch), "COLUMNS": WIDTH}
 
 
 def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import simtest
 from simtest.calibration import CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.reconstruction.assumptions import FOCAL_SD, NEAR_MISSES, assumptions, calibration_of_view
-from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
+from simtest.reconstruction.picture import BORDERED, Options, read_calibration, reconstruct_values
 from simtest.reconstruction.ranking import best_of, stated_errors
 from simtest.runtime.files import write_json
 from simtest.spec import load_calibration
@@ -89,6 +90,35 @@ def test_a_field_of_view_alone_leaves_all_of_it_open():
     assert "response" not in {each.what for each in assumptions(calibration, "linear", "fine")}
 
 
+@pytest.mark.parametrize(("across", "corner"), [("width", (100, 0)), ("height", (0, 80)), ("diagonal", (100, 80))])
+def test_a_field_of_view_spans_what_it_is_told_to_span(across, corner):
+    camera = calibration_of_view(70.0, 200, 160, across).camera
+    ends = camera.unproject(np.add((100.0, 80.0), [corner, np.negative(corner)]))
+    assert np.degrees(np.arccos(ends[0] @ ends[1])) == pytest.approx(70.0)
+    assert camera.fx == camera.fy
+
+
+def test_a_field_of_view_is_told_with_its_extent(tmp_path):
+    with pytest.raises(InputError, match="--fov-of depth: must be one of width, height, diagonal"):
+        calibration_of_view(70.0, 200, 160, "depth")
+    assert calibration_of_view(175.0, 200, 10, "height").camera.width == 200
+    picture = np.zeros((160, 200), np.float32)
+    _, (told,) = read_calibration(Options(fov_deg=70.0, fov_of="diagonal"), picture)
+    assert "70 deg across the picture's diagonal" in told
+
+
+def test_dark_borders_are_told_where_the_field_of_view_alone_is_known():
+    y, x = np.mgrid[:160, :200]
+    inside = np.hypot(x - 100, y - 80) < 70
+    picture = np.repeat(spot()[..., None], 3, axis=2) * [0.5, 0.3, 0.25] + [0.4, 0.2, 0.15]
+    round_view = np.where(inside[..., None], picture, 0.0).clip(0, 1).astype(np.float32)
+    options = Options(fov_deg=70.0)
+    calibration, _ = read_calibration(options, round_view)
+    assert BORDERED in reconstruct_values("a", round_view, calibration, options).warnings
+    whole = picture.clip(0, 1).astype(np.float32)
+    assert BORDERED not in reconstruct_values("a", whole, calibration, options).warnings
+
+
 def test_a_full_calibration_leaves_nothing_open(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text(
@@ -161,3 +191,27 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
     with pytest.raises(InputError, match="--target top"):
         Options(fov_deg=53.0, target="top")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("distance_mm", [30.0, 60.0, 80.0])
+@pytest.mark.parametrize("surface", ["plane", "cylinder"])
+def test_the_best_without_a_distance_errs_least_at_every_working_distance(surface, distance_mm):
+    """Lights told, distance not: the named estimator is measured best too, near and far."""
+    settings = {
+        "surface.distance_mm": distance_mm, "surface.tilt_deg": 14.0, "sensor.noise_sigma": 0.03, "sensor.seed": 9071,
+        "rig.lights.0.offset_mm": 4.0, "rig.lights.0.azimuth_deg": 205.0,
+    }  # fmt: skip
+    frame = simtest.render(surface, settings)
+    calibration = frame.calibration
+    assert calibration.priors.lights_mm
+    assert calibration.priors.distance_mm is None
+    (found,) = simtest.reconstruct(
+        frame.image, calibration, estimators=["bisector", "curved", "cone_axis", "brightest_point"]
+    )
+    true = frame.highlights[0].normal
+    errors = {name: np.degrees(np.arccos(min(1.0, each.normal @ true))) for name, each in found.estimates.items()}
+    best, _ = best_of(found.estimates)
+    assert best == min(errors, key=errors.get)
+    # And it says how far it may be off.
+    assert errors[best] <= 2.5 * np.degrees(np.sqrt(np.trace(found.estimates[best].covariance)))

@@ -33,7 +33,7 @@ def test_the_glossary_has_all_budget_parts_estimators_and_where_kinds_are_listed
     names = [*PARTS, *project["entry-points"]["simtest.estimators"]]
     assert [name for name in names if f"`{name}`" not in GLOSSARY] == []
     detection = (CONCEPTS / "detection.md").read_text(encoding="utf-8")
-    assert [kind.value for kind in Kind if f"| {kind.value} |" not in detection] == []
+    assert [kind.value for kind in Kind if f"\n| {kind.value} " not in detection] == []
 
 
 def test_every_term_of_the_glossary_stands_once() -> None:

@@ -163,6 +163,16 @@ def test_a_surface_with_relief_is_named_by_its_base(base, surface):
         # One in 18 refused: 5.6 % of 90 deg alone are 5 deg.
         ({"a": [*noisy(1.0, 17, spread=0.001), None]}, "nowhere here (worst: 1°)", False),
         ({"a": [None, "missed"]}, "no method answered", True),
+        (
+            {"a": [*noisy(1.0, 4, spread=0.001), "missed", "missed"]},
+            "33 % of the highlights have no answer (2 missed); else nowhere here (worst: 1°)",
+            False,
+        ),
+        (
+            {"a": [*noisy(1.0, 6, spread=0.001), "missed", None]},
+            "25 % of the highlights have no answer (1 missed, 1 refused); else nowhere here (worst: 1°)",
+            False,
+        ),
     ],
 )
 def test_where_the_best_method_breaks(errors, said, is_broken):
@@ -377,6 +387,30 @@ def test_the_terminal_shows_a_summary_within_80_columns_and_plain_where_nobody_l
         "light at the camera", "light beside the camera (ε/d up to 0.1)", "light beside the camera (ε/d above 0.1)"
     ]  # fmt: skip
     assert "\x1b[1m" in printed(run, 120, terminal=True)
+
+
+def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_terminal(tmp_path):
+    parts = [
+        rows_of("cone_axis", noisy(0.1, spread=0.01), "a"), rows_of("mine", [*noisy(7.0, 18), None, "missed"], "a"),
+        rows_of("cone_axis", noisy(0.1, spread=0.01), "b", **TUBE),
+        rows_of("mine", noisy(0.1, spread=0.01), "b", **TUBE),
+        rows_of("cone_axis", noisy(2.0), "c", kd_min=-0.5, kd_max=0.5),
+        rows_of("mine", noisy(0.1, spread=0.01), "c", kd_min=-0.5, kd_max=0.5),
+    ]  # fmt: skip
+    run = make_run(tmp_path, "noise", [row for part in parts for row in part], items=0)
+    flat, tube, saddle = guide_rows(read_run(run).guide)
+    (worse,), (tied,) = flat.guests, tube.guests
+    assert (worse.estimator, worse.standing, worse.answered) == ("mine", "not best", "18 of 20")
+    assert (worse.unanswered, worse.is_broken) == ("1 missed, 1 refused", True)
+    assert worse.breaks.startswith("here: mean 7")
+    assert (tied.estimator, tied.standing, tied.is_broken) == ("mine", "tied", False)
+    # The best one has the situation's own line.
+    assert (saddle.best, saddle.guests) == ("mine", ())
+    text = printed(run, 80, terminal=False)
+    assert text.count("mine") == 4  # one of them among those tied
+    assert "(not best)" in text
+    page = (run / "index.html").read_text(encoding="utf-8")
+    assert page.count('class="guest"') == 2
 
 
 def test_a_run_without_true_highlights_says_so(tmp_path):

@@ -1,4 +1,4 @@
-"""Run, nightly, realism and picture pages in a real browser: nothing overflows, phones get short pages, axe is content.
+"""Run, nightly, realism, picture and 3D pages in a real browser: nothing overflows or is overprinted, axe is content.
 
 axe-core comes with the package axe-playwright-python (extra ci), which bundles axe.min.js.
 """
@@ -23,6 +23,8 @@ from simtest.realism.comparison import compare
 from simtest.realism.page import write_comparison
 from simtest.reconstruction.picture import Options
 from simtest.report import write_report
+from simtest.report.view3d import grid_triangles
+from simtest.report.viewer import Content, write_scene_page
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
 CHROMIUM = next(
@@ -34,7 +36,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
 ]
 
-PAGES = ("run", "nightly", "realism", "picture")
+PAGES = ("run", "nightly", "realism", "picture", "view")
 WIDTHS = (1400, 1000, 390)
 SCHEMES = ("light", "dark")
 PHONE_HEIGHT = 844
@@ -48,7 +50,7 @@ OVERFLOWS = """() => {
   for (const part of document.body.querySelectorAll("*")) {
     const box = part.getBoundingClientRect();
     if (!box.width || !box.height || part.closest("svg, .js-plotly-plot, .skip")) continue;
-    const frame = part.parentElement.closest(".scroll, .strip, [data-scrolls]");
+    const frame = part.parentElement.closest(".scroll, [data-scrolls]");
     if (frame) continue;
     const style = getComputedStyle(part), name = part.tagName + "." + part.className;
     if (box.right > width + 1 || box.left < -1) found.push(`${name}: ${box.left} to ${box.right} of ${width}`);
@@ -59,12 +61,29 @@ OVERFLOWS = """() => {
   return found;
 }"""
 
-# A box that scrolls sideways says so, but for a strip of pictures.
+# A box that scrolls says so, and where to.
 SILENT = """() => [...document.querySelectorAll(".scroll")].filter(box => {
   const hint = box.previousElementSibling;
-  const wide = box.getClientRects().length && box.scrollWidth > box.clientWidth + 1;
-  return wide && !(hint?.classList.contains("hint") && !hint.hidden);
+  const ways = [[box.scrollWidth > box.clientWidth + 1, "sideways"], [box.scrollHeight > box.clientHeight + 1, "down"]];
+  const told = hint?.classList.contains("hint") && !hint.hidden ? hint.textContent : "";
+  return box.getClientRects().length && ways.some(([cut, way]) => cut && !told.includes(way));
 }).map(box => box.getAttribute("aria-label"))"""
+
+# Texts at the ticks of a chart's axis that lie on each other, by more than the blank rim of their boxes.
+OVERPRINTS = """() => {
+  const found = [];
+  for (const axis of document.querySelectorAll(".xaxislayer-above, .yaxislayer-above")) {
+    const texts = [...axis.querySelectorAll("text")].filter(text => text.textContent.trim());
+    const boxes = texts.map(text => text.getBoundingClientRect());
+    for (let i = 0; i < boxes.length; i++) for (let j = 0; j < i; j++) {
+      const [a, b] = [boxes[i], boxes[j]];
+      const across = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+      const down = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+      if (across > 1 && down > 3) found.push(`${texts[i].textContent} on ${texts[j].textContent}`);
+    }
+  }
+  return found;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +97,23 @@ def pages(tmp_path_factory):
     made["nightly"] = write_nightly_page(folder / "nightly", judged)
     made["realism"] = write_comparison(compare(frames(5), frames(5, first=9)), folder / "realism", "plain")
     made["picture"] = picture_page(folder)
+    made["view"] = view_page(folder / "view.html")
     return made
+
+
+def view_page(path: Path) -> Path:
+    """The page in 3D of a dome with one true normal and those of two estimators."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 12), np.linspace(-4, 4, 12))
+    vertices = np.stack([x, y, 12 + 0.05 * (x**2 + y**2)], axis=-1)
+    at, tip = np.array([[0.0, 0.0, 12.0]]), np.array([[0.0, 0.0, 9.0]])
+    names = ("camera", "true normal", "cone_axis", "another_package_with_a_long_name")
+    points, none = vertices.reshape(-1, 3), np.empty((0, 3))
+    content = Content(
+        points, grid_triangles(vertices, 2.0), np.full(len(points), 0.1), none, none, np.full_like(points, 0.5),
+        np.zeros((1, 3)), np.array(names), np.repeat(at, 4, axis=0), np.concatenate([tip, tip, tip, tip + 0.2]),
+    )  # fmt: skip
+    write_scene_page(content, path, "a_scene_with_a_long_name")
+    return path
 
 
 def picture_page(folder: Path) -> Path:
@@ -128,13 +163,15 @@ def open_all(page):
         box.locator(".main-svg, canvas, img").first.wait_for()
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", PAGES)
-def test_nothing_overflows(opened, name, width):
-    page = opened(name, width)
+def test_nothing_overflows(opened, name, width, scheme):
+    page = opened(name, width, scheme)
     assert page.evaluate(OVERFLOWS) == []
     open_all(page)
     assert page.evaluate(OVERFLOWS) == []
+    assert page.evaluate(OVERPRINTS) == []
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert page.evaluate(SILENT) == []
 
@@ -196,3 +233,13 @@ def test_paper_shows_what_is_folded_and_folds_it_again(opened):
 
 def test_the_run_page_is_small(pages):
     assert pages["run"].stat().st_size <= 1_500_000
+
+
+def test_the_overprint_check_sees_a_planted_fault(opened):
+    page = opened("realism", 1400)
+    open_all(page)
+    page.evaluate("""() => {
+      const [one, other] = document.querySelectorAll(".yaxislayer-above text");
+      other.setAttribute("transform", one.getAttribute("transform"));
+    }""")
+    assert page.evaluate(OVERPRINTS) != []

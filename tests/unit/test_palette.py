@@ -1,6 +1,8 @@
 """The palette: its colours stay apart for observers who lack a cone, and stand out on the pages' grounds."""
 
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,7 +60,18 @@ def test_the_metric_finds_what_it_is_for():
 
 @pytest.mark.parametrize("ground", palette.GROUNDS)
 def test_colours_stand_out_on_light_and_dark(ground):
-    assert min(contrast(colour, ground) for colour in [*palette.SERIES, palette.NEUTRAL]) >= 2.3
+    told = {colour: contrast(colour, ground) for colour in [*palette.SERIES, palette.NEUTRAL, *palette.FURTHER]}
+    assert min(told.values()) >= palette.LEAST_CONTRAST, min(told, key=told.get)
+
+
+def test_the_grounds_are_those_of_the_pages():
+    """And contrast is WCAG's: black on white is 21, and a grey of 119 is the lightest that has 4.5 on white."""
+    sheet = (Path(style.__file__).parent / "templates" / "base.css.j2").read_text(encoding="utf-8")
+    grounds = re.findall(r"--bg: (#[0-9a-f]+);", sheet)[:2]
+    assert grounds == ["#fff", palette.GROUNDS[1]]
+    assert palette.rgb(palette.GROUNDS[0]) == (255, 255, 255)
+    assert contrast("#000000", "#ffffff") == pytest.approx(21)
+    assert contrast("#777777", "#ffffff") < 4.5 < contrast("#767676", "#ffffff")
 
 
 def test_every_installed_estimator_of_this_package_has_a_colour_of_its_own():
@@ -68,5 +81,5 @@ def test_every_installed_estimator_of_this_package_has_a_colour_of_its_own():
 
 def test_other_names_take_further_colours_in_the_order_of_the_alphabet():
     made = palette.colours(["zeta", "cone_axis", "alpha"])
-    assert made == {"zeta": palette.FURTHER[1], "cone_axis": "#15628C", "alpha": palette.FURTHER[0]}
+    assert made == {"zeta": palette.FURTHER[1], "cone_axis": "#166B90", "alpha": palette.FURTHER[0]}
     assert style.colours is palette.colours

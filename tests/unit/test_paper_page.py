@@ -22,7 +22,7 @@ from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from tests.isocurve_formulas import cosine_beta
 
-COLOURS = {"circle_pose": "#CA5C12", "cone_axis": "#15628C"}
+COLOURS = {"circle_pose": "#B15912", "cone_axis": "#166B90"}
 
 MEANS = {
     "sigma": {0.0: 0.2, 0.05: 0.4, 0.1: 0.8},

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Uniform
-from simtest.detection.blobs import Kind
+from simtest.cli.reconstruct import _print_assumed, _print_counts
+from simtest.detection.blobs import Highlight, Kind
+from simtest.detection.regions import Region
 from simtest.detection.view_mask import View
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import PARTS
@@ -18,6 +20,7 @@ from simtest.estimators.cloud_shape import CloudShape, Slope
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera
 from simtest.reconstruction import explanations
+from simtest.reconstruction.assumptions import LIGHT_AT_CAMERA, assumptions, calibration_of_view
 from simtest.reconstruction.description import Drawing, PictureRecord, SpecularityRecord, members
 from simtest.reconstruction.overlay import ISOPHOTE, draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
@@ -115,6 +118,50 @@ def test_a_picture_without_highlights_has_a_page(tmp_path):
     text, data = page_of([], tmp_path)
     assert data["spots"] == []
     assert "No highlight was found" in text
+
+
+def left_out(kind, at):
+    edge = np.array(RING) + at
+    region = Region((at[0] - 5, at[1] - 5, 10, 10), np.array(at), 0.5)
+    return Highlight(region, kind, 0.2, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
+
+
+def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path, capsys):
+    others = [left_out(Kind.SMALL, (40, 40)), left_out(Kind.BORDER, (80, 40)), left_out(Kind.BORDER, (90, 60))]
+    spots = [*many(2), spot(2, (50, 90), {"cone_axis": Failure(Reason.CLUSTER, "two")}, None)]
+    assumed = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
+    record = replace(record_of(spots), other_highlights=others, assumed=assumed)
+    write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "2 of 3 highlights have a normal" in page
+    assert "3 more were found and left out" in page
+    assert "(2 border, 1 few pixels)" in page
+    assert LIGHT_AT_CAMERA in page
+    _print_assumed(record.assumed)
+    _print_counts(record, Path("frame.png"))
+    said = capsys.readouterr().out
+    assert said.startswith(f"note: {LIGHT_AT_CAMERA}\n")
+    assert "3 specularities found in frame.png, 2 with a normal\n" in said
+    assert "3 more highlights found and left out" in said
+    assert "2 border, 1 few pixels" in said
+    # Where the light is told, or all have a normal, there is nothing to say.
+    _print_assumed(assumed[1:])
+    _print_counts(record_of(many(2)), Path("frame.png"))
+    said = capsys.readouterr().out
+    assert LIGHT_AT_CAMERA not in said
+    assert "2 specularities found in frame.png\n" in said
+
+
+def test_a_kind_that_is_named_as_a_flag_has_another_name_for_people(tmp_path):
+    _, data = page_of([replace(each, kind="small") for each in many(1)], tmp_path)
+    name = data["spots"][0]["kind"]
+    assert name == "few pixels"
+    assert data["words"]["kinds"][name] == explanations.KINDS["small"]
+    shown = {explanations.kind_name(str(kind)) for kind in Kind}
+    assert not shown & set(explanations.FLAGS)
+    assert len(shown) == len(Kind)
+    assert set(explanations.KIND_NAMES) <= set(explanations.KINDS)
+    assert explanations.kind_name(None) == ""
 
 
 def test_the_overlay_draws_the_best_estimate_alone():

@@ -8,6 +8,7 @@ from rich import progress as rich
 
 from simtest.cli import progress
 from simtest.cli.progress import progress_bar
+from simtest.cli.remaining import LEAST_STEPS, Remaining
 from simtest.validation.runner import _told as told
 
 
@@ -82,6 +83,78 @@ def test_a_stop_waits_for_the_next_step(bars):
         stopped_between_steps()
     assert not bars[0].live.is_started
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def times_left(ends, total, start=0):
+    """What is said at the end of each step by a clock that shows the given times."""
+    remaining = Remaining()
+    assert remaining.seconds(start, total, 0.0) is None
+    return [remaining.seconds(done, total, now) for done, now in enumerate(ends, start + 1)]
+
+
+def test_the_first_step_is_no_measure_of_the_others():
+    # 40 s to compile, then 0.5 s a frame: extrapolated, 100 frames would take over an hour.
+    ends = [40 + 0.5 * i for i in range(100)]
+    said = times_left(ends, 100)
+    assert said[:LEAST_STEPS] == [None] * LEAST_STEPS
+    told = [(i, left) for i, left in enumerate(said) if left is not None]
+    assert told[0][0] <= 6
+    for i, left in told:
+        assert left == pytest.approx(ends[-1] - ends[i], abs=0.51)
+
+
+def test_a_run_that_goes_on_measures_its_own_frames_alone():
+    said = times_left([30 + float(i) for i in range(20)], 320, start=300)
+    assert said[-1] == 0
+    assert said[9] == pytest.approx(10)
+
+
+def test_there_is_no_estimate_while_the_pace_changes():
+    # Frames of 0.1 s, then of 2 s: told again once most measured steps are of the new kind.
+    ends = [0.5 * i for i in range(20)] + [9.5 + 3.0 * (i + 1) for i in range(60)]
+    said = times_left(ends, 80)
+    assert said[15] is not None
+    assert said[30] is None
+    later = [(i, left) for i, left in enumerate(said[45:-1], 45) if left is not None]
+    assert later
+    for i, left in later:
+        assert left == pytest.approx(ends[-1] - ends[i], rel=0.35)
+
+
+def test_a_stretch_of_work_is_measured_by_itself():
+    remaining = Remaining()
+    first = [remaining.seconds(done, 6, float(done)) for done in range(7)]
+    assert first[5] == pytest.approx(1.0)
+    second = [remaining.seconds(done, 8, 100.0 + 10 * done) for done in range(9)]
+    assert second[:5] == [None] * 5
+    assert second[6] == pytest.approx(20.0)
+
+
+def test_bar_and_lines_tell_the_time_left_once_it_is_known(bars, monkeypatch, capsys):
+    seconds = [0.0]
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
+
+    def fields():
+        said = []
+        with progress_bar() as move:
+            for done in range(21):
+                # The first step takes 60 s, the others 5 s.
+                seconds[0] = 0.0 if done == 0 else 55.0 + 5.0 * done
+                move(done, 20, "plane")
+                said.append(bars[-1].tasks[0].fields["left"] if bars else "")
+        return said
+
+    said = fields()
+    assert set(said[:5]) == {""}
+    assert said[6] == "about 0:01:10 left"
+    assert said[20] == ""
+    bars.clear()
+    capsys.readouterr()
+    monkeypatch.setattr(progress, "at_terminal", lambda: False)
+    fields()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "simtest: 1/20 plane (60 s)"
+    assert "simtest: 7/20 plane (90 s, about 65 s left)" in lines
 
 
 def test_the_bar_tells_where_an_anatomy_must_be_made_first():

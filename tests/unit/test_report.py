@@ -473,7 +473,7 @@ def test_surface_without_truth_or_pixels(tmp_path):
 def test_style():
     shades = colours(["new", "cone_axis", "circle_pose", "also new"])
     assert len(set(shades.values())) == 4
-    assert shades["cone_axis"] == "#15628C"
+    assert shades["cone_axis"] == "#166B90"
     texts = [number(v) for v in (None, float("nan"), 3, 0.01234, 123456.0, 1e-5)]
     assert texts == ["–", "–", "3", "0.0123", "1.23e+05", "1.00e-05"]
     axis = Axis("x", "stretched")

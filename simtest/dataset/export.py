@@ -1,0 +1,344 @@
+"""Exports the frames of a run or a dataset for those who estimate elsewhere: pictures, cameras, priors and no truth."""
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from pydantic import TypeAdapter, ValidationError
+from typing_extensions import TypedDict
+
+from simtest.dataset.scoring.record import (
+    ExportedFrame,
+    Record,
+    Source,
+    Use,
+    image_hash,
+    source_of_dataset,
+    source_of_run,
+)
+from simtest.dataset.scoring.views import Shown, Views, views_of_cases
+from simtest.errors import InputError
+from simtest.reconstruction.picture_values import scale_picture
+from simtest.runtime import provenance
+from simtest.runtime.arrays import Image
+from simtest.runtime.engines import Engine, OnStep
+from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.locks import LOCK, exclusive_folder
+from simtest.runtime.machine_errors import write_error
+from simtest.runtime.resources import shown
+from simtest.simulation.camera_chain import displayed
+from simtest.simulation.frame_files import encoded_png
+from simtest.spec import Experiment, calibration_toml, camera_table
+from simtest.spec.sensor import Sensor
+from simtest.validation.cases import expand
+from simtest.validation.matching import peak_px
+from simtest.validation.runner import EXPORTING, Progress
+
+FRAMES, PREVIEWS, CAMERAS = "frames", "previews", "cameras"
+TABLES = {
+    "frames.csv": ("frame", "file", "preview", "width", "height", "channels", "camera"),
+    "highlights.csv": (
+        "frame", "specularity", "peak_x_px", "peak_y_px", "box_x_px", "box_y_px", "box_width_px", "box_height_px",
+    ),
+}  # fmt: skip
+README = "README.md"
+NAME_DIGITS = 16
+
+
+class Detected(TypedDict):
+    """A detection: its peak, px, and its box: column, row, width, height."""
+
+    peak_px: tuple[float, float]
+    box: tuple[int, int, int, int]
+
+
+class Exported(TypedDict):
+    """A frame that has been written, and what it shows."""
+
+    frame: str
+    sha256: str
+    file: str
+    width: int
+    height: int
+    channels: int
+    camera: str
+    table: dict[str, Any]
+    detections: list[Detected]
+    case: int
+    setting: str
+    realisation: int
+
+
+_EXPORTED = TypeAdapter(list[Exported])
+
+
+@dataclass(frozen=True)
+class ExportPart:
+    """Frames that one task writes into the folder `out`; `kept` is the file that it lists them in."""
+
+    views: Views
+    out: Path
+    kept: Path
+
+
+def check_exportable(experiment: Experiment) -> None:
+    """Raise `InputError` where an experiment renders no frames: before it is run."""
+    views_of_cases(experiment, expand(experiment), "")
+
+
+def export_run(
+    folder: Path, experiment: Experiment, out: Path, engine: Engine, progress: Progress | None = None
+) -> Path:
+    """Export the frames of a finished run.
+
+    Parameters
+    ----------
+    folder : Path
+        The run's; export.json is written there.
+    experiment : Experiment
+        What was run.
+    out : Path
+        Folder of the export: empty, new or that of an earlier export.
+    engine : Engine
+        Runs the tasks; the files do not depend on it.
+    progress : callable, optional
+        Called with frames done, frames in all, and what is being done.
+
+    Returns
+    -------
+    Path
+        README.md of the export.
+
+    Raises
+    ------
+    InputError
+        If the experiment renders no frames, a calibration cannot be written as a file, or the folder holds something
+        else.
+    """
+    source = source_of_run(folder, experiment, expand(experiment))
+    return _export(source, experiment.model_dump(mode="json"), out, engine, progress, "--export")
+
+
+def export_dataset(folder: Path, out: Path, engine: Engine, progress: Progress | None = None) -> Path:
+    """Export the frames of a dataset, rendered again as the sensor gives them; see `export_run`."""
+    source = source_of_dataset(folder)
+    with exclusive_folder(folder, "DATASET"):
+        return _export(source, {}, out, engine, progress, "--out")
+
+
+def _export(
+    source: Source, experiment: dict[str, Any], out: Path, engine: Engine, progress: Progress | None, option: str
+) -> Path:
+    with exclusive_folder(out, option):
+        _check_folder(out, option)
+        try:
+            made = _write_frames(source, out, engine, progress)
+            _write_tables(out, made)
+            _write_record(source, experiment, made)
+        except OSError as error:
+            raise write_error(error, out) from error
+    return out / README
+
+
+def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress | None) -> list[Exported]:
+    """Write what is missing of frames, previews and cameras; return all frames in the order of cases and realisations.
+
+    Each task lists what it has written, so that a stopped export goes on.
+    """
+    kept = source.folder / EXPORTING
+    for folder in (kept, *(out / name for name in (FRAMES, PREVIEWS, CAMERAS))):
+        folder.mkdir(parents=True, exist_ok=True)
+    origin = hashlib.sha256(f"{source.fingerprint} {source.definition} {provenance.source_hash()}".encode()).hexdigest()
+    parts = [ExportPart(views, out, kept / f"{origin[:12]}-{views.key:05d}.json") for views in source.views]
+    done = {number: made for number, part in enumerate(parts) if (made := _written(part)) is not None}
+    missing = [number for number in range(len(parts)) if number not in done]
+    total = sum(len(views) for views in source.views)
+    count = sum(map(len, done.values()))
+
+    def step() -> None:
+        nonlocal count
+        count += 1
+        if progress:
+            progress(count, total, "exporting frames")
+
+    for task, made in engine.run(write_part, [parts[number] for number in missing], step):
+        done[missing[task]] = made
+    # Lists of a stopped export of something else go too.
+    for file in kept.iterdir():
+        file.unlink()
+    kept.rmdir()
+    return [each for _, made in sorted(done.items()) for each in made]
+
+
+def _written(part: ExportPart) -> list[Exported] | None:
+    """Return the frames that a stopped export has written of a part; None where some are missing."""
+    try:
+        made = _EXPORTED.validate_json(part.kept.read_bytes())
+    except (OSError, ValidationError):
+        return None
+    files = {part.out / path for each in made for path in (each["file"], _preview_of(each), each["camera"])}
+    return made if all(file.is_file() for file in files) else None
+
+
+def _preview_of(frame: Exported) -> str:
+    return f"{PREVIEWS}/{frame['frame']}.png"
+
+
+def _write_tables(out: Path, made: Sequence[Exported]) -> None:
+    """Write frames.csv, highlights.csv and the README; remove frames of an earlier export.
+
+    Frames stand in the order of their names, which are hashes, so that the order tells nothing.
+    """
+    by_name = {each["frame"]: each for each in made}
+    frames = {name: by_name[name] for name in sorted(by_name)}
+    listed: list[Sequence[object]] = []
+    found: list[Sequence[object]] = []
+    for name, f in frames.items():
+        listed.append((name, f["file"], _preview_of(f), f["width"], f["height"], f["channels"], f["camera"]))
+        found += [(name, number, *each["peak_px"], *each["box"]) for number, each in enumerate(f["detections"])]
+    own = {path for f in frames.values() for path in (f["file"], _preview_of(f), f["camera"])}
+    for name in (FRAMES, PREVIEWS, CAMERAS):
+        for path in (out / name).iterdir():
+            if f"{name}/{path.name}" not in own:
+                path.unlink()
+    for (name, columns), rows in zip(TABLES.items(), (listed, found), strict=True):
+        _write_text(out / name, _csv(columns, rows))
+    _write_text(out / README, _readme(len(frames), len(found)))
+
+
+def _readme(frames: int, highlights: int) -> str:
+    """Return what a stranger is told: the files, and what to send back."""
+    env = Environment(
+        loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, keep_trailing_newline=True
+    )
+    text = env.get_template("export.md.j2")
+    return text.render(frames=frames, highlights=highlights, version=provenance.version())
+
+
+def _csv(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table as CSV; numbers read back as the same."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exported]) -> None:
+    frames = {
+        each["frame"]: ExportedFrame(
+            sha256=each["sha256"],
+            camera=each["camera"],
+            peaks=tuple(detected["peak_px"] for detected in each["detections"]),
+        )
+        for each in made
+    }
+    uses = tuple(
+        Use(frame=each["frame"], case=each["case"], setting=each["setting"], realisation=each["realisation"])
+        for each in made
+    )
+    Record(
+        kind=source.kind,
+        version=source.version,
+        fingerprint=source.fingerprint,
+        definition=source.definition,
+        variant=source.variant,
+        experiment=experiment,
+        cameras={each["camera"]: each["table"] for each in made},
+        frames=frames,
+        uses=uses,
+    ).write(source.folder)
+
+
+def _check_folder(out: Path, option: str) -> None:
+    """Raise `InputError` if a folder holds something that is no part of an export."""
+    try:
+        held = {path.name for path in out.iterdir()} - {LOCK}
+    except OSError as error:
+        raise InputError(f"{option} {shown(out)}: cannot be used ({error.strerror})") from error
+    strangers = sorted(held - {FRAMES, PREVIEWS, CAMERAS, README, *TABLES})
+    # Folders of those names alone may be anyone's, and an export removes what it does not list.
+    if not strangers and held and "frames.csv" not in held and {FRAMES, PREVIEWS, CAMERAS} - held:
+        strangers = sorted(held)
+    if strangers:
+        what = f"holds {shown(strangers[0])}, which is no part of an export"
+        raise InputError(f"{option} {shown(out)}: {what}; must be empty or hold an export")
+
+
+# In a worker --------------------------------------------------------------------------------------------------------
+
+
+def write_part(part: ExportPart, on_step: OnStep) -> list[Exported]:
+    """Write the frames of a part, each with its preview and camera; call `on_step` after each."""
+    made = []
+    for each in part.views:
+        made.append(_write_frame(each, part.out))
+        on_step()
+    write_json(part.kept, made, compact=True)
+    return made
+
+
+def _write_frame(each: Shown, out: Path) -> Exported:
+    """Write a frame, its preview and its camera."""
+    image, sensor, told = each.image, each.view.scene.sensor, each.view.calibration
+    calibration = calibration_toml(told)
+    name, camera = frame_name(image, calibration, each.isolated), _camera_name(calibration)
+    file, data = _encoded(name, image, sensor)
+    ok, small = cv2.imencode(".png", np.rint(displayed(image, sensor)[:, :, ::-1] * 255).astype(np.uint8))
+    assert ok
+    write_atomically(out / file, lambda part: part.write_bytes(data))
+    write_atomically(out / PREVIEWS / f"{name}.png", lambda part: part.write_bytes(bytes(small)))
+    _write_text(out / camera, calibration)
+    detections: list[Detected] = []
+    for found in each.detections():
+        x, y = peak_px(found).tolist()
+        left, top, width, height = found.region.box
+        detections.append({"peak_px": (x, y), "box": (int(left), int(top), int(width), int(height))})
+    height, width = image.shape[:2]
+    return {
+        "frame": name, "sha256": image_hash(image), "file": file, "width": width, "height": height,
+        "channels": 1 if image.ndim == 2 else image.shape[2], "camera": camera,
+        "table": json.loads(json.dumps(camera_table(told.camera))), "detections": detections,
+        "case": each.case, "setting": each.setting, "realisation": each.number,
+    }  # fmt: skip
+
+
+def frame_name(image: Image, calibration: str, isolated: bool) -> str:
+    """Return the name of a frame: a hash of all that an estimator sees of it, so that it tells nothing else.
+
+    Realisations that look the same to an estimator share one frame.
+    """
+    seen = f"{image_hash(image)} {calibration} {isolated}"
+    # No row of digits alone, which a program that reads a table would take for a number.
+    return "f" + hashlib.sha256(seen.encode()).hexdigest()[:NAME_DIGITS]
+
+
+def _camera_name(calibration: str) -> str:
+    return f"{CAMERAS}/c{hashlib.sha256(calibration.encode()).hexdigest()[:NAME_DIGITS]}.toml"
+
+
+def _encoded(name: str, image: Image, sensor: Sensor) -> tuple[str, bytes]:
+    """Return the file of a frame and its content: PNG where it holds the very values, else NPY of float32."""
+    if sensor.encodes:
+        data = encoded_png(image, sensor)
+        read = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        values = None if read is None else scale_picture(read, name)
+        if values is not None:
+            values = values if values.ndim == 2 else values[:, :, ::-1]
+            if image_hash(values) == image_hash(image):
+                return f"{FRAMES}/{name}.png", data
+    content = io.BytesIO()
+    np.save(content, np.ascontiguousarray(image, dtype="<f4"), allow_pickle=False)
+    return f"{FRAMES}/{name}.npy", content.getvalue()
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

@@ -1,0 +1,231 @@
+"""Whatever a core does is a Failure that is counted or one line, and leaves neither a process nor a folder."""
+
+import tempfile
+
+import numpy as np
+import pytest
+
+from simtest.calibration import NO_PRIORS, Calibration, Frame
+from simtest.errors import Failure, Reason
+from simtest.estimators import Estimate
+from simtest.estimators.dispatch import run, run_in_frame
+from simtest.estimators.process.core import MAX_FAULTS, Core
+from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
+from simtest.estimators.process.wire import CoreFault
+from tests.unit.core_helpers import CAMERA, PATCH, bad_command, processes_with, wait_until
+
+SHORT_S = 0.3
+
+TRANSPORT = [
+    ("kill", "core_died", "ended by SIGKILL"),
+    ("segfault", "core_died", "ended by SIGSEGV"),
+    ("exit", "core_died", "exit code 3; its last words: no licence for this highlight"),
+    ("exit_after_hello", "core_died", "exit code 5"),
+    ("grandchild", "core_died", "exit code 0"),
+    ("hang", "core_timeout", "no answer within"),
+    ("ignores_term", "core_timeout", "no answer within"),
+    ("reads_nothing", "core_timeout", "no answer within"),
+    ("half_line", "core_timeout", "begun (25 bytes)"),
+    ("half_array", "core_timeout", "begun (5 bytes)"),
+    ("late", "core_timeout", "no answer within"),
+    ("closes_stdin", "core_protocol", "closed its standard input but did not end"),
+    ("closes_stdout", "core_protocol", "closed its standard output but did not end"),
+    ("flood", "core_protocol", "a line longer than 1048576 bytes"),
+    ("garbage_text", "core_protocol", "no JSON: normal: 0 0 1"),
+    ("garbage_json", "core_protocol", "no JSON"),
+    ("binary", "core_protocol", "no JSON"),
+    ("deep", "core_protocol", "no JSON"),
+    ("list", "core_protocol", "no JSON object"),
+    ("huge_array", "core_protocol", "arrays of 8000000000000 bytes"),
+    ("negative", "core_protocol", "shape [-2]"),
+    ("dtype", "core_protocol", "dtype '|O'"),
+    ("wrong_shape", "core_protocol", 'shape "2"'),
+    ("wrong_id", "core_protocol", "an answer with id 8 to request 1"),
+    ("unknown_type", "core_protocol", "type 'poem'"),
+    ("twice", "core_protocol", "more than one answer"),
+]
+
+ANSWERS = [
+    ("nan", "not_finite", "normal holds NaN"),
+    ("infinite_covariance", "not_finite", "covariance holds NaN or infinity"),
+    ("zero", "estimator_error", "length 0"),
+    ("long", "estimator_error", "length 2"),
+    ("away", "estimator_error", "faces away"),
+    ("text", "estimator_error", "must be numbers of shape (3)"),
+    ("two", "estimator_error", "must be numbers of shape (3)"),
+    ("no_look", "estimator_error", "look_px or look_ray: missing"),
+    ("indefinite", "estimator_error", "no negative eigenvalue"),
+    ("basis", "estimator_error", "basis"),
+    ("candidates", "estimator_error", "first candidate"),
+    ("target", "estimator_error", "target 'liver'"),
+    ("flags", "estimator_error", "flags"),
+]
+
+STARTS = [
+    ("exit_at_start", "core_died", "exit code 4; its last words: no such model"),
+    ("hang_at_start", "core_timeout", "no answer within"),
+    ("half_hello", "core_timeout", "begun (16 bytes)"),
+    ("no_hello", "core_protocol", "Welcome to the core!"),
+    ("protocol", "core_protocol", "protocol 2; simtest speaks 1"),
+    ("kind", "core_protocol", "kind 'film'; must be patch or frame"),
+    ("arrays_unknown", "core_protocol", "array 'truth'; must be one of values"),
+    ("level", "core_protocol", "isophotes [1.5]"),
+    ("no_name", "core_protocol", "name ''"),
+    ("transport", "core_protocol", "transport 'smoke'"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Let the cores' folders stand where the test sees them."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    yield tmp_path
+    assert list(tmp_path.glob("simtest-core-*")) == []
+
+
+def limits(fault, reason):
+    """Return a short limit where the limit is what is tested, else one that a busy machine keeps to."""
+    if reason != "core_timeout":
+        return 20.0
+    # What was begun must have come by then.
+    return 2.0 if fault.startswith("half") else SHORT_S
+
+
+@pytest.mark.parametrize(("fault", "reason", "words"), TRANSPORT)
+def test_a_core_that_breaks_down_is_a_failure_and_the_next_highlight_has_a_new_core(folder, fault, reason, words):
+    command, mark = bad_command(fault, limit_s=limits(fault, reason))
+    core = Core(command)
+    core.start()
+    estimator = ProcessEstimator(core)
+    failure = run(estimator, PATCH, CAMERA)
+    assert isinstance(failure, Failure), failure
+    assert (failure.reason, words in failure.detail) == (Reason(reason), True), failure
+    assert "\n" not in failure.detail
+    # Ended at once, with everything that it had started.
+    assert processes_with(mark) == []
+    assert list(folder.glob("simtest-core-*")) == []
+    again = run(estimator, PATCH, CAMERA)
+    assert isinstance(again, Failure)
+    assert again.reason == reason
+    core.close()
+    assert processes_with(mark) == []
+
+
+@pytest.mark.parametrize(("fault", "reason", "words"), ANSWERS)
+@pytest.mark.parametrize("kind", ["patch", "frame"])
+def test_a_malformed_answer_is_a_failure_of_its_highlight_and_the_core_goes_on(folder, fault, reason, words, kind):
+    command, mark = bad_command(fault, *(["--frame"] if kind == "frame" else []))
+    core = Core(command)
+    core.start()
+    for _ in range(2):
+        failure = answer_of(core)
+        assert isinstance(failure, Failure)
+        assert (failure.reason, words in failure.detail) == (Reason(reason), True), failure
+    # Its messages are in step, so it is the same process still.
+    assert len(processes_with(mark)) == 1
+    core.close()
+    assert processes_with(mark) == []
+
+
+def answer_of(core):
+    """Ask a core of either kind about a highlight at the image's centre."""
+    if core.hello.kind == "patch":
+        return run(ProcessEstimator(core), PATCH, CAMERA)
+    frame = Frame(np.zeros((480, 640), np.float32) + 0.5, Calibration(CAMERA), 2.0)
+    return run_in_frame(ProcessFrameEstimator(core), frame, [PATCH], NO_PRIORS).of_patches[0]
+
+
+@pytest.mark.parametrize(("fault", "reason", "words"), STARTS)
+def test_a_core_that_does_not_greet_as_it_must_is_told_at_the_start(folder, fault, reason, words):
+    command, mark = bad_command(fault, start_s=limits(fault, reason))
+    with pytest.raises(CoreFault) as caught:
+        Core(command).start()
+    assert caught.value.reason == reason
+    assert words in caught.value.detail
+    assert processes_with(mark) == []
+
+
+@pytest.mark.parametrize(("fault", "words"), [("none_found", ""), ("too_many", "20000 estimates of a frame")])
+def test_too_few_and_too_many_estimates_of_a_frame(folder, fault, words):
+    core = Core(bad_command(fault, "--frame")[0])
+    core.start()
+    failure = answer_of(core)
+    assert isinstance(failure, Failure)
+    assert failure.reason == ("estimator_error" if words else "no_estimate")
+    assert words in failure.detail
+    core.close()
+
+
+def test_standard_error_is_drained_and_its_end_alone_is_kept(folder):
+    core = Core(bad_command("flood_stderr")[0])
+    core.start()
+    assert isinstance(answer_of(core), Estimate)
+    assert len(core._child._stderr) <= 4096
+    core.close()
+
+
+@pytest.mark.parametrize("fault", ["exit_after", "flood_after"])
+def test_a_core_that_breaks_down_after_an_answer_is_told_at_the_next_request(folder, fault):
+    command, mark = bad_command(fault)
+    core = Core(command)
+    core.start()
+    made = [answer_of(core) for _ in range(4)]
+    failures = [each for each in made if isinstance(each, Failure)]
+    assert failures
+    assert {each.reason for each in failures} <= {Reason.CORE_DIED, Reason.CORE_PROTOCOL}
+    core.close()
+    assert processes_with(mark) == []
+
+
+def test_after_some_faults_in_a_row_a_core_is_not_started_again(folder):
+    command, mark = bad_command("exit")
+    core = Core(command)
+    core.start()
+    made = [answer_of(core) for _ in range(MAX_FAULTS + 2)]
+    assert {each.reason for each in made} == {Reason.CORE_DIED}
+    assert [each.detail.startswith("not asked after 5 faults in a row") for each in made] == [False] * 5 + [True] * 2
+    assert processes_with(mark) == []
+
+
+def test_a_good_answer_between_faults_lets_a_core_go_on(folder):
+    core = Core(bad_command("exit", "--spared1")[0])
+    core.start()
+    made = [answer_of(core) for _ in range(2 * MAX_FAULTS + 4)]
+    assert [isinstance(each, Estimate) for each in made] == [True, False] * (MAX_FAULTS + 2)
+    assert not any("not asked" in str(each) for each in made)
+    core.close()
+
+
+def test_a_core_that_stays_after_its_input_closed_is_killed(folder, monkeypatch):
+    monkeypatch.setattr("simtest.estimators.process.child.Child.close.__defaults__", (SHORT_S,))
+    command, mark = bad_command("stays")
+    core = Core(command)
+    core.start()
+    assert isinstance(answer_of(core), Estimate)
+    core.close()
+    assert processes_with(mark) == []
+
+
+def test_a_core_that_was_closed_is_started_again_by_the_next_request(folder):
+    core = Core(bad_command("none")[0])
+    core.start()
+    first = core._child.process.pid
+    assert isinstance(answer_of(core), Estimate)
+    core.close()
+    assert isinstance(answer_of(core), Estimate)
+    assert core._child.process.pid != first
+    core.close()
+
+
+def test_an_interrupt_in_the_middle_of_a_request_ends_the_core(folder, monkeypatch):
+    command, mark = bad_command("hang")
+    core = Core(command)
+    core.start()
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simtest.estimators.process.child.Child._write", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        answer_of(core)
+    assert wait_until(lambda: not processes_with(mark))

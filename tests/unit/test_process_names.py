@@ -1,0 +1,187 @@
+"""A core's name: a command, or a TOML file; what is malformed is told in one line before anything is made."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+import simtest
+from simtest.errors import InputError
+from simtest.estimators import load_estimators
+from simtest.estimators.process.command import parse_core
+from simtest.estimators.process.naming import absolute_names, close_cores, short_names
+from tests.unit.core_helpers import BAD_CORE
+
+TABLE = """
+[core]
+name = "mine"
+command = "{command}"
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_core_stays():
+    yield
+    close_cores()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Give a folder with a program, a script that is not executable, and a model."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "program").symlink_to(shutil.which("true"))
+    (tmp_path / "script.py").write_text(BAD_CORE.read_text())
+    (tmp_path / "model.onnx").write_bytes(b"weights")
+    (tmp_path / "inside").mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("command:", "names no program"),
+        ("command:   ", "names no program"),
+        ("command: ''", "names no program"),
+        ("command: 'half", "cannot be split into words"),
+        ("command: no-such-program-anywhere --flag", "no program no-such-program-anywhere' on PATH"),
+        ("command: ./missing", "./missing does not exist"),
+        ("command: ./inside", "./inside is a folder; must be a program"),
+        ("command: .", "no program '.' on PATH"),
+        ("command: ./model.onnx", "./model.onnx is not executable"),
+        ("command: ./script.py", "./script.py is not executable"),
+        ("command: script.py", "a program in this folder is named ./"),
+        ("command: /dev/null", "/dev/null is a device"),
+        ("missing.toml", "missing.toml"),
+        ("inside.toml", "inside.toml"),
+    ],
+)
+def test_a_command_that_cannot_be_run_is_refused_in_one_line(folder, text, words):
+    (folder / "inside.toml").mkdir()
+    with pytest.raises(InputError) as caught:
+        load_estimators([text])
+    assert words.replace("no program ", "no program '", 1) in str(caught.value) or words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_program_that_is_no_program_is_refused_in_one_line(folder):
+    garbage = folder / "garbage"
+    garbage.write_bytes(b"\x7fELF garbage")
+    garbage.chmod(0o755)
+    with pytest.raises(InputError, match="cannot be started"):
+        load_estimators(["command: ./garbage"])
+    with pytest.raises(InputError, match="the core ended with exit code 0"):
+        load_estimators(["command: ./program"])
+
+
+def test_nothing_is_made_before_the_core_has_greeted(folder):
+    with pytest.raises(InputError, match="no such model"):
+        simtest.validate("overview", folder / "run", estimators=[f"command: {sys.executable} script.py exit_at_start"])
+    assert not (folder / "run").exists()
+
+
+def test_the_name_is_that_of_the_last_file_or_of_the_program(folder):
+    python = sys.executable
+    names = {
+        f"command: {python} script.py --model model.onnx": "model",
+        f"command: {python} script.py": "script",
+        "command: ./program --level 3": "program",
+        f"command: {python} -c 'pass'": Path(python).stem,
+    }
+    assert {text: parse_core(text).name for text in names} == names
+    assert short_names(["cone_axis", *names]) == ("cone_axis", *names.values())
+
+
+def test_files_among_the_arguments_are_absolute(folder):
+    core = parse_core(f"command: {sys.executable} script.py --model=model.onnx --out=new inside text")
+    assert core.arguments == (
+        sys.executable, str(folder / "script.py"), f"--model={folder / 'model.onnx'}", "--out=new",
+        str(folder / "inside"), "text",
+    )  # fmt: skip
+    assert set(core.hashes()) == {sys.executable, str(folder / "script.py"), str(folder / "model.onnx")}
+
+
+def test_absolute_names_mean_the_same_elsewhere(folder, monkeypatch):
+    (folder / "inside" / "core.toml").write_text(TABLE.format(command=f"{sys.executable} ../script.py"))
+    names = [f"command: {sys.executable} script.py 'two words'", "inside/core.toml", "cone_axis"]
+    before = [parse_core(name) for name in names[:2]]
+    absolute = absolute_names(names)
+    monkeypatch.chdir("/")
+    after = [parse_core(name) for name in absolute[:2]]
+    assert [core.arguments[:3] for core in after] == [core.arguments[:3] for core in before]
+    assert [core.name for core in after] == [core.name for core in before] == ["script", "mine"]
+    assert absolute[2] == "cone_axis"
+
+
+def test_files_of_a_toml_file_are_looked_for_in_its_folder(folder):
+    (folder / "inside" / "script.py").write_text(BAD_CORE.read_text())
+    (folder / "inside" / "core.toml").write_text(TABLE.format(command=f"{sys.executable} script.py none"))
+    core = parse_core("inside/core.toml")
+    assert core.arguments[1] == str(folder / "inside" / "script.py")
+    assert (core.name, core.time_limit_s) == ("mine", 10.0)
+    assert set(load_estimators(["inside/core.toml"])) == {"mine"}
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("time_limit_s = 0", "core.time_limit_s"),
+        ('kind = "film"', "core.kind"),
+        ('environment = "HOME"', "core.environment"),
+        ("colour = 3", "core.colour"),
+        ('name = "two words"', "core.name"),
+        ('name = "a/b"', "core.name"),
+    ],
+)
+def test_a_malformed_toml_file_is_refused(folder, more, words):
+    text = TABLE.format(command="./program") + more
+    if more.startswith("name"):
+        text = text.replace('name = "mine"\n', "")
+    (folder / "core.toml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        load_estimators(["core.toml"])
+
+
+def test_the_kind_and_the_environment_of_a_toml_file_hold(folder, monkeypatch):
+    line = TABLE.format(command=f"{sys.executable} script.py none")
+    (folder / "core.toml").write_text(line + 'kind = "frame"')
+    with pytest.raises(InputError, match=r"kind patch; core\.toml says frame"):
+        load_estimators(["core.toml"])
+    (folder / "core.toml").write_text(line + 'environment = ["LICENCE_SERVER", "ABSENT_ONE"]')
+    monkeypatch.setenv("LICENCE_SERVER", "port 3")
+    monkeypatch.setenv("OTHER_THING", "3")
+    variables = parse_core("core.toml").variables()
+    assert variables["LICENCE_SERVER"] == "port 3"
+    assert not {"OTHER_THING", "ABSENT_ONE"} & set(variables)
+
+
+def test_names_that_clash_are_refused(folder):
+    core = f"command: {sys.executable} script.py none"
+    with pytest.raises(InputError, match="estimator 'script': given twice"):
+        load_estimators([core, core])
+    shutil.copy(folder / "script.py", folder / "cone_axis.py")
+    with pytest.raises(InputError, match="is called cone_axis, as an installed estimator is"):
+        load_estimators([f"command: {sys.executable} cone_axis.py none"])
+
+
+def test_the_same_core_is_started_once_and_a_changed_one_anew(folder):
+    core = f"command: {sys.executable} script.py none"
+    (first,) = load_estimators([core]).values()
+    (again,) = load_estimators([core]).values()
+    assert again.core is first.core
+    (folder / "script.py").write_text(BAD_CORE.read_text() + "\n# changed\n")
+    (changed,) = load_estimators([core]).values()
+    assert changed.core is not first.core
+    assert first.core._child is None
+
+
+def test_the_command_line_takes_a_core(folder, here):
+    from PIL import Image
+
+    Image.linear_gradient("L").resize((64, 64)).save("picture.png")
+    core = f"command: {sys.executable} {folder / 'script.py'} protocol"
+    (folder / "camera.toml").write_text("width = 64\nheight = 64\nfx = 46.0\nfy = 46.0\ncx = 32.0\ncy = 32.0\n")
+    code, _, errors = here("reconstruct", "picture.png", "--camera", "camera.toml", "--out", "out", "--estimator", core)
+    assert code != 0
+    assert len(errors) == 1
+    assert "hello: protocol 2; simtest speaks 1" in errors[0]

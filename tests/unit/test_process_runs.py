@@ -1,0 +1,302 @@
+"""Cores in whole runs: equal rows, nothing of the truth, several workers, and no process left however a run ends."""
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+
+import numpy as np
+import polars as pl
+import psutil
+import pytest
+
+import simtest
+from simtest.errors import InputError
+from simtest.estimators.process.naming import close_cores
+from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
+
+EXPERIMENT = """
+name = "aslant"
+realisations = 2
+seed = 7481927361
+estimators = ["cone_axis"]
+
+[[groups]]
+scene = "cylinder"
+isolated = false
+label = "peculiar-setting-label"
+set = { "camera.width" = 200, "camera.height" = 150 }
+sweep = [{ "surface.tilt_deg" = [7.31, 13.77] }]
+"""
+
+PUBLISHED = """
+name = "published-few"
+realisations = 2
+seed = 3
+estimators = ["cone_axis"]
+
+[[groups]]
+scene = "published"
+label = "few"
+sweep = [{ "paper.sigma" = [0.0, 0.02] }]
+"""
+
+
+def command(script, *arguments):
+    return f"command: {sys.executable} {script} {' '.join(map(str, arguments))}".strip()
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    path = tmp_path / "aslant.toml"
+    path.write_text(EXPERIMENT)
+    return path
+
+
+@pytest.fixture
+def published(tmp_path):
+    """Return an experiment that renders nothing, so that it takes no time."""
+    path = tmp_path / "published.toml"
+    path.write_text(PUBLISHED)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def no_core_stays():
+    yield
+    close_cores()
+
+
+# The same rows --------------------------------------------------------------------------------------------------------
+
+
+def same_but_for_the_name(results, first, second):
+    """Check that two estimators have equal rows but for their names."""
+    one, other = (results.filter(pl.col("estimator") == name).drop("estimator") for name in (first, second))
+    assert len(one)
+    assert "ok" in one["status"]
+    differing = [name for name in one.columns if not one[name].equals(other[name])]
+    assert differing == []
+
+
+@pytest.mark.parametrize("transport", ["", "--files"])
+def test_an_estimator_of_ours_gives_the_same_rows_as_a_core(tmp_path, published, transport):
+    core = command(OWN_CORE, "cone_axis", transport)
+    run = simtest.validate(published, tmp_path / "run", estimators=["cone_axis", core])
+    same_but_for_the_name(run.results, "cone_axis", "own_core")
+
+
+@pytest.mark.render
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cone_axis", "circle_pose"])
+def test_an_estimator_of_ours_gives_the_same_rows_as_a_core_in_rendered_frames(tmp_path, experiment, name):
+    run = simtest.validate(experiment, tmp_path / "run", estimators=[name, command(OWN_CORE, name)])
+    same_but_for_the_name(run.results, name, "own_core")
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_two_workers_give_the_same_rows_as_one(tmp_path, experiment, monkeypatch):
+    monkeypatch.chdir(CORES)
+    core = f"command: {sys.executable} own_core.py cone_axis"
+    runs = [simtest.validate(experiment, tmp_path / str(n), estimators=[core], workers=n) for n in (1, 2)]
+    assert runs[0].results.equals(runs[1].results)
+    assert set(runs[0].results["status"]) == {"ok"}
+
+
+# Nothing of the truth -------------------------------------------------------------------------------------------------
+
+
+def patterns(value):
+    """Return the bytes by which a number that is not round could be told from all others."""
+    return [repr(value)[:9].encode(), struct.pack("<d", value), struct.pack("<f", value)]
+
+
+@pytest.mark.render
+def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment):
+    spied = tmp_path / "spied.bin"
+    out = tmp_path / "peculiar-output-folder"
+    run = simtest.validate(experiment, out, estimators=[command(CORES / "spy_core.py", spied)])
+    content = spied.read_bytes()
+    rows = run.results.filter(pl.col("status") == "ok")
+    assert len(rows) == 4
+    assert content.count(b'"type":"patch"') == 4
+    truths = ["truth_x", "truth_y", "truth_z", "bp_true_x_px", "bp_true_y_px", "kd_min", "kd_max", "eps_over_d"]
+    values = {v for name in (*truths, "surface.tilt_deg") for v in rows[name].drop_nulls().to_list()}
+    # A round number, such as 0, says nothing.
+    telling = [v for v in values if abs(v * 1e3 - round(v * 1e3)) > 1e-9 or v in (7.31, 13.77)]
+    assert len(telling) > 8
+    found = [v for v in telling for pattern in patterns(v) if pattern in content]
+    assert found == []
+    # Searched for rightly: what it was told is found.
+    told = rows["look_x_px"].to_list()
+    assert [v for v in told if repr(v)[:9].encode() in content] == told
+    words = ["7481927361", "peculiar", "aslant", "cylinder", "realisation", "truth", "setting", "seed", "noise_sigma"]
+    words += [str(seed) for seed in rows["seed"].to_list()]
+    assert [word for word in words if word.encode() in content] == []
+    assert [seed for seed in rows["seed"].to_list() if struct.pack("<q", seed) in content] == []
+
+
+@pytest.mark.render
+def test_a_core_has_an_empty_folder_three_pipes_and_a_short_environment(tmp_path, experiment, monkeypatch):
+    monkeypatch.setenv("SECRET_OF_THE_USER", "42")
+    monkeypatch.setenv("PYTHONPATH", os.environ.get("PYTHONPATH", "") or str(tmp_path))
+    spied = tmp_path / "spied.bin"
+    simtest.validate(experiment, tmp_path / "run", realisations=1, estimators=[command(CORES / "spy_core.py", spied)])
+    line = next(line for line in spied.read_bytes().split(b"\n") if line.startswith(b"SURROUNDINGS "))
+    seen = json.loads(line.removeprefix(b"SURROUNDINGS "))
+    assert seen["tree"] == [[".", [], []]]
+    assert sorted(seen["open"]) == ["0", "1", "2"]
+    assert all(link.startswith("pipe:") for link in seen["open"].values())
+    allowed = {"PATH", "HOME", "LANG", "LD_LIBRARY_PATH", "TMPDIR", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"}
+    # Python itself adds LC_CTYPE in the C locale.
+    assert {name for name in seen["environment"] if not name.startswith("LC_")} <= allowed
+    assert seen["environment"]["TMPDIR"] == seen["cwd"]
+    assert not os.path.exists(seen["cwd"])
+
+
+# The end --------------------------------------------------------------------------------------------------------------
+
+PARENT = """
+import sys, time
+from simtest.estimators import load_estimators
+(estimator,) = load_estimators([sys.argv[1]]).values()
+print(estimator.core._child.folder, flush=True)
+{then}
+"""
+
+
+def parent(then, core):
+    return subprocess.Popen([sys.executable, "-c", PARENT.format(then=then), core], stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("fault", ["stays", "ignores_term"])
+def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
+    mark = f"--mark={tmp_path.name}-{fault}"
+    started = parent("time.sleep(60)", command(BAD_CORE, fault, mark))
+    folder = started.stdout.readline().strip()
+    assert len(processes_with(mark)) == 2  # the parent's own command line holds it too
+    assert os.path.isdir(folder)
+    started.send_signal(signal.SIGKILL)
+    started.wait()
+    started.stdout.close()
+    assert wait_until(lambda: not processes_with(mark))
+    assert wait_until(lambda: not os.path.exists(folder))
+
+
+@pytest.mark.parametrize("then", ["", "raise SystemExit(1)", "import os; os._exit(0)"])
+def test_a_core_ends_with_its_parent(tmp_path, then):
+    mark = f"--mark={tmp_path.name}"
+    started = parent(then, command(BAD_CORE, "none", mark))
+    folder = started.stdout.readline().strip()
+    started.wait()
+    started.stdout.close()
+    assert wait_until(lambda: not processes_with(mark))
+    assert wait_until(lambda: not os.path.exists(folder))
+
+
+@pytest.mark.parametrize(
+    ("number", "workers"), [("SIGINT", 1), ("SIGTERM", 1), ("SIGKILL", 1), ("SIGINT", 2), ("SIGKILL", 2)]
+)
+@pytest.mark.slow
+def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
+    mark = f"--mark={tmp_path.name}"
+    line = [
+        sys.executable,
+        "-m",
+        "simtest",
+        "validate",
+        "paper",
+        "--out",
+        str(tmp_path / "run"),
+        "--workers",
+        str(workers),
+    ]
+    core = command(BAD_CORE, "hang", "--spared3", mark)
+    started = subprocess.Popen([*line, "--estimator", core], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                               start_new_session=True)  # fmt: skip
+    held = lambda: [p for p in processes_with(mark) if p.pid != started.pid]  # noqa: E731
+    assert wait_until(held, 60)
+    time.sleep(1)
+    started.send_signal(getattr(signal, number))
+    started.wait(60)
+    assert wait_until(lambda: not processes_with(mark))
+
+
+def test_a_run_closes_its_cores(tmp_path, published):
+    mark = f"--mark={tmp_path.name}"
+    core = command(BAD_CORE, "none", mark)
+    simtest.validate(published, tmp_path / "run", realisations=1, estimators=[core])
+    assert processes_with(mark) == []
+    assert [child for child in psutil.Process().children() if "simtest-core" in " ".join(child.cmdline())] == []
+
+
+# What is told of it ---------------------------------------------------------------------------------------------------
+
+
+def test_a_run_tells_of_its_cores(tmp_path, published):
+    core = command(BAD_CORE, "none")
+    run = simtest.validate(published, tmp_path / "run", realisations=1, estimators=["cone_axis", core])
+    assert set(run.results["estimator"]) == {"cone_axis", "bad_core"}
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    record = summary["run"]["cores"]["bad_core"]
+    assert (record["command"], record["name"], record["version"]) == (core, "bad core", "0.1")
+    assert len(record["files"][str(BAD_CORE)]) == 64
+    assert "bad core 0.1" in summary["experiments"]["published-few"]["estimators"]["bad_core"]
+    assert "bad_core" in (tmp_path / "run" / "index.html").read_text()
+
+
+def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
+    from simtest.nightly.measure import measure_run, plan_run
+    from simtest.spec.profile import load_profile
+
+    core = command(BAD_CORE, "none")
+    published.write_text(PUBLISHED.replace('"cone_axis"', json.dumps(core)))
+    assert simtest.load_experiment(published).estimators == (core,)
+    profile = tmp_path / "profile.toml"
+    entry = f'[[experiments]]\nexperiment = "{published}"\nestimators = ["cone_axis", {json.dumps(core)}]\n'
+    profile.write_text(f"canaries = false\ncosts = false\n{entry}")
+    planned = plan_run(load_profile(profile))
+    made = measure_run(load_profile(profile), tmp_path / "scratch", "a", planned=planned)
+    assert set(made.figures["estimator"]) >= {"cone_axis", "bad_core"}
+
+
+def test_a_changed_program_is_another_run(tmp_path, published):
+    script = tmp_path / "core.py"
+    script.write_text(BAD_CORE.read_text())
+    arguments = {"realisations": 1, "estimators": [command(script, "none")]}
+    simtest.validate(published, tmp_path / "run", **arguments)
+    before = (tmp_path / "run" / "summary.json").read_text()
+    simtest.validate(published, tmp_path / "run", **arguments)
+    assert (tmp_path / "run" / "summary.json").read_text() == before
+    script.write_text(BAD_CORE.read_text().replace('"0.1"', '"0.2"'))
+    with pytest.warns(UserWarning, match="another"):
+        simtest.validate(published, tmp_path / "run", **arguments)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["run"]["cores"]["core"]["version"] == "0.2"
+
+
+def test_the_failures_of_a_core_are_counted(tmp_path, published):
+    run = simtest.validate(published, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "exit")])
+    assert set(run.results["status"]) == {"core_died"}
+    assert "no licence for this highlight" in run.results["flags"][0]
+
+
+def test_a_frame_core_does_not_fit_the_published_protocol(tmp_path, published):
+    core = command(BAD_CORE, "none", "--frame")
+    with pytest.raises(InputError, match="needs a whole frame"):
+        simtest.validate(published, tmp_path / "run", realisations=1, estimators=[core])
+
+
+@pytest.mark.parametrize("kind", ["", "--frame"])
+def test_a_picture_is_reconstructed_by_a_core(kind):
+    y, x = np.mgrid[:480, :640] + 0.5
+    picture = np.exp(-((x - 320) ** 2 + (y - 240) ** 2) / 200)
+    camera = simtest.Camera.from_fov(70.0, 640, 480)
+    made = simtest.reconstruct(picture, camera, estimators=["cone_axis", command(BAD_CORE, "none", kind)])
+    assert made.choices.estimators == ("cone_axis", "bad_core")
+    (spot,) = made
+    assert spot.estimates["bad_core"].normal.tolist() == [0, 0, -1]
