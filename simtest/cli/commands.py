@@ -26,6 +26,7 @@ COMMANDS = {
     "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
     "realism": "Measure how far generated frames are from real ones.",
     "fit": "Fit the ranges of a dataset recipe to real frames.",
+    "core": "Check a reconstruction core that runs as a command of its own.",
     "validate": "Run an experiment and write its report.",
     "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",

@@ -92,6 +92,7 @@ Estimators = Annotated[
     list[str] | None,
     named(
         "estimators",
+        files=True,
         name="--estimator",
         negative="",
         help="Estimator by name, or a core of your own: 'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
@@ -99,6 +100,10 @@ Estimators = Annotated[
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
 Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
+Views = Annotated[
+    int | None,
+    Parameter(help="Viewpoints of each group that varies them, the first ones; default all.", converter=whole_number),
+]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]
 Workers = Annotated[
     int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)

@@ -7,6 +7,15 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from simtest.cli.dense_score import (
+    MapDepth,
+    MapEncoding,
+    MapFrame,
+    MapUnit,
+    is_dense,
+    refuse_dense_options,
+    score_dense,
+)
 from simtest.cli.options import Address, AsJson, EngineName, Workers, named_path
 
 DEFAULT_OUT = Path("reports/scores")
@@ -27,6 +36,10 @@ def score(
     engine: EngineName = "local",
     workers: Workers = 1,
     address: Address = None,
+    encoding: MapEncoding = None,
+    frame: MapFrame = None,
+    depth: MapDepth = None,
+    unit_mm: MapUnit = None,
     as_json: AsJson = False,
 ) -> None:
     """Score normals that were estimated elsewhere on exported frames, as our own estimators are scored.
@@ -34,8 +47,13 @@ def score(
     Parameters
     ----------
     answers : Path
-        Table of normals, CSV or Parquet: frame, x_px, y_px, normal_x, normal_y, normal_z (docs/howto/score.md).
+        Table of normals, CSV or Parquet: frame, x_px, y_px, normal_x, normal_y, normal_z (docs/howto/score.md). Or a
+        folder of maps of normals or depths, or the word shading, for a score of every pixel (docs/howto/dense.md).
     """
+    if is_dense(answers):
+        score_dense(answers, on, out, name, encoding, frame, depth, unit_mm, as_json)
+        return
+    refuse_dense_options(encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
     from simtest.cli.guide_table import print_guide
     from simtest.cli.printing import print_run
     from simtest.cli.progress import progress_bar

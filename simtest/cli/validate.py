@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from simtest.cli.manners import MANNERS
 from simtest.cli.options import (
     Address,
     AsJson,
@@ -17,6 +18,7 @@ from simtest.cli.options import (
     Seed,
     Settings,
     Variant,
+    Views,
     Workers,
     named,
     named_path,
@@ -34,6 +36,7 @@ def validate(
     ] = None,
     realisations: Realisations = None,
     seed: Seed = None,
+    views: Views = None,
     settings: Settings = None,
     estimators: Estimators = None,
     variant: Variant = None,
@@ -52,8 +55,8 @@ def validate(
     ----------
     experiment : str
         An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, laws, compare,
-        known_light, sensor, reflectance, relief, interreflection, rig, camera, motion, anatomy, anatomy_sensor, colon,
-        liver, mesh, paper, paper_limits.
+        known_light, sensor, reflectance, relief, interreflection, rig, camera, motion, anatomy, anatomy_sensor, dense,
+        colon, liver, mesh, paper, paper_limits.
     """
     from simtest.api import validate as run
     from simtest.cli.guide_table import print_guide
@@ -65,7 +68,7 @@ def validate(
     from simtest.validation.mesh_verdicts import mesh_verdicts
 
     values = parse_settings(settings or [])
-    own = {"realisations": realisations, "seed": seed, "estimators": estimators}
+    own = {"realisations": realisations, "seed": seed, "estimators": estimators, "views": views}
     values |= {key: value for key, value in own.items() if value is not None}
     described = load_experiment(experiment, values)
     meshes = mesh_verdicts(described)
@@ -79,9 +82,12 @@ def validate(
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         run(described, folder, None, command, variant, progress, engine=chosen, export=export)
     if as_json:
-        print_run(folder, meshes=meshes)
+        exported = {} if export is None else {"export": export / "README.md"}
+        print_run(folder, meshes=meshes, **exported)
         return
-    print(*meshes, sep="\n", end="\n" * bool(meshes))
+    # A warning has told what is wrong with a mesh, unless --quiet left it out.
+    verdicts = [mesh for mesh in meshes if mesh.usable or MANNERS.quiet]
+    print(*verdicts, sep="\n", end="\n" * bool(verdicts))
     print_guide(folder)
     print(folder / "index.html")
     if export is not None:

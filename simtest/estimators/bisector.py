@@ -61,9 +61,9 @@ class Bisector:
         The candidates are those of the lights that may have made the highlight, the proposed one first. With several
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
-        mean square of what the single lights would give. Fails as `cone_axis` does, and with ``not_known`` without
-        lights. In a highlight too small for isophotes s is the sightline of its centre, flagged ``unresolved``, and no
-        axis ratio is stated.
+        mean square of what the single lights would give, over the distances. Fails as `cone_axis` does, and with
+        ``not_known`` without lights. In a highlight too small for isophotes s is the sightline of its centre, flagged
+        ``unresolved``, and no axis ratio is stated.
         """
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
@@ -82,8 +82,7 @@ class Bisector:
         candidates = np.array([candidate for candidate, _ in found])
         budget = _budget(family, order[0], priors.distance, normal)
         if budget is not None and own is None:
-            moved = (candidates[1:] - normal) @ basis_across(normal).T
-            budget = {**budget, "light_offset": moved.T @ moved / len(moved)}
+            budget = {**budget, "light_offset": _light_part(family, order, priors.distance, normal)}
         estimate = Estimate(
             normal=normal,
             candidates=candidates,
@@ -146,6 +145,17 @@ def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal:
     J = across @ (np.array(turned) - unturned).T / STEP
     own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
     return {**own, "distance": _distance_part(family, light, distance, across)}
+
+
+def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distribution, normal: Array) -> Array:
+    """Return the covariance of the first light's normal by the others, shape (2, 2), rad^2, in a basis across it.
+
+    It is the mean square over the lights and the distances, since the angle between two lights goes with 1/d.
+    """
+    distances = np.array([_middle(distance)]) if _is_narrow(distance) else distance.quantile(DISTANCES)
+    first, *single = (_normals(family, light, distances)[0] for light in lights)
+    moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
+    return np.asarray(moved.T @ moved / len(moved))
 
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:

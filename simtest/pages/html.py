@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _PACKAGE = Path(__file__).resolve().parents[1]
 TEMPLATES = [
     _PACKAGE / "pages" / "templates",
-    *(_PACKAGE / room for room in ("report", "realism", "reconstruction", "nightly/page")),
+    *(_PACKAGE / room for room in ("report", "realism", "reconstruction", "nightly/page", "dataset/scoring/dense")),
 ]
 
 

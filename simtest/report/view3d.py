@@ -178,7 +178,7 @@ def view_json(data: View3D) -> PlotlyJson:
         for (name, positions, colour), symbol in zip(data.points, ("diamond", "circle"), strict=False)
     ]
     axes = {f"{a}axis": {"title": {"text": f"{a} ({data.unit})"}, "nticks": 5} for a in "xyz"}
-    camera = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}}
+    camera = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.5, "y": -1.14, "z": -1.68}}
     made: PlotlyJson = {"height": data.height, "scene": {"aspectmode": "data", "camera": camera, **axes},
                         "dragmode": "orbit", "margin": MARGIN}  # fmt: skip
     if data.curvature is None:

@@ -17,7 +17,7 @@ from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
 from simtest.simulation.coding import check_codec
 from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
-from simtest.simulation.visible_highlights import VisibleHighlight, describe, find_spots
+from simtest.simulation.visible_highlights import Spots, VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
 
 LEAST_SHARE = 1e-12
@@ -68,12 +68,20 @@ class RenderedView:
         return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
+    def _specular(self) -> Image:
+        """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
+        return _mean(collect(self.radiance.specular, self.scene.sensor, self.calibration.camera))
+
+    @cached_property
+    def spots(self) -> Spots:
+        """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
+        return find_spots(_mean(self.light), self._specular, self.calibration.camera.seen)
+
+    @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
         """The spots that can be seen in the noise-free frame, the brightest first (theory.md 7.1b)."""
         sensor, camera = self.scene.sensor, self.calibration.camera
-        light = _mean(self.light)
-        specular = _mean(collect(self.radiance.specular, sensor, camera))
-        spots = find_spots(light, specular, camera.seen)
+        light, specular, spots = _mean(self.light), self._specular, self.spots
         at = light[spots.rows, spots.columns]
         scale = self.full_scale
         noise = sensor.noise_model().at(at / scale, self.radiance.channels) if scale > 0 else np.zeros_like(at)

@@ -94,6 +94,7 @@ class Experiment(Spec):
     __str__ = short_repr
 
 
+VIEWPOINT = "surface.viewpoint"
 _EXPERIMENT_KEYS = frozenset({"realisations", "seed", "estimators", "title", "description"})
 
 
@@ -106,7 +107,8 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
         A path, or the name of a shipped experiment.
     settings : mapping, optional
         Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced, realisations in all
-        groups; all other paths are those of the scene and apply to each group, in place of a sweep over them.
+        groups; `views` keeps that many viewpoints, the first ones, of each group that varies them; all other paths are
+        those of the scene and apply to each group, in place of a sweep over them.
 
     Raises
     ------
@@ -123,16 +125,22 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
+    changes = {key: value for key, value in settings.items() if value is not None or key != "views"}
+    views = settings.pop("views", None)
     _check_first_parts(settings)
     experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
+    if views is not None:
+        groups = tuple(_thinned(group, views) for group in groups)
+        if not any(VIEWPOINT in table for group in groups for table in (*group.sweep, *group.pool)):
+            raise InputError(f"--set views: no group of {shown(path)} varies {VIEWPOINT}")
     if "realisations" in own:
         # In all groups, also in those that have a number of their own.
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
     # The page must say that this is not the experiment as shipped.
     description = experiment.description
-    if settings:
-        description = f"{description} With {', '.join(f'{key}={value}' for key, value in settings.items())}.".strip()
+    if changes:
+        description = f"{description} With {', '.join(f'{key}={value}' for key, value in changes.items())}.".strip()
     return experiment.model_copy(update={"groups": groups, "description": description})
 
 
@@ -142,10 +150,23 @@ def _check_first_parts(settings: Mapping[str, Any]) -> None:
     for path in settings:
         first = path.partition(".")[0]
         if first not in scene:
-            own = sorted(_EXPERIMENT_KEYS)
+            own = sorted([*_EXPERIMENT_KEYS, "views"])
             meant = suggestion(first, [*own, *scene])
             allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
             raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{meant}")
+
+
+def _thinned(group: Group, views: object) -> Group:
+    """Keep the first viewpoints of a group that varies them."""
+    if isinstance(views, bool) or not isinstance(views, int) or views < 1:
+        raise InputError(f"--set views={shown(str(views), 60)}: must be a whole number from 1 on")
+
+    def first(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
+        return tuple(
+            {key: values[:views] for key, values in table.items()} if VIEWPOINT in table else table for table in tables
+        )
+
+    return group.model_copy(update={"sweep": first(group.sweep), "pool": first(group.pool)})
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:

@@ -61,17 +61,9 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     InputError
         If the file is missing or of another kind, its channels differ, or an integer map has no scale.
     """
-    suffix = path.suffix.lower()
-    if suffix not in DEPTH_SUFFIXES:
-        raise InputError(f"{shown(path)}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
     if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
         raise InputError(f"--depth-scale {scale_mm:g}: must be 1e-9 to {FARTHEST_MM:g} mm")
-    if suffix == ".npy":
-        values = _read_npy(path)
-    elif suffix == ".exr":
-        values = _read_exr(path)
-    else:
-        values = np.asarray(read_raw(path, "a depth map"))
+    values = read_values(path)
     # A grey map that was saved as RGB is accepted.
     if values.ndim == 3:
         colours = values[:, :, :3]
@@ -90,6 +82,19 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     return depth
 
 
+def read_values(path: Path, wanted: str = "a depth map") -> npt.NDArray[np.generic]:
+    """Read a map as it stands in a file of `DEPTH_SUFFIXES`, shape (H, W) or (H, W, C); `wanted` is for messages.
+
+    Channels of PNG and TIFF are in OpenCV's order. Raises `InputError` if the file is missing or of another kind.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise InputError(f"{shown(path)}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
+    if suffix == ".npy":
+        return _read_npy(path, wanted)
+    return _read_exr(path, wanted) if suffix == ".exr" else np.asarray(read_raw(path, wanted))
+
+
 def _check_range(low: float, high: float, where: object) -> None:
     if not (low >= NEAREST_MM and high <= FARTHEST_MM):
         raise InputError(
@@ -97,8 +102,8 @@ def _check_range(low: float, high: float, where: object) -> None:
         )
 
 
-def _read_npy(path: Path) -> npt.NDArray[np.generic]:
-    check_file(path, "picture_bytes", "a depth map")
+def _read_npy(path: Path, wanted: str) -> npt.NDArray[np.generic]:
+    check_file(path, "picture_bytes", wanted)
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
@@ -113,11 +118,11 @@ def _read_npy(path: Path) -> npt.NDArray[np.generic]:
     return np.array(values)
 
 
-def _read_exr(path: Path) -> npt.NDArray[np.generic]:
+def _read_exr(path: Path, wanted: str) -> npt.NDArray[np.generic]:
     # Imported here: the renderer's library reads EXR, and is slow to load.
     from simtest.rendering.bitmap import read_bitmap
 
-    check_file(path, "picture_bytes", "a depth map")
+    check_file(path, "picture_bytes", wanted)
     return read_bitmap(path)
 
 
@@ -137,13 +142,13 @@ def depth_points(depth: Array, camera: Camera, kind: Literal["z", "distance"] = 
     return np.asarray(depth[..., None] * along)
 
 
-def depth_normals(points: Array) -> Array:
+def depth_normals(points: Array, radius_px: int = RADIUS_PX) -> Array:
     """Compute the normals of a map of points, shape (H, W, 3): unit, facing the camera, NaN where there is none.
 
-    The normal is perpendicular to the two mean differences of the points of a window: exact on planes, through any
-    lens.
+    The normal is perpendicular to the two mean differences of the points of a window of 2 `radius_px` + 1: exact on
+    planes, through any lens.
     """
-    window = np.arange(-RADIUS_PX, RADIUS_PX + 1, dtype=float)
+    window = np.arange(-radius_px, radius_px + 1, dtype=float)
     slope, mean = window / (window**2).sum(), np.full(len(window), 1 / len(window))
     known = np.asarray(np.isfinite(points).all(axis=-1))
     values = np.where(known[..., None], points, 0.0)
@@ -154,7 +159,7 @@ def depth_normals(points: Array) -> Array:
     length = np.linalg.norm(normal, axis=-1)
     # reject windows that leave the map, or hold a hole or a jump
     clear = (known & ~_jumps(values[..., 2])).astype(np.uint8)
-    sound = (cv2.erode(clear, np.ones((2 * RADIUS_PX + 1,) * 2, np.uint8), borderValue=0) > 0) & (length > 0)
+    sound = (cv2.erode(clear, np.ones((len(window),) * 2, np.uint8), borderValue=0) > 0) & (length > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         normal /= length[..., None]
     normal[np.einsum("hwi,hwi->hw", normal, values) > 0] *= -1

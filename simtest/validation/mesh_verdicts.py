@@ -41,6 +41,8 @@ class MeshVerdict:
 def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
     """Judge each mesh file of an experiment once; recipes are fine by construction.
 
+    A file has several verdicts only where groups of other lobes or refinements are judged otherwise.
+
     Raises
     ------
     InputError
@@ -54,7 +56,7 @@ def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
         key = (surface.file(), surface.kind, surface.edge_mm, curvature)
         if key not in verdicts:
             verdicts[key] = _judge(surface, curvature)
-    return list(verdicts.values())
+    return list(dict.fromkeys(verdicts.values()))
 
 
 def _scenes(group: Group) -> Iterator[Scene]:

@@ -212,8 +212,10 @@ def test_json_holds_neither_nan_nor_paths_that_break_it(capsys):
 
 def test_reports_are_json_on_request():
     """Each command that reports takes --json: whoever adds one is reminded."""
-    reports = {"doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
+    reports = {"core check", "score",
+               "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
+               "dataset export",
                "mesh check", "mesh colon", "mesh liver"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:

@@ -2,15 +2,18 @@
 
 import re
 import struct
+import warnings
 
 import numpy as np
 import pytest
 import trimesh
 
+from simtest.cli.manners import MANNERS
+from simtest.cli.validate import validate
 from simtest.spec import Experiment, Group
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_polygons import read_mixed_polygons
-from simtest.validation.mesh_verdicts import mesh_verdicts
+from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
 from tests.refusals import refused
 
 CORNERS = np.array([[x, y, z] for x in (0, 10) for y in (0, 10) for z in (0, 10)], dtype=float)
@@ -133,3 +136,28 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     trimesh.creation.icosphere(subdivisions=5, radius=20).export(path)
     (fine,) = mesh_verdicts(experiment(**{"surface.path": str(path), "reflectance.exponent": 2.0}))
     assert (fine.usable, fine.text) == (True, "fine enough")
+    # Two lobes of one verdict are told once, and two verdicts of one file both.
+    values = {"surface.path": str(path)}
+    groups = [Group(scene="anatomy", set={**values, "reflectance.exponent": n}) for n in (2.0, 3.0, 9e4)]
+    assert mesh_verdicts(Experiment(name="x", groups=groups[:2])) == [fine]
+    both = mesh_verdicts(Experiment(name="x", groups=groups))
+    assert [each.usable for each in both] == [True, False]
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_the_command_tells_each_verdict_once(tmp_path, monkeypatch, capsys, quiet):
+    monkeypatch.chdir(tmp_path)
+    fit, unfit = MeshVerdict("a.ply", True, "fine enough"), MeshVerdict("b.ply", False, "too coarse")
+    monkeypatch.setattr("simtest.validation.mesh_verdicts.mesh_verdicts", lambda _: [fit, unfit])
+    monkeypatch.setattr("simtest.api.validate", lambda *_, **__: None)
+    monkeypatch.setattr(MANNERS, "quiet", quiet)
+    if quiet:
+        warnings.simplefilter("ignore")
+        validate("overview", out=tmp_path)
+    else:
+        with pytest.warns(UserWarning, match="mesh b.ply: too coarse"):
+            validate("overview", out=tmp_path)
+    said = capsys.readouterr().out
+    assert said.count("mesh a.ply: fine enough") == 1
+    # On the error stream already, unless warnings are left out.
+    assert said.count("mesh b.ply: too coarse") == (1 if quiet else 0)

@@ -1,6 +1,7 @@
 """What the audit and the hashed constraints make of the tools' reports, and what the release check refuses."""
 
 import importlib.util
+import os
 import re
 import sys
 import zipfile
@@ -104,6 +105,41 @@ def test_a_step_that_fails_is_told_in_one_line(tmp_path):
     code = "import sys; print('first'); print('worst', file=sys.stderr); sys.exit(3)"
     with pytest.raises(check.CheckError, match=r"exit 3: worst$"):
         check.run([sys.executable, "-c", code], tmp_path)
+
+
+@pytest.mark.slow
+def test_without_a_registry_the_release_check_is_skipped_with_the_reason(tmp_path, monkeypatch, capsys):
+    check = loaded("release_check")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(
+        sys, "argv", ["release_check.py", "--pythons", "this", "--out", str(tmp_path), "--skip-offline"]
+    )
+    assert check.main() == 0
+    (said,) = capsys.readouterr().out.splitlines()
+    assert said.startswith("release check: skipped, since pip reaches no package registry: ")
+    assert len(said) > 80
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_a_registry_out_of_reach_skips_the_release_check(monkeypatch, capsys):
+    check = loaded("release_check")
+
+    def failing(*_):
+        raise check.CheckError("pip check: exit 1: a requires b")
+
+    monkeypatch.setattr(check, "build", failing)
+    monkeypatch.setattr(check, "offline", lambda _: "")
+    for flags in ([], ["--skip-offline"]):
+        monkeypatch.setattr(sys, "argv", ["release_check.py", "--pythons", "this", *flags])
+        assert check.main() == 1
+        assert "a requires b" in capsys.readouterr().err
+    # Who does not ask for it gets no skip.
+    monkeypatch.setattr(check, "offline", lambda _: "no network")
+    monkeypatch.setattr(sys, "argv", ["release_check.py", "--pythons", "this"])
+    assert check.main() == 1
 
 
 def test_the_release_check_asks_pythons_that_are_new_enough(monkeypatch):

@@ -2,4 +2,5 @@
 
 `record` keeps what was exported, `views` renders a run's or dataset's frames again, `frames` yields them by name,
 `table` reads a table of normals, `answers` looks them up as an estimator does, `run` makes a run's results of them.
+`dense` scores maps of normals or depths.
 """

@@ -76,7 +76,7 @@ def scene_json(content: Content) -> PlotlyJson:
     layout: PlotlyJson = {
         "height": HEIGHT_PX, "margin": MARGIN, "dragmode": "orbit",
         "scene": {"aspectmode": "data", **axes,
-                  "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.25, "y": -0.95, "z": -1.4}}},
+                  "camera": {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.5, "y": -1.14, "z": -1.68}}},
         "updatemenus": [{"type": "buttons", "direction": "right", "buttons": buttons, "x": 0, "y": 1,
                          "xanchor": "left", "yanchor": "top", **BUTTONS}],
     }  # fmt: skip

@@ -1,0 +1,160 @@
+"""Depth maps: what their values count, how they are aligned with the truth, and the normals that they imply."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.files import JsonObject
+from simtest.runtime.seeds import from_integer
+from simtest.validation.depth_maps import depth_normals
+
+DepthKind = Literal["z", "ray"]
+KINDS: tuple[DepthKind, ...] = ("z", "ray")
+"""Along the optical axis, or along the pixel's ray."""
+
+Alignment = Literal["none", "scale", "affine"]
+ALIGNMENTS: tuple[Alignment, ...] = ("none", "scale", "affine")
+"""As stated; times a factor a frame; times a factor plus a shift a frame."""
+
+ROUNDS = 20
+TUNING = 4.685
+"""Of Tukey's weights, in standard deviations: 95 % as efficient as least squares on normal errors."""
+
+TRIALS, JUDGED = 100, 2000
+"""Pairs of pixels that the affine start tries, and pixels that judge each, at least."""
+
+MOST_PIXELS = 20_000
+"""Pixels of a frame that fit its alignment, evenly spread."""
+
+MAD_TO_SIGMA = 1.4826
+LEAST_PIXELS = 3
+
+CLEAR_RATIO = 1.02
+"""By such a factor at least the residuals of one kind of depth are below those of the other."""
+
+
+def depth_factor(camera: Camera, kind: DepthKind) -> Array:
+    """Return the depth of a kind over the distance along the ray, at each pixel's centre, shape (H, W)."""
+    if kind == "ray":
+        return np.ones((camera.height, camera.width))
+    z = camera.unproject(camera.pixel_centres())[..., 2]
+    return np.where(z > 0, z, np.nan)
+
+
+def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
+    """Return the factor and the shift, in the truth's unit, that bring depths to the truth.
+
+    They minimise the relative residuals (a depth + b - t) / t by iteratively reweighted least squares with Tukey's
+    weights [Beaton & Tukey 1974], from a least-median start [Rousseeuw 1984]: up to nearly half of the pixels may be
+    wrong.
+
+    Parameters
+    ----------
+    depth, truth : ndarray, shape (N,)
+        Positive and finite.
+    how : str
+        One of `ALIGNMENTS`.
+
+    Returns
+    -------
+    factor, shift : float
+        NaN where there are too few pixels.
+    """
+    if how == "none":
+        return 1.0, 0.0
+    if len(depth) < LEAST_PIXELS:
+        return float("nan"), float("nan")
+    every = max(1, len(depth) // MOST_PIXELS)
+    depth, truth = depth[::every], truth[::every]
+    columns = [depth / truth] if how == "scale" else [depth / truth, 1 / truth]
+    design = np.stack(columns, axis=1)
+    fitted = _start(design)
+    for _ in range(ROUNDS):
+        residual = np.abs(design @ fitted - 1)
+        reach = TUNING * max(MAD_TO_SIGMA * float(np.median(residual)), 1e-12)
+        weight = np.where(residual < reach, (1 - (residual / reach) ** 2) ** 2, 0.0)
+        weighed = design * weight[:, None]
+        last, fitted = fitted, np.linalg.lstsq(weighed.T @ design, weighed.sum(axis=0), rcond=None)[0]
+        if np.allclose(last, fitted, rtol=1e-10, atol=1e-12):
+            break
+    return float(fitted[0]), float(fitted[1]) if how == "affine" else 0.0
+
+
+def _start(design: Array) -> Array:
+    """Return the fit through one or two pixels with the least median residual, among `TRIALS` draws."""
+    if design.shape[1] == 1:
+        return np.array([1 / np.median(design[:, 0])])
+    rng = from_integer(0)
+    tried = design[:: max(1, len(design) // JUDGED)]
+    best, least = np.array([1 / np.median(design[:, 0]), 0.0]), np.inf
+    for _ in range(TRIALS):
+        pair = design[rng.choice(len(design), 2, replace=False)]
+        if abs(np.linalg.det(pair)) < 1e-12:
+            continue
+        fitted = np.linalg.solve(pair, np.ones(2))
+        median = float(np.median(np.abs(tried @ fitted - 1)))
+        if median < least:
+            best, least = fitted, median
+    return best
+
+
+def normals_of_distance(distance: Array, rays: Array) -> Array:
+    """Return the normals of a map of distances along the rays, shape (H, W, 3); NaN where there is none.
+
+    The points lie on the camera's own rays, and the normal is perpendicular to their central differences: exact on a
+    plane, through any lens. A pixel next to a hole, a fold's edge or the frame's border has none.
+    """
+    return depth_normals(distance[..., None] * rays, radius_px=1)
+
+
+@dataclass
+class DepthEvidence:
+    """How well depths fit the truth as each kind, over all frames that were added."""
+
+    spreads: dict[DepthKind, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    """Spread of the logarithm of truth over depth, a frame: 0 where a factor alone is missing."""
+
+    def add(self, depth: Array, distance: Array, factors: dict[DepthKind, Array]) -> None:
+        """Add a frame: depths, true distances and `depth_factor` of its answered pixels, shape (N,)."""
+        if len(depth) < LEAST_PIXELS:
+            return
+        spreads = {kind: _spread(np.log(distance * factors[kind] / depth)) for kind in KINDS}
+        for kind, value in spreads.items():
+            self.spreads[kind].append(value)
+
+    @property
+    def best(self) -> DepthKind:
+        """The kind that fits best so far."""
+        return min(KINDS, key=self._mean)
+
+    def _mean(self, kind: DepthKind) -> float:
+        return float(np.mean(self.spreads[kind])) if self.spreads[kind] else 0.0
+
+    def decide(self, what: str) -> DepthKind:
+        """Return the kind that fits best by a clear margin; raise `InputError` where both fit alike."""
+        best = self.best
+        other = next(kind for kind in KINDS if kind != best)
+        if self._mean(other) <= CLEAR_RATIO * self._mean(best) or not self.spreads[best]:
+            raise InputError(
+                f"{what}: depths fit the truth alike along the axis and along the ray (spreads {self._mean('z'):.3g} "
+                f"and {self._mean('ray'):.3g}); say which: --depth z or --depth ray"
+            )
+        return best
+
+    def to_json(self) -> JsonObject:
+        """Return the mean spread of each kind."""
+        return {f"spread_{kind}": self._mean(kind) for kind in KINDS if self.spreads[kind]}
+
+
+def _spread(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+
+
+def answered(depth: Array, scored: Mask) -> Mask:
+    """Return the scored pixels that have a depth, shape (H, W)."""
+    return np.asarray(scored & np.isfinite(depth))

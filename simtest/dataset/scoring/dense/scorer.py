@@ -1,0 +1,152 @@
+"""Scores maps frame by frame: angles and depth errors go into tallies, and each frame leaves its rows."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtest.dataset.scoring.dense.cells import CELLS, ZONE_CELLS, labels
+from simtest.dataset.scoring.dense.conventions import Answer, Conventions, MapOptions
+from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, answered, depth_factor, normals_of_distance
+from simtest.dataset.scoring.dense.frame_truth import SURFACES, FrameTruth
+from simtest.dataset.scoring.dense.map_files import decode_depth
+from simtest.dataset.scoring.dense.tally import Tally, named
+from simtest.geometry.vectors import angle_deg
+from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.files import JsonObject
+
+ANGLE, DEPTH = "angle_deg", "depth_percent"
+"""What is measured: the angle between estimated and true normal, and the depth's error as a share of the distance."""
+
+BELOW = {ANGLE: (5.0, 11.25, 22.5, 30.0), DEPTH: (1.0, 5.0, 10.0, 25.0)}
+"""Thresholds below which the share of the pixels is reported."""
+
+NORMAL = "normal"
+
+
+def depth_source(how: str) -> str:
+    """Return the name of the source of normals and depths that an alignment gives."""
+    return f"depth_{how}"
+
+
+SOURCES = (NORMAL, *map(depth_source, ALIGNMENTS))
+"""Where normals come from: a normal map, or a depth map after each alignment."""
+
+Key = tuple[str, str, str]
+"""Source, quantity, surface."""
+
+
+@dataclass
+class Scorer:
+    """The figures of all frames that were added, read by the same conventions.
+
+    Parameters
+    ----------
+    options : MapOptions
+        What the user stated.
+    conventions : Conventions
+        How maps are read.
+    """
+
+    options: MapOptions
+    conventions: Conventions
+    tallies: dict[Key, Tally] = field(default_factory=dict)
+    rows: list[JsonObject] = field(default_factory=list)
+    alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    """Sources that some frame has; a frame without one counts as unanswered there."""
+    _cells: list[tuple[Key, JsonObject]] = field(default_factory=list)
+    _told_rows: int = 0
+
+    def add(self, truth: FrameTruth, answer: Answer) -> dict[str, Array]:
+        """Score a frame; return the normals of each source, shape (H, W, 3), NaN where it has none."""
+        normals, distances = self._read(truth, answer)
+        for surface in SURFACES:
+            sorted_in = labels(truth, surface)
+            for source in self.sources:
+                estimate = normals.get(source)
+                true = truth.normal[surface][truth.scored]
+                values = np.full(len(true), np.nan) if estimate is None else angle_deg(estimate[truth.scored], true)
+                self._count((source, ANGLE, surface), truth, values, sorted_in)
+        for source in self.sources:
+            if source != NORMAL:
+                distance = distances.get(source)
+                true = truth.distance[truth.scored]
+                values = np.full(len(true), np.nan) if distance is None else (
+                    100 * np.abs(distance[truth.scored] / true - 1)
+                )  # fmt: skip
+                self._count((source, DEPTH, "fine"), truth, values, labels(truth, "fine"))
+        return normals
+
+    def _read(self, truth: FrameTruth, answer: Answer) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return the normals and, of depths, the distances along the rays, by source."""
+        normals: dict[str, Array] = {}
+        distances: dict[str, Array] = {}
+        if answer.normal is not None:
+            normals[NORMAL] = self.conventions.normals(answer.normal)
+        if answer.depth is not None:
+            depth = decode_depth(answer.depth, self.options.unit_mm)
+            factor = depth_factor(truth.camera, self.conventions.depth)
+            rays = truth.camera.unproject(truth.camera.pixel_centres())
+            true, fitted_on = truth.distance * factor, answered(depth, truth.scored & np.isfinite(factor))
+            for how in ALIGNMENTS:
+                a, b = align(depth[fitted_on], true[fitted_on], how)
+                self.alignments.setdefault(how, []).append((a, b))
+                aligned = (a * depth + b) / factor
+                aligned[~(aligned > 0)] = np.nan
+                distances[depth_source(how)] = aligned
+                # A factor turns no normal.
+                as_stated = normals.get(depth_source("none")) if b == 0 and a > 0 else None
+                normals[depth_source(how)] = normals_of_distance(aligned, rays) if as_stated is None else as_stated
+        return normals, distances
+
+    def _count(self, key: Key, truth: FrameTruth, values: Array, sorted_in: list[IntArray]) -> None:
+        source, quantity, surface = key
+        below = BELOW[quantity]
+        if key not in self.tallies:
+            self.tallies[key] = Tally(len(CELLS), below)
+        sums = self.tallies[key].add(truth.name, values, sorted_in)
+        common = {"frame": truth.name, "setting": truth.setting, **truth.swept, "source": source,
+                  "quantity": quantity, "surface": surface}  # fmt: skip
+        for number, cell in enumerate(CELLS):
+            if sums[number, 0] + sums[number, 1] == 0:
+                continue
+            # Exact quantiles of the frame's zones; of the bins its sums.
+            own = np.empty(0)
+            if number < len(ZONE_CELLS):
+                own = values[sorted_in[0 if number == 0 else 1] == number]
+                own = own[np.isfinite(own)]
+            self.rows.append({
+                **common, "group": cell.group, "label": cell.label, "scope": cell.scope,
+                "n": int(sums[number, 0] + sums[number, 1]), "n_unanswered": int(sums[number, 1]),
+                **named(sums[number], below),
+                "median": float(np.median(own)) if own.size else None,
+                "p95": float(np.percentile(own, 95)) if own.size else None,
+            })  # fmt: skip
+
+    def alignment_summary(self) -> JsonObject:
+        """Return median, least and largest factor and shift of each alignment over the frames."""
+        summary: JsonObject = {}
+        for how, pairs in self.alignments.items():
+            values = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
+            if how == "none" or not len(values):
+                continue
+            own: JsonObject = {"frames": len(values)}
+            for column, name in enumerate(("factor", "shift_mm")):
+                if name == "factor" or how == "affine":
+                    part = values[:, column]
+                    own[name] = {"median": float(np.median(part)), "least": float(part.min()),
+                                 "largest": float(part.max())}  # fmt: skip
+            summary[how] = own
+        return summary
+
+    def cells(self) -> list[tuple[Key, JsonObject]]:
+        """Return the figures of every cell that holds a pixel."""
+        if len(self.rows) != self._told_rows:
+            self._cells = [
+                (key, {"group": cell.group, "label": cell.label, "scope": cell.scope, **tally.figures(number)})
+                for key, tally in self.tallies.items()
+                for number, cell in enumerate(CELLS)
+                if tally.frames[number]
+            ]
+            self._told_rows = len(self.rows)
+        return self._cells

@@ -1,0 +1,154 @@
+"""`simtest score` of maps, from the command line, on rendered frames: tissue, a lens, a view mask, an instrument."""
+
+import json
+
+import numpy as np
+import pytest
+from dense_frames import turned, write_png
+
+from simtest.dataset.scoring.dense.from_folder import frames_of
+
+pytestmark = pytest.mark.render
+
+EXPERIMENT = """
+title = "Dense"
+description = "Frames for maps."
+realisations = 1
+seed = 4242
+estimators = ["brightest_point"]
+
+[[groups]]
+scene = "saddle"
+label = "tissue"
+pool = [{ "surface.distance_mm" = [14.0, 18.0] }]
+[groups.set]
+"surface.relief" = { bands = [{ slope_deg = 4.0, wavelength_mm = 2.0 }] }
+reflectance = { type = "tissue", albedo = { preset = "liver_capsule" }, film = { index = 1.35, alpha = 0.05 } }
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 90.0
+"camera.fy" = 90.0
+"camera.view_mask.radius" = 55.0
+"camera.distortion.type" = "brown_conrady"
+"camera.distortion.k1" = -0.1
+"render.samples_per_pixel" = 1
+
+[[groups]]
+scene = "cylinder"
+label = "fisheye"
+[groups.set]
+"camera.width" = 128
+"camera.height" = 96
+"camera.fx" = 60.0
+"camera.fy" = 60.0
+"camera.distortion.type" = "kannala_brandt"
+"surface.tilt_deg" = 20.0
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Return the folder of a small run whose frames were exported, and the truth of these."""
+    import simtest
+
+    folder = tmp_path_factory.mktemp("dense")
+    (folder / "small.toml").write_text(EXPERIMENT)
+    simtest.validate(folder / "small.toml", folder / "run", export=folder / "frames")
+    return folder / "run", list(frames_of(folder / "run"))
+
+
+def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
+    on, truths = run
+    assert len(truths) == 3
+    assert {truth.excluded["outside_view"] > 0 for truth in truths if truth.setting == "tissue"} == {True}
+    (tmp_path / "maps").mkdir()
+    for seed, truth in enumerate(truths):
+        # Relief: against the fine surface a degree is scored, against the base more.
+        write_png(tmp_path / "maps" / f"{truth.name}.png", turned(truth.normal["fine"], 1.0, seed) * [1, -1, -1])
+    code, output, errors = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored")
+    assert (code, [line for line in errors if "Error" in line]) == (0, [])
+    assert "x,-y,-z (opengl), found out" in output.replace("\n", " ")
+    record = json.loads((tmp_path / "scored" / "dense.json").read_text())
+    cells = record["sources"]["normal"]["angle_deg"]
+    for cell in cells["fine"]:
+        assert cell["mean"] == pytest.approx(1.0, abs=1e-3), cell
+        assert cell["median"] == pytest.approx(1.0, abs=4e-3), cell
+    assert cells["base"][0]["mean"] > 1.5
+    assert record["counts"]["scored"] == sum(int(truth.scored.sum()) for truth in truths)
+    assert "wall" not in json.dumps(record["counts"])
+
+
+@pytest.mark.slow
+def test_maps_in_npy_are_exact(run, here, tmp_path):
+    on, truths = run
+    (tmp_path / "maps").mkdir()
+    for seed, truth in enumerate(truths):
+        np.save(tmp_path / "maps" / f"{truth.name}.npy", turned(truth.normal["fine"], 1.0, seed))
+    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored", "--json")
+    assert code == 0
+    record = json.loads(output)
+    means = [cell["mean"] for cell in record["sources"]["normal"]["angle_deg"]["fine"]]
+    np.testing.assert_allclose(means, 1.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_maps_in_exr_are_read(run, here, tmp_path):
+    from simtest.rendering.bitmap import write_exr
+
+    on, truths = run
+    (tmp_path / "maps").mkdir()
+    for truth in truths:
+        write_exr(tmp_path / "maps" / f"{truth.name}_depth.exr", truth.distance)
+    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored", "--json")
+    assert code == 0
+    record = json.loads(output)
+    assert record["conventions"]["depths"]["along"] == "ray"
+    assert record["sources"]["depth_none"]["depth_percent"]["fine"][0]["p95"] < 1e-4
+
+
+@pytest.mark.slow
+def test_the_baseline_is_scored_by_its_name(run, here, tmp_path):
+    code, output, _ = here("score", "shading", "--on", run[0], "--out", tmp_path / "scored")
+    assert code == 0
+    assert (tmp_path / "scored" / "index.html").is_file()
+    assert "depth_affine" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--encoding", "rgb"], "--encoding rgb: unknown"),
+        (["--frame", "north"], "--frame north: unknown"),
+        (["--depth", "far"], "--depth far: unknown"),
+        (["--unit-mm", "0"], "--unit-mm 0: must be"),
+    ],
+)
+def test_wrong_options_are_one_line(run, here, tmp_path, options, message):
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "a.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored", *options)
+    assert code != 0
+    assert message in errors[-1]
+    assert not (tmp_path / "scored" / "dense.json").exists()
+
+
+def test_options_of_maps_are_refused_for_a_table(run, here, tmp_path):
+    (tmp_path / "table.csv").write_text("frame,x_px,y_px,normal_x,normal_y,normal_z\n")
+    code, _, errors = here("score", tmp_path / "table.csv", "--on", run[0], "--frame", "opengl")
+    assert code != 0
+    assert "for folders of maps alone" in errors[-1]
+
+
+def test_a_run_is_not_written_over(run, here, tmp_path):
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "a.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", run[0])
+    assert code != 0
+    assert "holds another page" in errors[-1]
+
+
+def test_the_command_knows_the_methods():
+    from simtest.cli.dense_score import WORDS
+    from simtest.dataset.scoring.dense import METHODS
+
+    assert set(WORDS) == set(METHODS)

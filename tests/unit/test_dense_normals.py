@@ -1,0 +1,285 @@
+"""Normal maps: encodings, axes that are stated or found out, and angles in every cell."""
+
+import cv2
+import numpy as np
+import pytest
+from dense_frames import LENSES, sphere_truth, turned, write_png
+
+from simtest.dataset.scoring.dense import MapFolder, MapOptions, score_frames
+from simtest.dataset.scoring.dense.axes import ALL, matrix, parse_axes
+from simtest.dataset.scoring.dense.frame_truth import frame_truth
+from simtest.dataset.scoring.dense.tally import Tally
+from simtest.dataset.scoring.dense.zones import zones
+from simtest.errors import InputError
+
+
+def angles(score, figure, source="normal"):
+    return np.array([cell[figure] for key, cell in score.scorer.cells() if key[0] == source and key[1] == "angle_deg"])
+
+
+def scored(folder, *truths, **options):
+    return score_frames(lambda: truths, MapFolder(folder), MapOptions(**options))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_normals_turned_by_one_degree_score_one_degree_in_every_cell(lens, tmp_path):
+    truths = [sphere_truth(name, LENSES[lens], centre=(x, -2.0, 30.0)) for name, x in (("a", 3.0), ("b", -6.0))]
+    for seed, truth in enumerate(truths):
+        np.save(tmp_path / f"{truth.name}.npy", turned(truth.normal["fine"], 1.0, seed))
+    score = scored(tmp_path, *truths)
+    assert len(angles(score, "mean")) > 30
+    for figure in ("mean", "median", "rms", "p95", "mean_penalised"):
+        np.testing.assert_allclose(angles(score, figure), 1.0, atol=1e-9)
+    assert score.conventions.axes == "x,y,z"
+    low, high = score.cell("normal")["ci95"]["median"]
+    assert low == pytest.approx(1.0, abs=1e-9)
+    assert high == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("bits", "tolerance"), [(16, 1e-3), (8, 0.1)])
+def test_png_costs_no_more_than_its_steps(bits, tolerance, tmp_path):
+    truth = sphere_truth()
+    write_png(tmp_path / "a.png", turned(truth.normal["fine"], 1.0), bits)
+    np.testing.assert_allclose(angles(scored(tmp_path, truth), "mean"), 1.0, atol=tolerance)
+    write_png(tmp_path / "a.png", truth.normal["fine"], bits)
+    # The truth itself scores the quantisation alone.
+    assert angles(scored(tmp_path, truth), "mean").max() < {16: 0.002, 8: 0.4}[bits]
+
+
+@pytest.mark.parametrize(
+    ("axes", "told"),
+    [("x,-y,z", "x,-y,z"), ("x,-y,-z", "opengl"), ("x,y,-z", "directx"), ("-z,-y,x", "-z,-y,x"), ("y,x,z", "y,x,z")],
+)
+def test_other_axes_are_found_out_and_told(axes, told, tmp_path):
+    truth = sphere_truth()
+    # The transpose brings the camera frame to the channels.
+    write_png(tmp_path / "a.png", turned(truth.normal["fine"], 1.0) @ matrix(axes))
+    score = scored(tmp_path, truth)
+    assert score.conventions.axes == axes
+    assert any(told in line and "found out" in line for line in score.lines)
+    assert score.to_json()["conventions"]["normals"]["axes_stated"] is False
+    np.testing.assert_allclose(angles(score, "mean"), 1.0, atol=1e-3)
+
+
+def test_all_48_axes_differ_and_are_parsed():
+    assert len({matrix(axes).tobytes() for axes in ALL}) == 48
+    assert parse_axes("+X, -y, z") == "x,-y,z"
+    assert parse_axes("OpenGL") == "x,-y,-z"
+    for wrong in ("x,y", "x,x,z", "world", ""):
+        with pytest.raises(InputError, match="--frame"):
+            parse_axes(wrong)
+
+
+def test_stated_axes_are_taken_as_they_are(tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a.npy", truth.normal["fine"])
+    score = scored(tmp_path, truth, frame="x,-y,z")
+    assert score.cell("normal")["mean"] > 10
+    assert any("as stated" in line for line in score.lines)
+
+
+def test_axes_that_fit_alike_are_refused(tmp_path):
+    truth = sphere_truth()
+    flat = np.broadcast_to([0.0, 0.0, -1.0], truth.normal["fine"].shape).copy()
+    np.save(tmp_path / "a.npy", flat)
+    with pytest.raises(InputError, match=r"fit the truth alike .* --frame") as refused:
+        scored(tmp_path, truth)
+    assert "\n" not in str(refused.value)
+    assert scored(tmp_path, truth, frame="opencv").cell("normal")["n"] == truth.scored.sum()
+
+
+def test_normals_that_fit_with_no_axes_are_refused(tmp_path):
+    truth = sphere_truth()
+    noise = np.random.default_rng(1).normal(size=truth.normal["fine"].shape)
+    np.save(tmp_path / "a.npy", noise)
+    with pytest.raises(InputError, match="fit the truth with no axes"):
+        scored(tmp_path, truth)
+
+
+def test_the_choice_is_that_of_all_frames_even_if_the_first_misleads(tmp_path):
+    # The first frame's map is another's: by itself it would choose flipped axes.
+    truths = [sphere_truth(name, centre=(x, -2.0, 30.0)) for name, x in zip("abcdef", range(-6, 6, 2), strict=True)]
+    flipped = matrix("-x,-y,z")
+    for truth in truths:
+        normal = truth.normal["fine"] @ (flipped if truth.name == "a" else np.eye(3))
+        np.save(tmp_path / f"{truth.name}.npy", normal)
+    score = scored(tmp_path, *truths)
+    assert score.conventions.axes == "x,y,z"
+    stated = scored(tmp_path, *truths, frame="opencv")
+    np.testing.assert_array_equal(angles(score, "mean"), angles(stated, "mean"))
+    assert score.counts["frames"] == 6
+
+
+@pytest.mark.parametrize(("encoding", "stated"), [("positive_z", None), ("unit", None), ("centred", "centred")])
+def test_encodings_of_integers(encoding, stated, tmp_path):
+    truth = sphere_truth()
+    # Seen by the camera, z towards the viewer is positive but at steep rims.
+    vectors = turned(truth.normal["fine"], 1.0) * [1, -1, -1]
+    vectors[vectors[..., 2] < 0] = np.nan
+    write_png(tmp_path / "a.png", vectors, 16, encoding)
+    score = scored(tmp_path, truth, encoding=stated)
+    assert (score.conventions.encoding, score.conventions.axes) == (encoding, "x,-y,-z")
+    np.testing.assert_allclose(angles(score, "mean"), 1.0, atol=1e-3)
+
+
+def test_floats_between_0_and_1_are_found_out(tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a.npy", ((truth.normal["fine"] + 1) / 2).astype(np.float32))
+    score = scored(tmp_path, truth)
+    assert score.conventions.encoding == "unit"
+    assert score.cell("normal")["p95"] < 1e-3
+
+
+def test_channels_first_are_read(tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a.npy", np.moveaxis(truth.normal["fine"], -1, 0))
+    assert scored(tmp_path, truth).cell("normal")["p95"] < 1e-4
+
+
+def test_a_first_frame_without_an_answer_does_not_decide_how_others_are_read(tmp_path):
+    first, second = sphere_truth("a"), sphere_truth("b")
+    np.save(tmp_path / "a.npy", np.full(first.normal["fine"].shape, np.nan))
+    np.save(tmp_path / "b.npy", second.normal["fine"])
+    cell = scored(tmp_path, first, second).cell("normal")
+    assert cell["share_unanswered"] == 0.5
+    assert cell["p95"] < 1e-4
+
+
+def test_pixels_without_an_answer_are_counted(tmp_path):
+    truth = sphere_truth()
+    vectors = turned(truth.normal["fine"], 1.0)
+    vectors[:, :24] = np.nan
+    vectors[:, 24:48] = 0.0
+    np.save(tmp_path / "a.npy", vectors)
+    cell = scored(tmp_path, truth).cell("normal")
+    assert cell["n"] == truth.scored.sum()
+    assert cell["share_unanswered"] == pytest.approx(0.5)
+    assert cell["mean"] == pytest.approx(1.0)
+    # An unanswered pixel lies below no threshold, and counts as 90 deg in the penalised mean.
+    assert cell["below_30"] == pytest.approx(0.5)
+    assert cell["mean_penalised"] == pytest.approx(45.5)
+
+
+def test_alpha_and_grey_are_no_answer(tmp_path):
+    truth = sphere_truth()
+    counts = np.rint(255 * (truth.normal["fine"] + 1) / 2).astype(np.uint8)
+    alpha = np.full((*counts.shape[:2], 1), 255, np.uint8)
+    alpha[:, :24] = 0
+    counts[:, 24:48] = 128
+    cv2.imwrite(str(tmp_path / "a.png"), np.concatenate([counts[:, :, ::-1], alpha], axis=2))
+    assert scored(tmp_path, truth).cell("normal")["share_unanswered"] == pytest.approx(0.5)
+
+
+def test_a_frame_without_a_map_is_unanswered_as_a_whole(tmp_path):
+    truths = [sphere_truth("a"), sphere_truth("b")]
+    np.save(tmp_path / "a.npy", truths[0].normal["fine"])
+    score = scored(tmp_path, *truths)
+    assert score.counts["frames_without_map"] == 1
+    assert score.cell("normal")["share_unanswered"] == pytest.approx(0.5)
+    assert any("1 of them without a map" in line for line in score.lines)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder, n: np.save(folder / "a.npy", n[:-1]), "is 96 x 71 px; must be 96 x 72"),
+        (lambda folder, n: np.save(folder / "a.npy", n[..., :2]), "has shape"),
+        (lambda folder, n: np.save(folder / "other.npy", n), "no map is called as a frame"),
+        (lambda folder, n: (folder / "a.txt").write_text("1"), "holds no maps"),
+        (lambda folder, n: np.save(folder / "a.npy", (100 * n).astype(np.int64)), "normals are int64"),
+        (lambda folder, n: np.save(folder / "a_normal.npy", n[..., 0]), "has one channel"),
+        (
+            lambda folder, n: (np.save(folder / "a.npy", n), write_png(folder / "a.png", n)),
+            "a second map of frame a",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(make, message, tmp_path):
+    truth = sphere_truth()
+    make(tmp_path, truth.normal["fine"])
+    with pytest.raises(InputError, match=message) as refused:
+        scored(tmp_path, truth)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("stated", [{"encoding": "rgb"}, {"frame": "up"}, {"depth": "inverse"}, {"unit_mm": -1.0}])
+def test_options_that_are_unknown_are_refused(stated, tmp_path):
+    np.save(tmp_path / "a.npy", sphere_truth().normal["fine"])
+    with pytest.raises(InputError, match=r"^--(encoding|frame|depth|unit-mm)"):
+        scored(tmp_path, sphere_truth(), **stated)
+
+
+def test_maps_of_no_frame_are_told(tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a.npy", truth.normal["fine"])
+    np.save(tmp_path / "z.npy", truth.normal["fine"])
+    with pytest.warns(UserWarning, match="no such frame"):
+        scored(tmp_path, truth)
+
+
+def test_zones_are_rings_in_radii_of_the_highlight():
+    regions = np.zeros((101, 101), dtype=np.int64)
+    y, x = np.mgrid[:101, :101] - 50
+    regions[np.hypot(x, y) <= 8] = 1
+    found = zones(regions)[50, 50:]
+    assert (found[:9] == 0).all()
+    # The radius is that of the circle of the same area; the rings begin at the edge, between pixels.
+    np.testing.assert_array_equal([found[k] for k in (9, 15, 17, 23, 26, 38, 42, 50)], [1, 1, 2, 2, 3, 3, 4, 4])
+    assert (zones(np.zeros((5, 5), dtype=np.int64)) == 4).all()
+
+
+def test_pixels_off_the_view_the_surface_and_on_metal_are_excluded_and_counted():
+    truth = sphere_truth()
+    height, width = truth.size
+    mask, instrument = np.ones((height, width), dtype=bool), np.zeros((height, width), dtype=np.uint8)
+    mask[:10], instrument[20:40, 40:60] = False, 1
+    regions = np.zeros((height, width), dtype=np.int64)
+    regions[25:30, 45:50], regions[60:64, 10:14] = 1, 2
+    from types import SimpleNamespace
+
+    curvature = truth.curvature["fine"]
+    maps = SimpleNamespace(
+        normal=truth.normal["fine"], normal_base=truth.normal["fine"], mask=mask, instrument=instrument,
+        depth=truth.distance, larger_curvature=curvature, k_min_base=curvature, k_max_base=curvature,
+    )  # fmt: skip
+    made = frame_truth("a", maps, truth.camera, 1.0, regions)
+    assert made.excluded == {"outside_view": 0, "no_surface": 10 * width, "instrument": 400}
+    assert made.scored.sum() == height * width - 10 * width - 400
+    # The reflection on metal makes no zone.
+    assert (made.zone[60:64, 10:14] == 0).all()
+    assert made.zone[35, 70] != 0
+    assert not (made.zone[25:30, 45:50] == 0).any()
+
+
+def test_tallies_of_parts_add_up_whatever_their_order():
+    rng = np.random.default_rng(3)
+    frames = {name: rng.gamma(2.0, 5.0, 400) for name in "abcdefgh"}
+    label = [np.arange(400) % 3]
+    whole, first, second = (Tally(3, (5.0, 20.0)) for _ in range(3))
+    for name, values in frames.items():
+        whole.add(name, values, label)
+        (first if name < "d" else second).add(name, values, label)
+    second.merge(first)
+    for cell in range(3):
+        both = whole.figures(cell), second.figures(cell)
+        np.testing.assert_allclose(both[0]["median"], both[1]["median"], rtol=1e-9)
+        np.testing.assert_allclose(both[0]["ci95"]["mean"], both[1]["ci95"]["mean"], rtol=1e-6)
+    values = np.concatenate([own[np.arange(400) % 3 == 1] for own in frames.values()])
+    assert whole.figures(1)["median"] == pytest.approx(np.median(values), rel=0.01)
+    assert whole.figures(1)["p95"] == pytest.approx(np.percentile(values, 95), rel=0.01)
+    assert whole.figures(1)["mean"] == pytest.approx(values.mean())
+    assert whole.figures(1)["below_5"] == pytest.approx((values < 5).mean())
+
+
+def test_intervals_are_over_frames_not_pixels():
+    rng = np.random.default_rng(4)
+    few, tally, truth = Tally(1, ()), Tally(1, ()), []
+    for number in range(60):
+        centre = 10 + 2 * rng.standard_normal()
+        truth.append(centre)
+        tally.add(f"frame {number}", centre + 0.01 * rng.standard_normal(5000), [np.zeros(5000, dtype=np.int64)])
+    few.add("one", np.ones(10), [np.zeros(10, dtype=np.int64)])
+    low, high = tally.figures(0)["ci95"]["mean"]
+    # 1.96 standard errors over 60 frames on each side.
+    assert (high - low) / 2 == pytest.approx(1.96 * np.std(truth) / np.sqrt(60), rel=0.35)
+    assert few.figures(0)["ci95"] == {}
