@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from simtest.conventions import MOTION
 from simtest.errors import Failure, Reason
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.cone_axis import cone_axis
@@ -22,9 +23,6 @@ from simtest.spec import Experiment, Scene
 from simtest.spec.views import Moved, Views
 from simtest.validation.cases import Case
 from simtest.validation.results_table import ResultRow
-
-MOTION = "motion"
-"""Estimator of the rows."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from simtest.conventions import MOTION_COLUMNS
-from simtest.validation.motion import MOTION
+from simtest.conventions import MOTION, MOTION_COLUMNS
 from simtest.validation.statistics import share_interval
 
 
