@@ -68,3 +68,12 @@ EDGES_PER_HALF_WIDTH = 2.0
 
 ON_INSTRUMENT = "on_instrument"
 """Column of results of scenes with instruments: whether a detection shows one, and no true highlight."""
+
+MOTION = "motion"
+"""Estimator of the rows that hold what further views tell of curvatures."""
+
+MOTION_COLUMNS = (
+    "motion_over_d", "motion_sign_1", "motion_sign_2", "motion_gain_1", "motion_gain_2", "motion_margin_1",
+    "motion_margin_2", "motion_distance2", "motion_fits",
+)  # fmt: skip
+"""Columns of results of scenes with further views, all numbers (docs/howto/motion.md)."""

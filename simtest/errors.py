@@ -71,6 +71,7 @@ class Reason(StrEnum):
     UNRESOLVED = "unresolved"
     NOT_KNOWN = "not_known"
     NO_ESTIMATE = "no_estimate"
+    UNDECIDED = "undecided"
     ESTIMATOR_ERROR = "estimator_error"
     CORE_DIED = "core_died"
     CORE_TIMEOUT = "core_timeout"
@@ -95,6 +96,7 @@ _MEANINGS = {
     Reason.STREAK: "the spot is so long that its centre along it is not determined",
     Reason.UNRESOLVED: "the spot is too small to have a shape",
     Reason.NOT_KNOWN: "the estimator needs what the calibration does not tell, such as the lights' positions",
+    Reason.UNDECIDED: "the pictures do not tell the signs of the curvatures apart",
     Reason.NO_ESTIMATE: "the estimator found nothing that it could answer for",
     Reason.ESTIMATOR_ERROR: "the estimator stopped with an error",
     Reason.CORE_DIED: "the core's process ended before it answered",

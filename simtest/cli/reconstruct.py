@@ -72,6 +72,12 @@ Pose = Annotated[
 Depth = Annotated[
     str | None, Parameter(help="Depth at which normals.ply and arrows.ply stand: mm, or a depth map; default 1.")
 ]
+Poses = Annotated[
+    Path | None,
+    Parameter(
+        help="Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."
+    ),
+]
 DepthScale = Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")]
 
 
@@ -94,6 +100,7 @@ def reconstruct(
     camera_from_model: Pose = None,
     depth: Depth = None,
     depth_scale: DepthScale = None,
+    poses: Poses = None,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
@@ -110,9 +117,11 @@ def reconstruct(
     sequence = is_sequence(image)
     if sequence and (reference or camera_from_model or depth):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
+    if poses and not sequence:
+        raise InputError(f"{image}: --poses is for a folder or a film")
     box = None if roi is None else parse_roi(roi)
     names = None if estimators is None else tuple(estimators)
-    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target, fov_of)
+    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target, fov_of, poses)
     if sequence:
         _sequence(image, out, options, as_json)
         return
@@ -147,6 +156,8 @@ def _sequence(source: Path, out: Path, options: "Options", as_json: bool) -> Non
     unread = f", {made.failed} unreadable" if made.failed else ""
     found = counted(made.specularities, "specularity", "specularities")
     print(f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames")
+    if made.motion:
+        print(made.motion)
     print_files(made.files, as_json)
 
 

@@ -55,8 +55,8 @@ def validate(
     ----------
     experiment : str
         An experiment file, or the name of a shipped one: overview, curvature, light_offset, grid, laws, compare,
-        known_light, sensor, reflectance, relief, interreflection, rig, camera, anatomy, anatomy_sensor, dense, colon,
-        liver, mesh, paper, paper_limits.
+        known_light, sensor, reflectance, relief, interreflection, rig, camera, motion, anatomy, anatomy_sensor, dense,
+        colon, liver, mesh, paper, paper_limits.
     """
     from simtest.api import validate as run
     from simtest.cli.guide_table import print_guide

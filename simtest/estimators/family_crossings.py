@@ -57,6 +57,19 @@ class FamilyCrossings:
         C = C / -C[:, 2:, 2:]
         return np.array([C[:, 0, 0], 2 * C[:, 0, 1], C[:, 1, 1], 2 * C[:, 0, 2], 2 * C[:, 1, 2]]).T
 
+    @cached_property
+    def are_ellipses(self) -> Mask:
+        """Whether each isophote's conic is an ellipse across the axis, shape (K,).
+
+        A cone so wide that it reaches the plane at right angles to the mean axis is none, though its ellipse in the
+        picture is one.
+        """
+        a, b, c, d, e = self.conics.T
+        determinant = a * c - b * b / 4
+        size = determinant + (a * e * e - b * d * e + c * d * d) / 4
+        # a x^2 + ... = 1 is a real ellipse where det A > 0, and A has the sign of the right side about its centre.
+        return np.asarray((determinant > 0) & (a * size > 0))
+
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
         if self.camera.distortion is None:

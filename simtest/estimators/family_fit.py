@@ -40,8 +40,23 @@ def fit_isophote_families(
         if len(poses) < least:
             made.append(_with_arcs(patch, camera, isovalues, kept, failures))
         else:
-            made.append(_of_one(IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures)), least))
+            family = _of_ellipses(IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failures)), least)
+            made.append(family if isinstance(family, Failure) else _of_one(family, least))
     return made
+
+
+def _of_ellipses(family: IsophoteFamily, least: int) -> IsophoteFamily | Failure:
+    """Leave out isophotes that are no ellipses across the mean axis; a Failure where too few are left."""
+    while not (whole := family.are_ellipses).all():
+        # Without them the mean axis is another one.
+        failed = [Failure(Reason.NOT_AN_ELLIPSE, f"t = {i.isovalue:g} reaches too far off the mean axis")
+                  for i, good in zip(family.isophotes, whole, strict=True) if not good]  # fmt: skip
+        if whole.sum() < least:
+            return failed[0]
+        kept = np.flatnonzero(whole)
+        isophotes, poses = tuple(family.isophotes[i] for i in kept), tuple(family.poses[i] for i in kept)
+        family = IsophoteFamily(family.patch, family.camera, isophotes, poses, (*family.failures, *failed))
+    return family
 
 
 def _of_one(family: IsophoteFamily, least: int) -> IsophoteFamily:
@@ -70,7 +85,7 @@ def _with_arcs(
     ((kept, poses, failed),) = _with_poses([(sorted([*whole, *cut], key=lambda i: i.isovalue), failed)])
     if len(poses) < least:
         return failures[0]
-    return IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failed))
+    return _of_ellipses(IsophoteFamily(patch, camera, tuple(kept), tuple(poses), tuple(failed)), least)
 
 
 Posed = tuple[list[FittedIsophote], list[CirclePose], list[Failure]]

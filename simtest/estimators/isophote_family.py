@@ -338,6 +338,11 @@ class IsophoteFamily:
         return self.isophotes[0].isovalue if others else 0.0
 
     @property
+    def are_ellipses(self) -> Mask:
+        """Whether each isophote is an ellipse across the mean axis, shape (K,)."""
+        return self._crossings.are_ellipses
+
+    @property
     def residuals(self) -> Array:
         """RMS distance of each isophote's points from its conic, over its mean radius, shape (K,)."""
         return self._crossings.residuals

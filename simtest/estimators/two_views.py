@@ -1,19 +1,22 @@
-"""Two pictures of a highlight from known positions distinguish convex from concave [Z89].
+"""Pictures of a highlight from several known positions distinguish convex from concave [Z89].
 
 With light and camera at one position the highlight follows the camera over the surface: with a motion delta across the
 sightline the BP moves by u = (I + dS)^-1 delta, and its normal, hence its sightline, by dS u / d. One picture gives the
 sizes of 1 + d k (theory.md section 3, item 3), the motion their signs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.moved_patch import FirstPicture, Prediction
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array
+from simtest.geometry import Array, chi_squared
 from simtest.geometry.vectors import basis_across, tangent_coordinates
 
 GAIN_SD = 0.03
@@ -22,50 +25,152 @@ GAIN_SD = 0.03
 LEAST_SD = 1e-4
 """Standard deviation of a normal that states none, rad, and least allowance for the patch's third order."""
 
-CLEAR = 9.21
-"""Difference of two squared Mahalanobis distances that 1 % of normal pairs exceed by chance."""
+CHANGE_SD = 0.3
+"""Standard deviation of the relative change of the curvatures over one working distance along the surface."""
 
-STEPS = 30
-STEP = 1e-5
+WRONG_SHARE = 0.01
+"""Stated probability that a sign is told, and is wrong."""
+
+CLEAR = -2 * float(np.log(WRONG_SHARE))
+"""Least difference of two deviances for the better one to be told.
+
+Under a hypothesis, the likelihood of any other one exceeds its own by a factor of 1/p with a probability of p at most
+(Markov's inequality), whatever the number of pictures.
+"""
+
+FITS_SHARE = 0.999
+"""The best hypothesis explains the pictures unless its distance is beyond this quantile of chi-squared."""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Standard deviations of a camera's motion from one picture to another, independent between motions.
+
+    Parameters
+    ----------
+    translation : float
+        Of the translation along each axis, as a share of its length.
+    rotation : float
+        About each axis, rad.
+    """
+
+    translation: float = 0.0
+    rotation: float = 0.0
+
+
+EXACT = PoseError()
+
+
+@dataclass(frozen=True)
+class MovedView:
+    """A further picture of a highlight, from another position.
+
+    Parameters
+    ----------
+    estimates : sequence of Estimate
+        Of what may be the same highlight, of any estimator for a light at the camera. Each hypothesis takes the one
+        that it explains best, so that a false one is no evidence.
+    view_from_first : array_like, shape (4, 4)
+        The camera's motion: from the first camera's frame to this one's, mm.
+    error : PoseError
+        Of the motion.
+    """
+
+    estimates: Sequence[Estimate]
+    view_from_first: npt.ArrayLike
+    error: PoseError = EXACT
 
 
 @dataclass(frozen=True)
 class RankedHypotheses:
-    """The curvatures that one picture allows, ordered by how well they explain the second one.
+    """The curvatures that one picture allows, ordered by how well they explain the others.
 
     Parameters
     ----------
     hypotheses : ndarray, shape (H, 2)
         1 + d k along the first picture's principal directions, the best first.
     distance2 : ndarray, shape (H,)
-        Squared Mahalanobis distance of the second picture's normal from the predicted one; inf where the patch has no
-        highlight nearby for the second position.
+        Squared Mahalanobis distance of the other pictures' normals from the predicted ones.
     predicted : ndarray, shape (H, 3)
-        Predicted normals in the second camera's frame; NaN where there is none.
+        Predicted normals in the frame of the first other picture that was used.
+    deviance : ndarray, shape (H,)
+        Twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant.
+    freedom : int
+        Degrees of freedom of `distance2`: 2 for each further picture.
     """
 
     hypotheses: Array
     distance2: Array
     predicted: Array
+    deviance: Array
+    freedom: int = 2
 
     @property
     def margin(self) -> float:
-        """Distance of the second best less that of the best: twice the log of their likelihood ratio."""
-        return float(self.distance2[1] - self.distance2[0])
+        """By how much the best one is preferred to all others, >= 0 (see `sign_margins`)."""
+        return float(self._preferred[1:].min())
+
+    @property
+    def fits(self) -> bool:
+        """Whether the best hypothesis explains the other pictures; false too where poses are wrong or tissue moved."""
+        return bool(self.distance2[0] <= chi_squared.quantile(FITS_SHARE, self.freedom))
 
     @property
     def is_clear(self) -> bool:
-        """Whether the best one stands clear of all others."""
-        return self.margin > CLEAR
+        """Whether the best one explains the other pictures, and stands clear of all others."""
+        return self.fits and self.margin > CLEAR
+
+    @cached_property
+    def sign_margins(self) -> Array:
+        """By how much the sign of 1 + d k along each direction is preferred to the other one, shape (2,), >= 0.
+
+        The least difference of deviance, and of distance, of the hypotheses of the other sign from the best one. The
+        deviance alone bounds the probability to err; but it rejects what predicts little, such as a saddle of unknown
+        directions, where both explain the pictures equally well.
+        """
+        other = np.sign(self.hypotheses) != np.sign(self.hypotheses[0])
+        return np.array([self._preferred[of].min(initial=np.inf) for of in other.T])
+
+    def told_bends(self, gain_sd: float = GAIN_SD) -> tuple[int, int]:
+        """Sign of the curvature k along each direction, 0 where it is not told.
+
+        An abs(1 + d k) below 1 is that of a concave surface, whatever its sign; where it is 1 within the noise, the
+        surface may be flat.
+        """
+        told = []
+        for i, sign in enumerate(self.told_signs):
+            gains = self.hypotheses[:, i]
+            gains = gains[np.sign(gains) == sign] if sign else gains
+            bends = np.sign(gains - 1) * (np.abs(gains - 1) > 2 * gain_sd * np.abs(gains))
+            told.append(int(bends[0]) if (bends == bends[0]).all() else 0)
+        return told[0], told[1]
+
+    @cached_property
+    def _preferred(self) -> Array:
+        """By how much the best one is preferred to each, shape (H,)."""
+        more = np.minimum(self.distance2 - self.distance2[0], self.deviance - self.deviance[0])
+        return np.asarray(np.maximum(more, 0.0))
+
+    @property
+    def told_signs(self) -> tuple[int, int]:
+        """Sign of 1 + d k along each direction, 0 where the pictures do not tell it."""
+        told = (self.sign_margins > CLEAR) & self.fits
+        first, second = (np.sign(self.hypotheses[0]) * told).astype(int).tolist()
+        return first, second
 
 
 def rank_by_motion(
-    first: Estimate, second: Estimate, second_from_first: npt.ArrayLike, priors: Priors, gain_sd: float = GAIN_SD
+    first: Estimate,
+    second: Estimate,
+    second_from_first: npt.ArrayLike,
+    priors: Priors,
+    gain_sd: float = GAIN_SD,
+    pose_error: PoseError = EXACT,
 ) -> RankedHypotheses | Failure:
     """Rank the first picture's curvature hypotheses by the highlight's position in a second picture.
 
-    Each hypothesis is a quadric patch, on which the point is solved whose normal points at the second camera. A motion
-    along one principal direction determines that direction's sign alone: two hypotheses then remain equally good.
+    A motion along one principal direction determines that direction's sign alone: two hypotheses then remain equally
+    good. See `rank_by_motions`.
 
     Parameters
     ----------
@@ -79,108 +184,131 @@ def rank_by_motion(
         For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
     gain_sd : float
         Relative standard deviation of the first picture's abs(1 + d k), > 0.
+    pose_error : PoseError
+        Of the motion.
 
     Raises
     ------
     InputError
         If the motion is not rigid.
     """
-    R, t = _motion(second_from_first)
+    T = rigid(second_from_first, "second_from_first")
+    return rank_by_motions(first, [MovedView([second], T, pose_error)], priors, gain_sd)
+
+
+def rank_by_motions(
+    first: Estimate, views: Sequence[MovedView], priors: Priors, gain_sd: float = GAIN_SD
+) -> RankedHypotheses | Failure:
+    """Rank the first picture's curvature hypotheses by the highlight's positions in further pictures.
+
+    Each hypothesis is a quadric patch, on which the point is solved whose normal points at each further camera. What
+    all predictions share, the first picture's normal, distance, gains and principal directions, moves all of them at
+    once: the pictures' distances are not added, but taken together with their joint covariance.
+
+    Parameters
+    ----------
+    first : Estimate
+        See `rank_by_motion`, as for `priors` and `gain_sd`.
+    views : sequence of MovedView
+        Those without an estimate, and those too far off for the patch, are passed over. Where none is left a Failure
+        ``no_estimate`` or ``undecided``.
+
+    Raises
+    ------
+    InputError
+        If a motion is not rigid.
+    """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")
-    position, distance = -R.T @ t, priors.distance_mm
-    seen = R.T @ second.normal
-    hypotheses, distances, predictions = first.curvature.hypotheses, [], []
-    spread = np.array([1.0, 1.0, distance.sd / distance.mean, gain_sd, gain_sd])
-    for gains in hypotheses:
-        # predict the second picture's normal
-        values = np.array([0.0, 0.0, distance.mean, *gains])
-        predicted = _predicted(first, values, position)
-        if predicted is None:
-            distances.append(np.inf)
-            predictions.append(np.full(3, np.nan))
-            continue
-        # its distance from the one seen, by the noise of both, distance and gains
-        sources = _covariance_of_sources(first, spread)
-        J = _jacobian(first, values, position, predicted)
-        covariance = _turned(second, R, predicted) + LEAST_SD**2 * np.eye(2)
-        if J is not None:
-            covariance = covariance + J @ sources @ J.T
-        miss = tangent_coordinates(predicted, seen)
-        distances.append(float(miss @ np.linalg.solve(covariance, miss)))
-        predictions.append(R @ predicted)
-    order = np.argsort(distances, kind="stable")
-    return RankedHypotheses(hypotheses[order], np.array(distances)[order], np.array(predictions)[order])
+    used = [(view, rigid(view.view_from_first, "view_from_first")) for view in views if view.estimates]
+    if not used:
+        return Failure(Reason.NO_ESTIMATE, "no further picture shows the highlight")
+    covariance = np.zeros((2, 2)) if first.covariance is None else first.covariance
+    covariance = covariance + LEAST_SD**2 * np.eye(2) if first.covariance is None else covariance
+    distance_sd = priors.distance_mm.sd / priors.distance_mm.mean
+    hypotheses = first.curvature.hypotheses
+    pictures = [FirstPicture(first, priors.distance_mm.mean, gains) for gains in hypotheses]
+    # A view for which a patch has no highlight nearby lies too far off: what is missing there is no evidence.
+    explained = [[_explain(picture, view, T) for picture in pictures] for view, T in used]
+    near = [[each for each in of_view if each is not None] for of_view in explained]
+    near = [of_view for of_view in near if len(of_view) == len(pictures)]
+    if not near:
+        return Failure(Reason.UNDECIDED, "the camera moved farther than the curvatures at one point predict")
+    judged = []
+    for i, picture in enumerate(pictures):
+        sources = picture.sources(covariance, distance_sd, gain_sd)
+        judged.append(_judge([of_view[i] for of_view in near], sources))
+    distance2, deviance = (np.array([each[i] for each in judged]) for i in range(2))
+    predicted = np.array([each[2] for each in judged])
+    order = np.argsort(distance2, kind="stable")
+    return RankedHypotheses(
+        hypotheses[order], distance2[order], predicted[order], deviance[order], freedom=2 * len(near)
+    )
 
 
-def _motion(second_from_first: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return rotation and translation of a rigid motion, checked."""
-    T = np.asarray(second_from_first, dtype=float)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(f"second_from_first: shape {T.shape}; must be a finite 4 x 4 matrix")
-    R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise InputError("second_from_first: must be a rotation and a translation")
-    return R, T[:3, 3]
+@dataclass(frozen=True)
+class _Explained:
+    """A further picture under a hypothesis: what it predicts, and how far off the estimate is that fits best."""
+
+    predicted: Array  # normal in the view's own frame, shape (3,)
+    miss: Array  # of the estimate, in the tangent basis of the predicted normal, rad, shape (2,)
+    jacobian: Array  # of the prediction by `moved_patch.SOURCES`, shape (2, 6)
+    own: Array  # covariance of what this picture alone adds, shape (2, 2)
 
 
-def _predicted(first: Estimate, values: Array, position: Array) -> Array | None:
-    """Solve for the patch's normal that points at a position; None where Newton's method finds none.
-
-    `values`: rotation of the first normal in its tangent basis (2), rad, distance, and 1 + d k (2).
-    """
-    assert first.curvature is not None
-    turned, distance, gains = values[:2], values[2], values[3:]
-    N = first.normal + turned @ basis_across(first.normal)
-    N /= np.linalg.norm(N)
-    e = first.curvature.directions[0] - (first.curvature.directions[0] @ N) * N
-    e /= np.linalg.norm(e)
-    across = np.stack([e, np.cross(N, e)])
-    # In units of the distance the first camera is at (0, 0, 1), the second one at v.
-    v = np.append(across @ position, N @ position) / distance + [0.0, 0.0, 1.0]
-    K = gains - 1
-    x = v[:2] / gains
-    # Newton's method for the point x whose normal points at v, from the linear solution
-    for _ in range(STEPS):
-        height = v[2] + np.sum(K * x * x) / 2
-        off = v[:2] - x - height * K * x
-        slope = -np.diag(1 + height * K) - np.outer(K * x, K * x)
-        try:
-            step = np.linalg.solve(slope, off)
-        except np.linalg.LinAlgError:
-            return None
-        x = x - step
-        if not np.isfinite(x).all() or np.abs(x).max() > 10:  # diverged, or far off the patch
-            return None
-        if np.abs(step).max() < 1e-12:
-            normal = np.append(K * x, 1.0)
-            return np.asarray(normal @ np.concatenate([across, N[None]]) / np.linalg.norm(normal))
-    return None
+def _explain(picture: FirstPicture, view: MovedView, view_from_first: Array) -> _Explained | None:
+    """Explain a further picture by a hypothesis; None where the patch has no highlight nearby for its position."""
+    R, t = view_from_first[:3, :3], view_from_first[:3, 3]
+    position = -R.T @ t
+    prediction = picture.predict(position)
+    if prediction is None or (J := picture.jacobian(prediction)) is None:
+        return None
+    moved = _moved_by_pose(picture, prediction, view.error)
+    shape = prediction.shape_sd(CHANGE_SD) ** 2 + LEAST_SD**2
+    found = []
+    for estimate in view.estimates:
+        own = _turned(estimate, R, prediction.normal) + moved + shape * np.eye(2)
+        miss = tangent_coordinates(prediction.normal, R.T @ estimate.normal)
+        found.append(_Explained(R @ prediction.normal, miss, J, own))
+    return min(found, key=lambda each: float(each.miss @ np.linalg.solve(each.own, each.miss)))
 
 
-def _jacobian(first: Estimate, values: Array, position: Array, predicted: Array) -> Array | None:
-    """Differentiate the predicted normal, in its tangent basis, by rotation (2), log d and log(1 + d k); (2, 5)."""
-    basis, columns = basis_across(predicted), []
-    for i in range(5):
-        step = np.zeros(5)
-        step[i] = STEP if i < 2 else STEP * values[i]
-        moved = _predicted(first, values + step, position)
-        if moved is None:
-            return None
-        columns.append(basis @ (moved - predicted) / STEP)
-    return np.stack(columns, axis=1)
+def _judge(explained: Sequence[_Explained], sources: Array) -> tuple[float, float, Array]:
+    """Return squared distance and deviance of a hypothesis over all pictures, and the first predicted normal."""
+    # joint covariance: what each picture adds stands on the diagonal, what they share everywhere
+    J = np.concatenate([each.jacobian for each in explained])
+    covariance = J @ sources @ J.T
+    for i, each in enumerate(explained):
+        covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += each.own
+    miss = np.concatenate([each.miss for each in explained])
+    distance2 = float(miss @ np.linalg.solve(covariance, miss))
+    return distance2, distance2 + float(np.linalg.slogdet(covariance)[1]), explained[0].predicted
 
 
-def _covariance_of_sources(first: Estimate, spread: Array) -> Array:
-    """Return the covariance of what the prediction depends on, in the order of `_jacobian`, shape (5, 5)."""
-    made = np.diag(spread**2)
-    made[:2, :2] = LEAST_SD**2 * np.eye(2) if first.covariance is None else first.covariance
+def _moved_by_pose(picture: FirstPicture, prediction: Prediction, error: PoseError) -> Array:
+    """Return the covariance that the motion's error gives the difference of seen and predicted normal, (2, 2)."""
+    made = error.rotation**2 * np.eye(2)
+    if error.translation > 0:
+        by_position = picture.by_position(prediction)
+        sd = error.translation * float(np.linalg.norm(prediction.position))
+        made = made + sd**2 * by_position @ by_position.T
     return made
 
 
-def _turned(second: Estimate, R: Array, predicted: Array) -> Array:
-    """Return the second normal's covariance in the predicted one's tangent basis, first camera's frame."""
-    if second.covariance is None:
+def _turned(estimate: Estimate, R: Array, predicted: Array) -> Array:
+    """Return a further normal's covariance in the predicted one's tangent basis, first camera's frame."""
+    if estimate.covariance is None:
         return np.zeros((2, 2))
-    turn = basis_across(predicted) @ (basis_across(second.normal) @ R).T
-    return np.asarray(turn @ second.covariance @ turn.T)
+    turn = basis_across(predicted) @ (basis_across(estimate.normal) @ R).T
+    return np.asarray(turn @ estimate.covariance @ turn.T)
+
+
+def rigid(motion: npt.ArrayLike, name: str) -> Array:
+    """Return a rigid motion, shape (4, 4), checked; `name` stands in the `InputError` of one that is not."""
+    T = np.asarray(motion, dtype=float)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{name}: shape {T.shape}; must be a finite 4 x 4 matrix")
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputError(f"{name}: must be a rotation and a translation")
+    return T

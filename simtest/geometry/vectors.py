@@ -1,6 +1,7 @@
 """Unit vectors: tangent bases, the difference of two directions, and the bisector of light and camera."""
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.runtime.arrays import Array
 
@@ -66,6 +67,16 @@ def tangent_coordinates(normal: Array, other: Array) -> Array:
     sine = float(np.hypot(*across))
     angle = float(np.arctan2(sine, normal @ other))
     return across * (angle / sine) if sine > 0 else across  # 0 stays 0
+
+
+def rotation(vector: npt.ArrayLike) -> Array:
+    """Return the matrix, shape (3, 3), that turns about a vector by its length, rad, right-handed (Rodrigues)."""
+    x, y, z = np.asarray(vector, dtype=float)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = float(np.sqrt(x * x + y * y + z * z))
+    # sin(a)/a and (1 - cos(a))/a^2
+    first, second = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    return np.asarray(np.eye(3) + first * across + second * across @ across)
 
 
 def bisect(position: Array, light: Array) -> Array:

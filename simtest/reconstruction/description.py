@@ -13,9 +13,10 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.detection.blobs import Highlight
 from simtest.detection.view_mask import View
 from simtest.errors import Failure, Reason
-from simtest.estimators.protocol import Estimate, Target, drawable
+from simtest.estimators.protocol import Estimate, EstimatedCurvature, Target, drawable
 from simtest.geometry import Camera
 from simtest.reconstruction.assumptions import Assumption
+from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
 from simtest.reconstruction.ranking import StatedErrors, best_of, stated_errors
 from simtest.runtime import provenance
@@ -91,7 +92,7 @@ class SpecularityRecord:
     There is no peak where there is no patch, and no sightline where the lens images none. `kind` and `score` are those
     of its `highlight`, if the detector judges any. `best` names the estimator whose normal is the best one,
     `best_because` says why; `track` is the specularity's number over the frames of a sequence; `drawings` are by
-    estimator.
+    estimator; `motion` is what the other frames of its track tell of its curvature, where the poses are known.
     """
 
     id: int
@@ -107,6 +108,7 @@ class SpecularityRecord:
     track: int | None = None
     reference: ReferenceRecord | None = None
     best_because: str = ""
+    motion: MotionRecord | None = None
 
     __repr__ = short_repr
 
@@ -137,7 +139,7 @@ class SpecularityRecord:
             "best": self.best,
             "best_because": self.best_because,
             "estimates": {name: _estimate_json(e, self.drawings.get(name)) for name, e in self.estimates.items()},
-            **{name: value for name in ("track", "reference") if (value := getattr(self, name)) is not None},
+            **{name: value for name in ("track", "reference", "motion") if (value := getattr(self, name)) is not None},
         }
 
     @classmethod
@@ -346,6 +348,11 @@ def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
     normal, candidates, look_px = (np.array(entry[key], dtype=float) for key in ("normal", "candidates", "look_px"))
     margin, flags = entry["choice_margin"], tuple(entry["flags"])
     budget = entry["budget"] and {name: np.array(part) for name, part in entry["budget"].items()}
+    curvature = None
+    if (shape := entry.get("curvature")) is not None:
+        gains = None if shape["gains"] is None else np.array(shape["gains"], dtype=float)
+        curvature = EstimatedCurvature(np.array(shape["directions"], dtype=float), shape["axis_ratio"], gains)
     return Estimate(
-        normal, candidates, look_px, entry["axis_ratio"], (), margin, flags=flags, budget=budget, target=entry["target"]
-    )
+        normal, candidates, look_px, entry["axis_ratio"], (), margin, flags=flags, budget=budget,
+        target=entry["target"], curvature=curvature,
+    )  # fmt: skip

@@ -54,6 +54,8 @@ class Options:
         then in the uncertainty.
     fov_of : {"width", "height", "diagonal"}
         What the field of view spans.
+    poses : Path, optional
+        Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
 
     Raises
     ------
@@ -72,6 +74,7 @@ class Options:
     smoothing_px: float | None = None
     target: Target = "fine"
     fov_of: Extent = "width"
+    poses: Path | None = None
 
     def __post_init__(self) -> None:
         if self.detector != AUTO:

@@ -79,7 +79,7 @@ def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequ
     listed.sort(key=lambda track: (-len(track.frames), track.track))
     write_page(
         path, "sequence.html.j2", data, count=len(frames), tracks=listed, short=len(tracks) - len(listed),
-        terms=explanations.TERMS,
+        terms=explanations.TERMS, judged=any(track.shapes for track in tracks),
     )  # fmt: skip
 
 

@@ -1,7 +1,9 @@
 """Reconstruction of a folder of pictures or a video: frame by frame, with tracks; a stopped run goes on."""
 
 import json
+import math
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,9 +15,13 @@ from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
+from simtest.reconstruction.motion import NEEDED, check_priors, judge_by_motion
+from simtest.reconstruction.motion_record import COLUMNS as MOTION_COLUMNS
 from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
+from simtest.reconstruction.pipeline import default_estimators
+from simtest.reconstruction.poses import Poses, read_poses
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
 from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
@@ -33,7 +39,8 @@ TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 class SequenceResult:
     """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written.
 
-    `assumed` is what nobody told of its frames; empty where all were done by an earlier run.
+    `assumed` is what nobody told of its frames; empty where all were done by an earlier run. `motion` says how many
+    highlights' curvatures the poses told, where these are known.
     """
 
     frames: int
@@ -42,6 +49,7 @@ class SequenceResult:
     tracks: int
     files: list[Path]
     assumed: Sequence[Assumption] = ()
+    motion: str | None = None
 
 
 def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Progress | None = None) -> SequenceResult:
@@ -66,12 +74,37 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
     source = open_source(path)
+    poses = None
+    if options.poses is not None:
+        poses, options = _checked_poses(options.poses, source, options)
     with exclusive_folder(out):
-        return _reconstruct(source, out, options, progress)
+        return _reconstruct(source, out, options, progress, poses)
+
+
+def _checked_poses(path: Path, source: Source, options: Options) -> tuple[Poses, Options]:
+    """Read the poses, and return them with options that have the estimator of curvature.
+
+    Whatever is wrong is found before the work: malformed poses, and a calibration that lacks what the method needs.
+    """
+    # Imported here: the models of files are slow to load.
+    from simtest.spec.calibration_file import load_calibration
+
+    if options.camera is None:
+        raise InputError(f"--poses {shown(path)}: needs a calibration; give --camera in place of --fov")
+    poses, calibration = read_poses(path), load_calibration(options.camera)
+    check_priors(calibration.priors, options.camera)
+    if not source.is_video:
+        poses.of_frames([file.name for file in source.files], range(len(source.files)), True)
+    names = options.estimators or default_estimators(calibration)
+    return poses, replace(options, estimators=names if NEEDED in names else (*names, NEEDED))
 
 
 def _reconstruct(
-    source: Source, out: Path, options: Options, progress: Callable[[int, int, str], None] | None
+    source: Source,
+    out: Path,
+    options: Options,
+    progress: Callable[[int, int, str], None] | None,
+    poses: Poses | None,
 ) -> SequenceResult:
     path, settings = source.path, _settings(source.path, options)
     _check_settings(out / SETTINGS, settings)
@@ -89,14 +122,17 @@ def _reconstruct(
         warnings.warn(
             f"{shown(path)}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
+    if poses is not None:
+        run.judge_by_motion(poses, by_name=not source.is_video)
     tracks = tracks_of(run.frames)
     files = _write(out, run.frames, tracks)
     if progress is not None:
         progress(run.taken, run.taken, "")
     found = sum(len(frame.specularities) for frame in run.frames)
     return SequenceResult(
-        run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files, run.assumed
-    )
+        run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files, run.assumed,
+        _told_by_motion(run.frames, poses),
+    )  # fmt: skip
 
 
 class _Run:
@@ -154,6 +190,22 @@ class _Run:
         write_json(stem.with_suffix(".json"), replace(record, specularities=spots).to_json() | entry, compact=True)
         return TrackedFrame(frame.name, frame.index, frame.time_s, size, spots)
 
+    def judge_by_motion(self, poses: Poses, by_name: bool) -> None:
+        """Judge the highlights' curvatures by the poses, and add that to the frames' files."""
+        # Imported here: the models of files are slow to load.
+        from simtest.spec.calibration_file import load_calibration
+
+        assert self.options.camera is not None
+        names, indices = [frame.name for frame in self.frames], [frame.index for frame in self.frames]
+        told = poses.of_frames(names, indices, by_name)
+        self.frames = judge_by_motion(self.frames, told, poses.error, load_calibration(self.options.camera).priors)
+        for frame in self.frames:
+            path = self.folder / f"{frame.index:06d}.json"
+            data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+            for entry, spot in zip(data["specularities"], frame.specularities, strict=True):
+                entry["motion"] = spot.motion
+            write_json(path, data, compact=True)
+
     def _tracked(self, spots: list[SpecularityRecord], size: tuple[int, int]) -> list[SpecularityRecord]:
         self._tracker = self._tracker or Tracker(size)
         numbers = self._tracker.update([spot.position_px for spot in spots])
@@ -169,9 +221,26 @@ def _read_done(path: Path, name: str) -> TrackedFrame | None:
     return frame if frame.name == name else None
 
 
+def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None) -> str | None:
+    """Say how many highlights' curvatures motion told; None without poses."""
+    if poses is None:
+        return None
+    judged = [spot.motion for frame in frames for spot in frame.specularities if spot.motion is not None]
+    shapes = Counter(each.shape for each in judged)
+    counts = ", ".join(f"{count} {shape}" for shape, count in shapes.most_common())
+    misfits = sum(each.distance2 is not None and not each.fits for each in judged)
+    error = poses.error
+    stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
+    return (
+        f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
+        f"error of the poses {'told' if poses.error_told else 'assumed'}: {stated}"
+    )
+
+
 def _settings(source: Path, options: Options) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
-    return dict(json.loads(json.dumps({"source": source, **asdict(options)}, default=str)))
+    told = {key: value for key, value in asdict(options).items() if key != "poses" or value is not None}
+    return dict(json.loads(json.dumps({"source": source, **told}, default=str)))
 
 
 def _check_settings(path: Path, settings: JsonObject) -> None:
@@ -192,14 +261,16 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
 
 def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[Path]:
     files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
+    judged = any(spot.motion is not None for frame in frames for spot in frame.specularities)
+    columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
     table = [
-        (frame.index, frame.time_s, spot.track, *row)
+        (frame.index, frame.time_s, spot.track, *row, *(() if spot.motion is None else spot.motion.row()))
         for frame in frames
         for spot in frame.specularities
         for row in normals_rows([spot])
     ]
     try:
-        write_atomically(files[0], lambda part: write_csv(part, TIMELINE, table))
+        write_atomically(files[0], lambda part: write_csv(part, columns, table))
         write_json(files[1], tracks, compact=True)
         write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     except OSError as error:

@@ -1,5 +1,6 @@
 """The specularities of a sequence: what is kept of each frame, and which of them are the same from frame to frame."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -40,13 +41,24 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class Track:
-    """The same specularity over frames: where it was seen, and its best normals; an entry of tracks.json."""
+    """The same specularity over frames: where it was seen, its best normals, and what motion tells of its shape."""
 
     track: int
     frames: list[int]
     times_s: list[float | None]
     peaks_px: list[Array | None]
     normals: list[Array | None]
+    shapes: list[str] = field(default_factory=list)
+
+    @property
+    def shape(self) -> str:
+        """What motion tells most often of the highlight's surface, and in how many of the frames."""
+        (shape, count), *_ = Counter(self.shapes).most_common(1)
+        return f"{shape}, {count} of {len(self.shapes)}"
+
+    def to_json(self) -> JsonObject:
+        """Return an entry of tracks.json; shapes only where poses are known."""
+        return {key: value for key, value in vars(self).items() if key != "shapes" or value}
 
 
 def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
@@ -61,6 +73,8 @@ def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
             track.times_s.append(frame.time_s)
             track.peaks_px.append(spot.peak_px)
             track.normals.append(None if best is None else best.normal)
+            if spot.motion is not None:
+                track.shapes.append(spot.motion.shape)
     return [tracks[number] for number in sorted(tracks)]
 
 

@@ -100,7 +100,7 @@ class Session:
         """
         before = self.scene
         # Surface, camera and lights: refused here if they are not sound.
-        if scene.surface != self.scene.surface or scene.film_level != self.scene.film_level:
+        if scene.placement != self.scene.placement:
             self._load_surface(scene)
             self._set_camera(scene)
         else:
@@ -133,7 +133,7 @@ class Session:
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.
-        surface = make_surface(scene.surface, scene.film_level)
+        surface = make_surface(scene.surface, scene.film_level, scene.camera.moved)
         check_camera(scene, surface)
         check_lights(scene, surface)
         check_motion(scene, surface)

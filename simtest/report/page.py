@@ -18,6 +18,7 @@ from simtest.report.glint_figures import glint_figures
 from simtest.report.guide_text import guide_content
 from simtest.report.heat_maps import heat_charts, heat_maps
 from simtest.report.law_charts import law_charts, law_colours
+from simtest.report.motion_figures import motion_figures
 from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
@@ -65,7 +66,7 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     figures.tell("comparing with the laws")
     curves = line_figures(run)
     lines = [(curve, figures.draw(curve.key, [line_chart(curve, colours)])[0]) for curve in curves]
-    relief = [*relief_figures(run, colours), *glint_figures(run), *visible_figures(run)]
+    relief = [*relief_figures(run, colours), *glint_figures(run), *visible_figures(run), *motion_figures(run)]
     for each in relief:
         figures.draw(each.chart.key, [each.chart])
     paper, results = paper_section(run, colours, figures), law_results(run)

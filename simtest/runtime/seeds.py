@@ -19,6 +19,7 @@ class Stage(IntEnum):
     VIEWPOINT = 3
     RIG = 4
     RELIEF = 5
+    POSE = 6
 
 
 def key(text: str) -> int:

@@ -14,6 +14,7 @@ from simtest.spec.camera_tables import camera_toml
 from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
+from simtest.spec.views import Moved
 
 SHORTEST, LONGEST = 0.004, 1000.0
 """Focal lengths over the longer side of the image, for fields of view of 179 and 0.06 deg."""
@@ -156,6 +157,7 @@ class SceneCamera(CameraSpec):
     """The camera of a scene: that of a camera file, and how it moves."""
 
     motion: Motion | None = Field(None, description="during the exposure; default none")
+    moved: Moved | None = Field(None, description="from where the surface's keys put it; default not")
 
     @property
     def moving(self) -> Motion | None:

@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
 from simtest.spec.spec_model import Spec
 
@@ -45,15 +46,10 @@ class Motion(Spec):
     def poses(self) -> Array:
         """Return the camera's poses, shape (steps, 4, 4), at `times_s`: middle_from_moment, mm.
 
-        The centre moves along a straight line, and the camera turns about a fixed axis (Rodrigues' formula).
+        The centre moves along a straight line, and the camera turns about a fixed axis.
         """
         poses = np.tile(np.eye(4), (self.steps, 1, 1))
         poses[:, :3, 3] = self.times_s[:, None] * np.array(self.velocity_mm_s)
         turn = np.radians(self.angular_velocity_deg_s)
-        speed = float(np.linalg.norm(turn))
-        if speed > 0:
-            x, y, z = turn / speed
-            across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            angle = (self.times_s * speed)[:, None, None]
-            poses[:, :3, :3] += np.sin(angle) * across + (1 - np.cos(angle)) * (across @ across)
+        poses[:, :3, :3] = [rotation(time * turn) for time in self.times_s]
         return poses

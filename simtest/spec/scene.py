@@ -23,6 +23,7 @@ from simtest.spec.tissue_colour import TissueColour
 from simtest.spec.toml_files import read_toml, source_name
 from simtest.spec.translucency import Translucency
 from simtest.spec.type_change import replace_values
+from simtest.spec.views import Views
 
 MOST_INSTRUMENTS = 8
 """More than a patient has ports for."""
@@ -90,6 +91,7 @@ class Scene(Spec):
     instruments: tuple[Instrument, ...] = Field(
         (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
     )
+    views: Views | None = Field(None, description="further views, for an experiment on motion; default none")
 
     __repr__ = short_repr
     __str__ = short_repr
@@ -98,6 +100,11 @@ class Scene(Spec):
     def shown_instruments(self) -> dict[int, Instrument]:
         """The instruments that are present, by their index in `instruments`."""
         return {i: instrument for i, instrument in enumerate(self.instruments) if instrument.present}
+
+    @property
+    def placement(self) -> tuple[object, ...]:
+        """What determines the surface and the camera's place before it."""
+        return self.surface, self.film_level, self.camera.moved
 
     @property
     def film_level(self) -> float | None:
@@ -142,6 +149,10 @@ class Scene(Spec):
         dumped: dict[str, Any] = dump(self)
         if not self.instruments:
             dumped.pop("instruments", None)
+        if self.views is None:
+            dumped.pop("views", None)
+        if self.camera.moved is None:
+            dumped.get("camera", {}).pop("moved", None)
         return dumped
 
     @property

@@ -12,13 +12,14 @@ from simtest.spec.surface import (
     SphereSurface,
     Surface,
 )
+from simtest.spec.views import Moved
 from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 
-def make_surface(spec: Surface, film_level: float | None = None) -> SurfaceModel:
+def make_surface(spec: Surface, film_level: float | None = None, moved: Moved | None = None) -> SurfaceModel:
     """Make the model of a scene's surface.
 
     Parameters
@@ -27,6 +28,8 @@ def make_surface(spec: Surface, film_level: float | None = None) -> SurfaceModel
         Its description.
     film_level : float, optional
         Up to where a liquid film fills the valleys of its relief, in standard deviations of the height.
+    moved : Moved, optional
+        Where the camera stands, from where the description puts it.
 
     Raises
     ------
@@ -34,6 +37,8 @@ def make_surface(spec: Surface, film_level: float | None = None) -> SurfaceModel
         If a recipe or mesh file is missing or malformed.
     """
     surface = _make_base(spec)
+    if moved is not None:
+        surface.model_from_camera = surface.model_from_camera @ moved.pose()
     if spec.relief is not None:
         # Imported here: its filters are slow to load, and smooth scenes do not need them.
         from simtest.surfaces.relief_field import make_relief

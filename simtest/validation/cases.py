@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from simtest.conventions import ON_INSTRUMENT
+from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
 from simtest.runtime.limits import check_limit
@@ -284,4 +284,6 @@ def swept_example(cases: list[Case]) -> "dict[str, Value]":
             example["bound_deg"] = 0.0
         if case.data.get("instruments"):
             example[ON_INSTRUMENT] = False
+        if case.data.get("views") is not None:
+            example |= dict.fromkeys(MOTION_COLUMNS, 0.0)
     return example

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from simtest.conventions import MOTION
 from simtest.runtime.arrays import Array
 from simtest.validation.paired import (
     Distinct,
@@ -123,7 +124,8 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     conditions : mapping, optional
         ``conditions`` of summary.json, by setting; without them the columns alone tell the situations apart.
     """
-    true = results.filter(pl.col("true_id").is_not_null())
+    # Rows of motion repeat the normals of the first view's estimator: they are no method of their own here.
+    true = results.filter(pl.col("true_id").is_not_null() & (pl.col("estimator") != MOTION))
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]

@@ -1,6 +1,6 @@
 """One realisation: render, expose, reconstruct, match, measure."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from simtest.errors import Reason
@@ -15,6 +15,7 @@ from simtest.validation.cases import Case
 from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
+from simtest.validation.motion import MOTION, FurtherView, further_views, with_motion
 from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.rough_truth import rough_truth
 
@@ -62,13 +63,14 @@ class Realiser:
     def __init__(self, variant: str | None) -> None:
         self._variant = variant
         self._view: RenderedView | None = None
+        self._further: list[FurtherView] = []
 
     def make(
         self, experiment: Experiment, case: Case, number: int, estimators: Mapping[str, AnyEstimator]
     ) -> Realisation:
         """Make one realisation of a case; `session` is then at its scene."""
         view, drawn = self.view(experiment, case, number)
-        return realise(self.session, experiment, case, number, view, drawn, estimators)
+        return realise(self.session, experiment, case, number, view, drawn, estimators, self._further)
 
     def view(self, experiment: Experiment, case: Case, number: int) -> tuple[RenderedView, dict[str, float]]:
         """Render the scene of a realisation, at which `session` then is; return it with the values drawn for it."""
@@ -77,17 +79,19 @@ class Realiser:
         if self._view is None:
             self.session = Session(scene, self._variant)
         if self._view is None or scene != self._view.scene:
+            self._further = further_views(self.session, scene)
             self._view = render_view(self.session, scene)
         return self._view, drawn
 
 
 def realise(
     session: Session, experiment: Experiment, case: Case, number: int, view: RenderedView, drawn: Mapping[str, Value],
-    estimators: Mapping[str, AnyEstimator],
+    estimators: Mapping[str, AnyEstimator], further: Sequence[FurtherView] = (),
 ) -> Realisation:  # fmt: skip
     """Make one realisation of a case from its rendered view, at whose scene the session must be.
 
-    `drawn` holds the values drawn for this realisation, by key path, and `estimators` the estimators by name.
+    `drawn` holds the values drawn for this realisation, by key path, `estimators` the estimators by name, and `further`
+    the further views of an experiment on motion.
     """
     seed = case.noise_seed(experiment, number)
     frame = view.frame(seed)
@@ -96,6 +100,8 @@ def realise(
     specularities = [] if dark else reconstruct(frame, view.calibration, estimators, isolated=case.isolated)
     # What is of clouds is judged by the base's highlight points, the rest by the true highlights.
     cloud_names = of_clouds(estimators)
+    motion = with_motion(experiment, case, number, view, further, specularities) if further else None
+    specularities = specularities if motion is None else motion.specularities
     singles, of_base, refused = apart(specularities, cloud_names)
     counted = [i for i, truth in enumerate(view.highlights) if truth.isolated or not case.isolated or dark]
     truths = [view.highlights[i] for i in counted]
@@ -117,7 +123,10 @@ def realise(
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
     metal = on_instruments(singles, matched, view)
     single_names = [name for name in estimators if name not in cloud_names]
+    single_names += [] if motion is None else [MOTION]
     made = rows(session, common, singles, truths, matched, single_names, unfound, rough, metal)
+    if motion is not None:
+        made = [motion.filled(row, view.scene, truths) if row.estimator == MOTION else row for row in made]
     if cloud_names:
         made += cloud_rows(session, view, common, of_base, refused, {} if rough is None else rough.clouds)
     return Realisation(number, view, made, frame, specularities, truths, matched)

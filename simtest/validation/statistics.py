@@ -140,3 +140,14 @@ def student_interval(values: Array) -> Interval:
         return None, None
     half = student_t.quantile((1 + CONFIDENCE) / 2, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
     return float(np.mean(values) - half), float(np.mean(values) + half)
+
+
+def share_interval(count: int, n: int) -> tuple[float, float]:
+    """Compute the exact 95 % interval of a share [Clopper and Pearson 1934]."""
+    # Imported here: slow to load, and runs need no shares.
+    from scipy import stats
+
+    tail = (1 - CONFIDENCE) / 2
+    low = float(stats.beta.ppf(tail, count, n - count + 1)) if count else 0.0
+    high = float(stats.beta.isf(tail, count + 1, n - count)) if count < n else 1.0
+    return low, high

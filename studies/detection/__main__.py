@@ -8,11 +8,12 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from benchmarks.measuring import Figure, print_figures
-from simtest.conventions import SPECULAR_PEAK_SHARE
+from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
 from simtest.reconstruction import detect_in_picture
 from studies.detection.frames import StudyFrame, study_frames
 from studies.detection.peers import T2_REL, THRESHOLDS, TUNED_T2_REL, arnold, fixed_threshold
@@ -28,7 +29,24 @@ F1, DICE = 0.90, 0.85
 PUBLISHED = f"Arnold 2010, T2rel {T2_REL:g}"
 
 
+FAINT = "simtest, faint ones too"
+
+
 def _ours(frame: StudyFrame) -> Mask:
+    """Return the detected highlights that outshine the tissue somewhere, as those of this study's truth do.
+
+    The detector also reports fainter ones, down to a quarter of the tissue's light, which tissue shows (theory.md
+    7.1b); the truth of these frames has none below the tissue's light.
+    """
+    detection = detect_in_picture(frame.picture.astype(np.float32) / 255).detection
+    light = detection.light
+    assert light is not None
+    _, labels = cv2.connectedComponents(detection.mask.astype(np.uint8), connectivity=8)
+    outshine = detection.mask & (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue)
+    return detection.mask & np.isin(labels, np.unique(labels[outshine]))
+
+
+def _all_of_ours(frame: StudyFrame) -> Mask:
     return detect_in_picture(frame.picture.astype(np.float32) / 255).detection.mask
 
 
@@ -51,7 +69,7 @@ def figures(frames: int = FRAMES, tuning: int = TUNING_FRAMES) -> list[Figure]:
         tried = {f"threshold {t}": _fixed(t) for t in THRESHOLDS}
         tried |= {f"Arnold 2010, T2rel {t:g}": _arnold(t) for t in TUNED_T2_REL}
         tuned = _run("tuning", tuning, Path(folder), tried, SHARES[:1])
-        detectors: dict[str, Detector] = {"simtest": _ours}
+        detectors: dict[str, Detector] = {"simtest": _ours, FAINT: _all_of_ours}
         for kind in ("threshold", "Arnold"):
             best = max((n for n in tried if n.startswith(kind)), key=lambda n: tuned[n, "all", SHARES[0]].dice)
             detectors[best] = tried[best]
@@ -64,7 +82,7 @@ def figures(frames: int = FRAMES, tuning: int = TUNING_FRAMES) -> list[Figure]:
             shown += _lines(name, part, scores[name, part, SHARES[0]], limit=name == "simtest" and part == "all")
     for share in SHARES[1:]:
         shown += _lines("simtest", f"all, peak share {share:g}", scores["simtest", "all", share])
-    for name in list(detectors)[1:]:
+    for name in list(detectors)[2:]:
         other = scores[name, "all", SHARES[0]]
         shown.append(Figure(f"F1 ahead of {name}", ours.f1 - other.f1, 0.0, True, ""))
         shown.append(Figure(f"Dice ahead of {name}", ours.dice - other.dice, 0.0, True, ""))

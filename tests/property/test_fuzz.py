@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Normal, Priors, exactly
+from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisector
 from simtest.estimators.brightest_point import brightest_point
@@ -11,6 +12,7 @@ from simtest.estimators.circle_pose import circle_pose as circle_pose_estimator
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.dispatch import run
+from simtest.estimators.highlight_fit import fit_highlight
 from simtest.estimators.photometric import photometric, photometric_plane
 from simtest.geometry import Camera, FittedArc, FittedConic, KannalaBrandt, Patch, circle_pose, fit_arc, fit_ellipse
 
@@ -167,6 +169,16 @@ def go(check, first, count):
 @pytest.mark.parametrize(("kind", "count"), [("conics", 300), ("contours", 150), ("patches", 150)])
 def test_nothing_raises_and_nothing_ok_holds_nan(kind, count):
     go(CHECKS[kind], 0, count)
+
+
+def test_an_isophote_that_is_no_ellipse_across_the_axis_is_a_failure():
+    # An arc through a fisheye: an ellipse in the picture, and a hyperbola across the mean axis of all isophotes.
+    rng = np.random.default_rng([10**6 + 1035, 7])
+    made, camera = patch(rng), CAMERAS[rng.integers(2)]
+    family = fit_highlight(made, camera, CONE_AXIS_ISOVALUES)
+    assert family.are_ellipses.all()
+    assert Reason.NOT_AN_ELLIPSE in [failure.reason for failure in family.failures]
+    assert "missing_isovalues" in run(cone_axis, made, camera, Priors()).flags
 
 
 @pytest.mark.slow

@@ -260,7 +260,7 @@ def test_every_branch_of_the_seed_tree_is_another():
     ]
     states = {sequence(*branch).generate_state(4).tobytes() for branch in branches}
     assert len(states) == len(branches)
-    assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4, 5]
+    assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4, 5, 6]
 
 
 # Cases ---------------------------------------------------------------------------------------------------------------

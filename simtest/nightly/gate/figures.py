@@ -5,12 +5,11 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import polars as pl
-from scipy import stats
 
 from simtest.nightly.gate.quantities import RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
 from simtest.validation.results_table import SCHEMA
-from simtest.validation.statistics import CONFIDENCE, figures, student_interval
+from simtest.validation.statistics import figures, share_interval, student_interval
 
 DIGEST_KEYS = ("realisation", "true_id", "specularity", "seed")
 """Order of the rows within a cell."""
@@ -76,7 +75,7 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
             yield Figure("setting", cell, quantity, unit, value, low, high, n, None, hashed, about)
 
     def share(quantity: str, count: int, n: int) -> Iterator[Figure]:
-        return figure(quantity, "", count / n, n, _share_interval(count, n), f"{count} of {n}")
+        return figure(quantity, "", count / n, n, share_interval(count, n), f"{count} of {n}")
 
     # Counts and shares
     found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
@@ -111,14 +110,6 @@ def _results_with_region(rows: pl.DataFrame) -> int:
     """Count the results that state an uncertainty, as `figures` does."""
     answered = rows.filter(pl.col("true_id").is_not_null() & (pl.col("status") == "ok"))
     return answered["mahalanobis2"].drop_nulls().len()
-
-
-def _share_interval(count: int, n: int) -> tuple[float, float]:
-    """Compute the exact interval of a share [Clopper and Pearson 1934]."""
-    tail = (1 - CONFIDENCE) / 2
-    low = float(stats.beta.ppf(tail, count, n - count + 1)) if count else 0.0
-    high = float(stats.beta.isf(tail, count + 1, n - count)) if count < n else 1.0
-    return low, high
 
 
 def digest(rows: pl.DataFrame) -> str:

@@ -1,0 +1,219 @@
+"""Poses of the camera over the frames of a sequence, from a file: views.json, a list of matrices, or a TUM trajectory.
+
+docs/howto/motion.md describes the formats.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.estimators.two_views import PoseError
+from simtest.runtime.arrays import Array
+from simtest.runtime.files import require_plain
+from simtest.runtime.resources import shown
+
+UNITS_MM = {"mm": 1.0, "m": 1000.0}
+
+UNTOLD_ERROR = PoseError(0.01, float(np.radians(0.2)))
+"""Error of a motion from frame to frame where the file states none."""
+
+ROUNDED = 1e-3
+"""How far a matrix may be from a rotation: files hold rounded numbers."""
+
+LISTS = ("frames", "views", "accepted", "poses")
+MATRICES = ("world_from_camera", "model_from_camera")
+SETTINGS = ("unit", "translation_error", "rotation_error_deg")
+NAMES = ("frame", "picture", "image", "name")
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the camera was at each frame.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    world_from_camera : ndarray, shape (N, 4, 4)
+        Poses, mm.
+    names : tuple of str
+        Of the frames' files; empty where the file names none, and poses go with frames by their order.
+    error : PoseError
+        Of the motion between two frames.
+    error_told : bool
+        Whether the file states the error.
+    """
+
+    path: Path
+    world_from_camera: Array
+    names: tuple[str, ...]
+    error: PoseError
+    error_told: bool
+
+    def of_frames(self, names: Sequence[str], indices: Sequence[int], by_name: bool) -> list[Array | None]:
+        """Return the pose of each frame, None for those without one.
+
+        Parameters
+        ----------
+        names, indices : sequence
+            Names of the frames, and their numbers in the sequence.
+        by_name : bool
+            Whether frames are files, so that they can be named.
+
+        Raises
+        ------
+        InputError
+            If no frame is named in the file, or the numbers of poses and frames differ.
+        """
+        if by_name and self.names:
+            table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
+            found = [table.get(name) for name in names]
+            if all(pose is None for pose in found):
+                raise InputError(
+                    f"--poses {shown(self.path)}: names {shown(self.names[0], 60)}; must name frames of the folder, "
+                    f"such as {shown(names[0], 60)}"
+                )
+            return found
+        count = len(self.world_from_camera)
+        if max(indices) >= count:
+            raise InputError(
+                f"--poses {shown(self.path)}: {count} poses; must be one for each of the {max(indices) + 1} frames"
+            )
+        return [self.world_from_camera[index] for index in indices]
+
+
+def read_poses(path: Path) -> Poses:
+    """Read a file of poses; raise `InputError`, one line, where it is malformed."""
+    where = f"--poses {shown(path)}"
+    try:
+        text = require_plain(path, "record_bytes").read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: no text (byte {error.start}); must be JSON or a TUM trajectory") from error
+    is_json = path.suffix.lower() == ".json"
+    poses, names, settings = _from_json(text, where) if is_json else _from_tum(text, where)
+    if not poses:
+        raise InputError(f"{where}: holds no pose; must hold one for each frame")
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise InputError(f"{where}: names {shown(twice, 60)} twice; must give each frame one pose")
+    unit = settings.pop("unit", "mm" if is_json else "m")
+    if unit not in UNITS_MM:
+        raise InputError(f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}")
+    made = np.array(poses)
+    made[:, :3, 3] *= UNITS_MM[unit]
+    translation = _share(settings, "translation_error", 1.0, where)
+    rotation = _share(settings, "rotation_error_deg", 90.0, where)
+    told = translation is not None or rotation is not None
+    stated = PoseError(translation or 0.0, float(np.radians(rotation or 0.0))) if told else UNTOLD_ERROR
+    return Poses(path, made, tuple(names), stated, told)
+
+
+Read = tuple[list[Array], list[str], dict[str, Any]]
+
+
+def _share(settings: dict[str, Any], key: str, most: float, where: str) -> float | None:
+    """Return a setting in [0, most]; None where the file has none."""
+    value = settings.get(key)
+    if value is None:
+        return None
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not 0 <= number <= most:
+        raise InputError(f"{where}: {key} = {shown(str(value), 40)}; must be a number in [0, {most:g}]")
+    return number
+
+
+def _from_json(text: str, where: str) -> Read:
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: no JSON ({str(error)[:80]})") from error
+    table = data if isinstance(data, dict) else {}
+    entries = next((table[key] for key in LISTS if key in table), data)
+    if not isinstance(entries, list):
+        raise InputError(f"{where}: no list of poses; must be a list, or hold one under {', '.join(LISTS)}")
+    poses, names = [], []
+    for number, entry in enumerate(entries):
+        at = f"{where}: pose {number}"
+        matrix = entry
+        if isinstance(entry, dict):
+            matrix = next((entry[key] for key in MATRICES if key in entry), None)
+            named = next((entry[key] for key in NAMES if isinstance(entry.get(key), str)), None)
+            names += [] if named is None else [Path(named).name]
+        poses.append(_matrix(matrix, at))
+    if names and len(names) < len(poses):
+        raise InputError(f"{where}: {len(names)} of {len(poses)} poses name their frame; must be all or none")
+    return (
+        poses,
+        names,
+        {key: table[key] for key in ("unit", "translation_error", "rotation_error_deg") if key in table},
+    )
+
+
+def _matrix(value: object, at: str) -> Array:
+    """Return a rigid 4 x 4 matrix whose rotation is made exact."""
+    if value is None:
+        raise InputError(f"{at}: no {' or '.join(MATRICES)}; must hold one, 4 x 4")
+    try:
+        T = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        T = np.empty(0)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{at}: {shown(str(value), 40)}; must be a 4 x 4 matrix of numbers")
+    R = T[:3, :3]
+    off = max(float(np.abs(R @ R.T - np.eye(3)).max()), float(np.abs(T[3] - [0, 0, 0, 1]).max()))
+    if off > ROUNDED or np.linalg.det(R) < 0:
+        raise InputError(f"{at}: off a rotation and a translation by {off:.3g}; must be rigid, determinant 1")
+    T[:3, :3], T[3] = _nearest_rotation(R), [0, 0, 0, 1]
+    return T
+
+
+def _nearest_rotation(R: Array) -> Array:
+    U, _, Vt = np.linalg.svd(R)
+    return np.asarray(U @ Vt)
+
+
+def _from_tum(text: str, where: str) -> Read:
+    """Read lines of timestamp tx ty tz qx qy qz qw; comments begin with # and may state a setting as key: value."""
+    poses, settings = [], {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if setting := re.match(r"#\s*(unit|translation_error|rotation_error_deg)\s*[:=]\s*(\S+)\s*$", line):
+            settings[setting[1]] = setting[2]
+        if not (words := line.partition("#")[0].replace(",", " ").split()):
+            continue
+        at = f"{where}: line {number}"
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != 8 or not np.isfinite(values).all():
+            raise InputError(f"{at}: {shown(line.strip(), 60)}; must be 8 numbers: time tx ty tz qx qy qz qw")
+        length = float(np.linalg.norm(values[4:]))
+        if abs(length - 1) > 0.01:
+            raise InputError(f"{at}: quaternion of length {length:.3g}; must be 1")
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = _of_quaternion(np.array(values[4:]) / length), values[1:4]
+        poses.append(T)
+    return poses, [], settings
+
+
+def _of_quaternion(q: Array) -> Array:
+    """Return the rotation of a unit quaternion x, y, z, w."""
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

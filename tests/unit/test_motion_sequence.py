@@ -1,0 +1,155 @@
+"""`simtest reconstruct --poses` on rendered sequences: convex from concave, and what wrong poses come to."""
+
+import csv
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.errors import InputError
+from simtest.reconstruction.picture import Options
+from simtest.reconstruction.sequence import reconstruct_sequence
+from simtest.rendering import Session
+from simtest.simulation.rendered_view import render_view
+from simtest.spec import scene_from_dict
+
+CALIBRATION = """
+[camera]
+width = 320
+height = 320
+fx = 320.0
+fy = 320.0
+[response]
+type = "linear"
+[vignetting]
+type = "cosine"
+power = 0.0
+[rig]
+lights_mm = [[0.0, 0.0, 0.0]]
+distance_mm = 10.0
+distance_sd_mm = 0.5
+[surface]
+phong_exponent = 50.0
+"""
+# d k, the camera's steps, mm, and what must be told; beyond its centre a highlight runs ahead of the camera.
+SHAPES = {
+    "convex": ((0.6, 0.2), 0.3, "convex"),
+    "concave": ((-2.4, -3.5), 0.06, "concave"),
+    "saddle": ((0.6, -0.5), 0.1, "saddle"),
+}
+PLACES = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.5)]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """Return a function from a shape to the options that reconstruct its rendered frames, and their folder."""
+    made, held = {}, []
+
+    def render(name):
+        if name in made:
+            return made[name]
+        folder = tmp_path_factory.mktemp(name)
+        frames = folder / "frames"
+        frames.mkdir()
+        (kd_1, kd_2), step, _ = SHAPES[name]
+        surface = {"type": "quadric", "k1_per_mm": kd_1 / 10, "k2_per_mm": kd_2 / 10, "tilt_deg": 3.0, "spin_deg": 20.0}
+        listed = []
+        for i, place in enumerate(PLACES):
+            moved = {"translation_mm": [step * place[0], step * place[1], 0.0], "rotation_deg": [0.2 * i, 0.0, 0.5 * i]}
+            scene = scene_from_dict({
+                "surface": surface,
+                "camera": {"width": 320, "height": 320, "fx": 320.0, "fy": 320.0, "moved": moved},
+                "sensor": {"noise_sigma": 0.02, "saturation": True, "exposure": {"gain": 0.9}},
+            })  # fmt: skip
+            if not held:
+                held.append(Session(scene))
+            frame = np.clip(render_view(held[0], scene).frame(9100 + i), 0, 1)
+            cv2.imwrite(str(frames / f"{i}.png"), np.round(frame * 65535).astype(np.uint16))
+            listed.append({"frame": f"{i}.png", "world_from_camera": held[0].surface.model_from_camera.tolist()})
+        (folder / "camera.toml").write_text(CALIBRATION)
+        table = {"frames": listed, "translation_error": 0.0, "rotation_error_deg": 0.01}
+        (folder / "poses.json").write_text(json.dumps(table))
+        made[name] = folder, Options(folder / "camera.toml", poses=folder / "poses.json")
+        return made[name]
+
+    return render
+
+
+def shapes_in(folder):
+    with (folder / "timeline.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return {(row["frame"], row["specularity"]): (row["bend_1"], row["bend_2"]) for row in rows}, rows
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_a_sequence_with_poses_tells_the_shape(film, name, tmp_path):
+    folder, options = film(name)
+    made = reconstruct_sequence(folder / "frames", tmp_path / "out", options)
+    expected = SHAPES[name][2]
+    bends, rows = shapes_in(tmp_path / "out")
+    assert len(bends) == len(PLACES)
+    wanted = {"convex": {("convex", "convex")}, "concave": {("concave", "concave")},
+              "saddle": {("concave", "convex"), ("convex", "concave")}}[name]  # fmt: skip
+    assert set(bends.values()) <= wanted
+    assert all(float(row["margin_1"]) > 9.2 for row in rows if row["motion"] == "ok")
+    entry = json.loads((tmp_path / "out" / "frames" / "000000.json").read_text())["specularities"][0]["motion"]
+    assert entry["shape"] == expected
+    assert entry["fits"]
+    (track,) = json.loads((tmp_path / "out" / "tracks.json").read_text())
+    assert track["shapes"] == [expected] * len(PLACES)
+    assert f"{expected}, 4 of 4" in (tmp_path / "out" / "index.html").read_text()
+    assert made.motion.startswith(f"bends of 4 highlights: 4 {expected}; 0 fit no curvature")
+
+
+@pytest.mark.render
+def test_wrong_poses_tell_nothing_wrong(film, tmp_path):
+    """Negative control: poses of the mirrored motion fit no curvature, or leave the signs open."""
+    folder, options = film("saddle")
+    table = json.loads((folder / "poses.json").read_text())
+    first = np.array(table["frames"][0]["world_from_camera"])
+    for entry in table["frames"]:
+        T = np.array(entry["world_from_camera"])
+        T[:3, 3] = 2 * first[:3, 3] - T[:3, 3]
+        entry["world_from_camera"] = T.tolist()
+    wrong = tmp_path / "poses.json"
+    wrong.write_text(json.dumps(table))
+    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+    bends, rows = shapes_in(tmp_path / "out")
+    assert "4 fit no curvature" in made.motion
+    assert all(row["sign_1"] == row["sign_2"] == "0" for row in rows)
+    # What one picture tells without any motion stays: an abs(1 + d k) below 1 is concave.
+    assert all("convex" not in each for each in bends.values())
+
+
+@pytest.mark.render
+def test_a_stopped_run_with_poses_goes_on_to_the_same_files(film, tmp_path):
+    folder, options = film("convex")
+    reconstruct_sequence(folder / "frames", tmp_path / "out", options)
+    before = (tmp_path / "out" / "timeline.csv").read_bytes()
+    (tmp_path / "out" / "frames" / "000002.json").unlink()
+    reconstruct_sequence(folder / "frames", tmp_path / "out", options)
+    assert (tmp_path / "out" / "timeline.csv").read_bytes() == before
+
+
+@pytest.mark.render
+def test_what_the_method_needs_is_asked_for_before_the_work(film, tmp_path):
+    folder, options = film("convex")
+    lines = {
+        "distance": "distance_mm = 10.0\ndistance_sd_mm = 0.5\n", "lobe": "phong_exponent = 50.0\n",
+        "lights at the camera": "lights_mm = [[0.0, 0.0, 0.0]]\n",
+    }  # fmt: skip
+    for words, line in lines.items():
+        camera = tmp_path / "camera.toml"
+        camera.write_text(CALIBRATION.replace(line, ""))
+        with pytest.raises(InputError, match=words):
+            reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, camera=camera))
+    with pytest.raises(InputError, match="give --camera"):
+        reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, camera=None, fov_deg=50.0))
+    few = tmp_path / "few.json"
+    few.write_text(json.dumps([np.eye(4).tolist()]))
+    with pytest.raises(InputError, match="1 poses; must be one for each of the 4 frames"):
+        reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=few))
+    assert not (tmp_path / "out" / "run.json").exists()

@@ -1,0 +1,116 @@
+"""Files of camera poses: three formats give the same poses, and whatever is malformed is one line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from simtest.errors import InputError
+from simtest.geometry.vectors import rotation
+from simtest.reconstruction.poses import UNTOLD_ERROR, read_poses
+
+
+def pose(turn=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation(turn), at
+    return T
+
+
+TWO = [pose(), pose((0.0, 0.0, np.pi / 2), (1.0, -2.0, 0.5))]
+HALF = "0.7071067811865476"
+
+
+def test_three_formats_give_the_same_poses(tmp_path):
+    texts = {
+        "list.json": json.dumps([T.tolist() for T in TWO]),
+        "named.json": json.dumps({
+            "frames": [{"frame": f"{i}.png", "world_from_camera": T.tolist()} for i, T in enumerate(TWO)]}),
+        "views.json": json.dumps({
+            "accepted": [{"picture": f"{i}.png", "model_from_camera": T.tolist()} for i, T in enumerate(TWO)]}),
+        "metres.json": json.dumps({"unit": "m", "poses": [pose().tolist(),
+                                                           pose((0, 0, np.pi / 2), (0.001, -0.002, 0.0005)).tolist()]}),
+        "tum.txt": f"# a comment\n0.0 0 0 0 0 0 0 1\n\n0.04 0.001 -0.002 0.0005 0 0 {HALF} {HALF}\n",
+        "tum_mm.txt": f"# unit: mm\n0.0 0 0 0 0 0 0 1\n0.04 1 -2 0.5 0 0 {HALF} {HALF}\n",
+    }  # fmt: skip
+    for name, text in texts.items():
+        path = tmp_path / name
+        path.write_text(text)
+        read = read_poses(path)
+        np.testing.assert_allclose(read.world_from_camera, TWO, atol=1e-12, err_msg=name)
+        assert read.error == UNTOLD_ERROR
+        assert not read.error_told
+
+
+def test_errors_of_the_poses_are_told_in_the_file(tmp_path):
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps({"poses": [TWO[0].tolist()], "translation_error": 0.02, "rotation_error_deg": 0.5}))
+    text = tmp_path / "poses.txt"
+    text.write_text("# translation_error: 0.02\n# rotation_error_deg: 0.5\n0 0 0 0 0 0 0 1\n")
+    for read in (read_poses(path), read_poses(text)):
+        assert read.error_told
+        assert read.error.translation == 0.02
+        assert np.degrees(read.error.rotation) == pytest.approx(0.5)
+
+
+def test_rounded_matrices_become_rotations(tmp_path):
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps([np.round(pose((0.3, 0.2, -0.4)), 4).tolist()]))
+    R = read_poses(path).world_from_camera[0, :3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+
+
+def test_poses_go_with_frames_by_name_or_by_order(tmp_path):
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps([{"frame": f"dir/{i}.png", "world_from_camera": T.tolist()}
+                                for i, T in enumerate(TWO)]))  # fmt: skip
+    read = read_poses(path)
+    second, missing, first = read.of_frames(["1.png", "x.png", "0.png"], [0, 1, 2], True)
+    assert missing is None
+    np.testing.assert_allclose([first, second], TWO, atol=1e-15)
+    np.testing.assert_allclose(read.of_frames(["film.avi#0", "film.avi#1"], [0, 1], False), TWO, atol=1e-15)
+    with pytest.raises(InputError, match="must name frames of the folder"):
+        read.of_frames(["a.png"], [0], True)
+    with pytest.raises(InputError, match="2 poses; must be one for each of the 3 frames"):
+        read.of_frames(["a", "b", "c"], [0, 1, 2], False)
+
+
+MALFORMED = {
+    "no JSON": ("a.json", "{"),
+    "no list of poses": ("a.json", '{"a": 1}'),
+    "holds no pose": ("a.json", "[]"),
+    "must be a 4 x 4 matrix": ("a.json", "[[1, 2, 3]]"),
+    "no world_from_camera or model_from_camera": ("a.json", '[{"frame": "a.png"}]'),
+    "determinant 1": ("a.json", json.dumps([np.diag([1.0, 1, -1, 1]).tolist()])),
+    "must be rigid": ("a.json", json.dumps([np.diag([1.0, 1, 2, 1]).tolist()])),
+    "NaN": ("a.json", "[[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),
+    "names a.png twice": (
+        "a.json", json.dumps([{"frame": "a.png", "world_from_camera": np.eye(4).tolist()}] * 2)),
+    "must be all or none": (
+        "a.json", json.dumps([{"frame": "a.png", "world_from_camera": np.eye(4).tolist()}, np.eye(4).tolist()])),
+    "must be one of mm, m": ("a.json", json.dumps({"unit": "inch", "poses": [np.eye(4).tolist()]})),
+    "translation_error = -1": ("a.json", json.dumps({"translation_error": -1, "poses": [np.eye(4).tolist()]})),
+    "rotation_error_deg = x": ("a.txt", "# rotation_error_deg: x\n0 0 0 0 0 0 0 1\n"),
+    "line 2": ("a.txt", "0 0 0 0 0 0 0 1\n0 0 0\n"),
+    "must be 8 numbers": ("a.txt", "zero 0 0 0 0 0 0 1\n"),
+    "quaternion of length 2": ("a.txt", "0 0 0 0 0 0 0 2\n"),
+    "holds no pose; must": ("a.txt", "# nothing\n"),
+    "no text": ("a.txt", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", list(MALFORMED))
+def test_malformed_files_are_one_line(words, tmp_path):
+    name, text = MALFORMED[words]
+    path = tmp_path / name
+    path.write_bytes(b"\xff\xfe\x00" if text is None else text.encode())
+    with pytest.raises(InputError) as raised:
+        read_poses(path)
+    message = str(raised.value)
+    assert words.lower() in message.lower()
+    assert message.startswith("--poses ")
+    assert "\n" not in message
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_poses(tmp_path / "none.json")
