@@ -92,6 +92,7 @@ Estimators = Annotated[
     list[str] | None,
     named(
         "estimators",
+        files=True,
         name="--estimator",
         negative="",
         help="Estimator by name, or a core of your own: 'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",

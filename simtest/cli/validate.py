@@ -82,7 +82,8 @@ def validate(
         chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
         run(described, folder, None, command, variant, progress, engine=chosen, export=export)
     if as_json:
-        print_run(folder, meshes=meshes)
+        exported = {} if export is None else {"export": export / "README.md"}
+        print_run(folder, meshes=meshes, **exported)
         return
     # A warning has told what is wrong with a mesh, unless --quiet left it out.
     verdicts = [mesh for mesh in meshes if mesh.usable or MANNERS.quiet]

@@ -11,6 +11,7 @@ from pydantic import JsonValue
 
 from simtest.dataset.plan import Plan, spec_files
 from simtest.errors import InputError
+from simtest.estimators.process.naming import core_hashes, core_name
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
 from simtest.runtime.limits import check_limit
@@ -92,11 +93,21 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
         "versions": provenance.versions(),
         "source": provenance.source_hash(),
         "variant": variant,
-        "inputs": {path.name: provenance.file_hash(path) for path in spec_files(plan.dataset)},
+        "inputs": {path.name: provenance.file_hash(path) for path in spec_files(plan.dataset)} | _core_files(plan),
     }
     found = provenance.environment()
     environment = {name: found[name] for name in ("commit", "python", "processor", "system")}
     return Manifest(plan.dataset.model_dump(mode="json"), origin, environment)
+
+
+def _core_files(plan: Plan) -> dict[str, str]:
+    """Return the hashes of the files of the estimators that are cores, named without the folders of this machine."""
+    hashes = core_hashes(plan.dataset.estimators)
+    return {
+        f"core {core_name(name)}: {Path(path).name}": digest
+        for name, of_core in hashes.items()
+        for path, digest in of_core.items()
+    }
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -351,15 +351,15 @@ def _flagged(
         masks["vignetted"] = limited[y : y + height, x : x + width]
     touched = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
     # An unresolved highlight states no shape that smoothing could have changed.
-    flags: tuple[str, ...] = ("small",) if small and UNRESOLVED not in result.flags else ()
+    flags = ("small",) if small and UNRESOLVED not in result.flags else ()
     flags = (*flags, "dim") if dim else flags
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
         used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
         flags = (*(name for name, mask in touched.items() if (mask & used).any()), *flags)
     # Answers made elsewhere may state them already.
-    flags = tuple(flag for flag in flags if flag not in result.flags)
-    return replace(result, flags=(*result.flags, *flags)) if flags else result
+    new = [flag for flag in flags if flag not in result.flags]
+    return replace(result, flags=(*result.flags, *new)) if new else result
 
 
 def _calibration(camera: object) -> Calibration:

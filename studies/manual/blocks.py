@@ -1,8 +1,8 @@
 """The code blocks of the manual's pages, read as they stand.
 
 Convention: an `sh` or `python` block runs as written from the checkout's root, in the page's order; a `console` block,
-or one below the line `<!-- own files -->`, needs files of the reader's and is not run. A `text` block may show what
-was printed: `studies.manual.outputs`.
+or one below the line `<!-- own files -->`, needs files of the reader's and is not run, unless it stands below the line
+`<!-- session -->`. A `text` block may show what was printed: `studies.manual.outputs`.
 """
 
 import re
@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 FENCE = re.compile(r"^(?P<indent> *)(?P<fence>`{3,}|~{3,})(?P<info>.*)$")
 OWN_FILES = "<!-- own files -->"
+SESSION = "<!-- session -->"
 COMMAND = re.compile(r"\$? *(?:simtest|python -m|make) ")
 
 
@@ -48,6 +49,11 @@ class Block:
     def place(self) -> str:
         """Page and line."""
         return f"{self.page}:{self.line}"
+
+    @property
+    def is_session(self) -> bool:
+        """Whether it shows commands and what they print, which may be refusals."""
+        return self.language == "console" and self.runs
 
     @property
     def shows_refusal(self) -> bool:
@@ -86,8 +92,9 @@ def blocks_of(path: Path) -> Iterator[Block]:
             end = next((k for k in range(number + 1, len(lines)) if closing.match(lines[k])), len(lines))
             code = [text[len(fence["indent"]) :] for text in lines[number + 1 : end]]
             language = fence["info"].strip().partition(" ")[0]
-            runs = language in ("sh", "python") and not own
-            yield Block(page, number + 2, language, "\n".join(code), runs, "\n".join(lines[ended:number]))
+            above = "\n".join(lines[ended:number])
+            runs = SESSION in above if language == "console" else language in ("sh", "python") and not own
+            yield Block(page, number + 2, language, "\n".join(code), runs, above)
             number = ended = end + 1
             own = False
         elif line.startswith("    ") and (number == 0 or not lines[number - 1].strip()) and COMMAND.match(line[4:]):

@@ -1,7 +1,8 @@
 """Compare what the manual shows as printed with what its commands print.
 
 Convention: a `text` block shows the output of the `sh` or `python` block before it, if no heading and no other block
-lies between. Each of its lines must be printed, in this order and without others between:
+lies between. A `console` block below the line `<!-- session -->` shows commands, after `$ `, and their output; they may
+fail. Each line of an output must be printed, in this order and without others between:
 
 - `...`, alone on a line, stands for any lines;
 - the line `<!-- may vary: PIECE; PIECE -->` above the block lists pieces of it (a path, a version, a time) in whose
@@ -16,7 +17,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from studies.manual.blocks import Block
@@ -52,7 +53,10 @@ class Shown:
 def with_outputs(blocks: Sequence[Block]) -> Iterator[tuple[Block, Shown | None]]:
     """Yield each block that runs, with its output where the page shows it."""
     for block, following in pairwise([*blocks, None]):
-        if block is not None and block.runs:
+        if block is not None and block.is_session:
+            printed = [line for line in block.code.splitlines() if not line.startswith("$ ")]
+            yield block, _shown(replace(block, code="\n".join(printed)))
+        elif block is not None and block.runs:
             shows = following is not None and following.language == "text" and not HEADING.search(following.above)
             yield block, _shown(following) if shows and following is not None else None
 

@@ -80,7 +80,9 @@ def _run_page(
                     continue
                 started = time.monotonic()
                 run = python.run if block.language == "python" else _shell
-                ok, text = run(command, scratch, timeout_s)
+                succeeded, text = run(command, scratch, timeout_s)
+                # Of a session it counts what is printed.
+                ok = succeeded or block.is_session
                 spent = time.monotonic() - started
                 failed += not ok
                 complete = complete and ok
@@ -114,8 +116,9 @@ def _pieces(block: Block) -> Iterator[str]:
 
 def outputs_of(command: str) -> list[str]:
     """Return the folders and files that a command of simtest writes to, as they stand in it or by default."""
-    named = re.findall(r"--(?:out|reports)[ =](\S+)", command)
-    runs = [f"reports/runs/{name}" for name in re.findall(r"simtest validate (\w+)", command) if not named]
+    named = re.findall(r"--(?:out|reports|export)[ =](\S+)", command)
+    elsewhere = re.search(r"--out[ =]", command)
+    runs = [f"reports/runs/{name}" for name in re.findall(r"simtest validate (\w+)", command) if not elsewhere]
     return [*named, *runs, *(["reports/nightly"] if "simtest nightly" in command and not named else [])]
 
 

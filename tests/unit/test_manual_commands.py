@@ -3,7 +3,7 @@
 import pytest
 
 from studies.manual.blocks import ROOT, blocks_of, manual_pages
-from studies.manual.runner import reads, run_pages
+from studies.manual.runner import outputs_of, reads, run_pages
 from studies.manual.stale import faults, stale
 
 
@@ -138,6 +138,8 @@ def test_blocks_run_in_order_and_failures_are_counted(tmp_path, monkeypatch, cap
     )
     assert run_pages([page], quick=True, timeout_s=60, log=None) == 0
     assert capsys.readouterr().out.count("left out") == 2
+    assert outputs_of("simtest validate dense --out run --export frames") == ["run", "frames"]
+    assert outputs_of("simtest validate dense --export frames") == ["frames", "reports/runs/dense"]
     assert reads("open('run/a.json')", ["run"])
     assert not reads("simtest render run_2 --out rerun; ls out/run", ["run"])
     page.write_text("```sh\nsleep 30\n```\n```sh\nsimtest nightly\nmake demo\n```\n", encoding="utf-8")

@@ -101,6 +101,19 @@ def test_outputs_belong_to_the_block_before_them(tmp_path):
     assert [each for _, each in with_outputs(list(blocks_of(page)))] == [None]
 
 
+def test_a_session_shows_its_own_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("studies.manual.runner._copy_checkout", lambda scratch: None)
+    page = tmp_path / "page.md"
+    session = "```console\n$ echo 1; exit 2\n1\n$ echo b /x\nb /y\n```\n"
+    page.write_text(session, encoding="utf-8")
+    assert list(with_outputs(list(blocks_of(page)))) == []
+    page.write_text(f"<!-- session -->\n<!-- may vary: /y -->\n{session}", encoding="utf-8")
+    assert run_pages([page], quick=True, timeout_s=60, log=None) == 0
+    page.write_text(f"<!-- session -->\n{session}", encoding="utf-8")
+    assert run_pages([page], quick=True, timeout_s=60, log=None) == 1
+    assert "-b /y\n+b /x\n" in capsys.readouterr().out
+
+
 def test_a_page_that_shows_another_output_fails(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("studies.manual.runner._copy_checkout", lambda scratch: None)
     page = tmp_path / "page.md"

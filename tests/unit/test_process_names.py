@@ -185,3 +185,18 @@ def test_the_command_line_takes_a_core(folder, here):
     assert code != 0
     assert len(errors) == 1
     assert "hello: protocol 2; simtest speaks 1" in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("./program --table model.onnx", "program"),
+        ("./program", "program"),
+        ("python3 script.py", "script"),
+        ("python3 script.py model.onnx", "script"),
+        (f"{sys.executable} script.py --weights model.onnx", "script"),
+        ("true", "true"),
+    ],
+)
+def test_a_command_has_the_name_of_what_the_user_wrote(folder, command, name):
+    assert parse_core(f"command: {command}").name == name

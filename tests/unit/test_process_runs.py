@@ -14,8 +14,14 @@ import psutil
 import pytest
 
 import simtest
+from simtest.dataset.manifest import new_manifest
+from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators.process.naming import close_cores
+from simtest.runtime.provenance import file_hash
+from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.paper import PaperSetting
+from simtest.validation.paper.gallery_item import reproduce_command
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
 
 EXPERIMENT = """
@@ -98,6 +104,19 @@ def test_an_estimator_of_ours_gives_the_same_rows_as_a_core_in_rendered_frames(t
 
 
 @pytest.mark.render
+def test_a_frame_core_answers_for_the_highlight_that_it_looks_at(tmp_path, experiment):
+    core = command(CORES / "brightest_core.py")
+    run = simtest.validate(experiment, tmp_path / "run", realisations=1, estimators=["brightest_point", core])
+    found = {name: rows for (name,), rows in run.results.group_by("estimator")}
+    assert set(found) == {"brightest_point", "brightest_core"}
+    own, others = found["brightest_core"], found["brightest_point"]
+    assert set(own["status"]) == {"ok"}
+    # The brightest pixel's centre against the sub-pixel peak.
+    assert np.abs(own["look_x_px"].to_numpy() - others["look_x_px"].to_numpy()).max() < 0.75
+    assert np.abs(own["error_deg"].to_numpy() - others["error_deg"].to_numpy()).max() < 0.5
+
+
+@pytest.mark.render
 @pytest.mark.slow
 def test_two_workers_give_the_same_rows_as_one(tmp_path, experiment, monkeypatch):
     monkeypatch.chdir(CORES)
@@ -116,14 +135,15 @@ def patterns(value):
 
 
 @pytest.mark.render
-def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment):
+@pytest.mark.parametrize("kind", ["patch", "frame"])
+def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment, kind):
     spied = tmp_path / "spied.bin"
     out = tmp_path / "peculiar-output-folder"
-    run = simtest.validate(experiment, out, estimators=[command(CORES / "spy_core.py", spied)])
+    run = simtest.validate(experiment, out, estimators=[command(CORES / "spy_core.py", spied, f"--{kind}")])
     content = spied.read_bytes()
-    rows = run.results.filter(pl.col("status") == "ok")
-    assert len(rows) == 4
-    assert content.count(b'"type":"patch"') == 4
+    rows = run.results
+    assert "ok" in rows["status"]
+    assert content.count(f'"type":"{kind}"'.encode()) == 4
     truths = ["truth_x", "truth_y", "truth_z", "bp_true_x_px", "bp_true_y_px", "kd_min", "kd_max", "eps_over_d"]
     values = {v for name in (*truths, "surface.tilt_deg") for v in rows[name].drop_nulls().to_list()}
     # A round number, such as 0, says nothing.
@@ -132,8 +152,8 @@ def test_a_core_sees_nothing_of_the_truth(tmp_path, experiment):
     found = [v for v in telling for pattern in patterns(v) if pattern in content]
     assert found == []
     # Searched for rightly: what it was told is found.
-    told = rows["look_x_px"].to_list()
-    assert [v for v in told if repr(v)[:9].encode() in content] == told
+    told = rows["look_x_px"].to_list() if kind == "patch" else ['"width":200', '"K":[[']
+    assert [v for v in told if str(v)[:9].encode() in content] == told
     words = ["7481927361", "peculiar", "aslant", "cylinder", "realisation", "truth", "setting", "seed", "noise_sigma"]
     words += [str(seed) for seed in rows["seed"].to_list()]
     assert [word for word in words if word.encode() in content] == []
@@ -185,6 +205,20 @@ def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
     started.stdout.close()
     assert wait_until(lambda: not processes_with(mark))
     assert wait_until(lambda: not os.path.exists(folder))
+
+
+def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
+    mark = f"--mark={tmp_path.name}"
+    started = parent("time.sleep(60)", command(BAD_CORE, "stays", mark))
+    folder = started.stdout.readline().strip()
+    process = psutil.Process(started.pid)
+    (core,) = process.children(recursive=True)
+    for each in (core, process):
+        each.kill()
+    started.wait()
+    started.stdout.close()
+    assert wait_until(lambda: not os.path.exists(folder))
+    assert wait_until(lambda: not processes_with(folder))
 
 
 @pytest.mark.parametrize("then", ["", "raise SystemExit(1)", "import os; os._exit(0)"])
@@ -277,6 +311,22 @@ def test_a_changed_program_is_another_run(tmp_path, published):
         simtest.validate(published, tmp_path / "run", **arguments)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
+
+
+@pytest.mark.parametrize("extra", ["", "'$HOME' '\"!'"])
+def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
+    core = command(BAD_CORE, "none", extra)
+    line = reproduce_command(PaperSetting(), (core,), 7)
+    done = subprocess.run(["bash", "-c", line.replace("python -c", f"{sys.executable} -c", 1)], capture_output=True,
+                          text=True, timeout=60, check=True)  # fmt: skip
+    assert "bad_core" in done.stdout
+    assert "Estimate(normal=(0, 0, -1)" in done.stdout
+
+
+def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores():
+    dataset = load_dataset("smooth").model_copy(update={"estimators": (command(BAD_CORE, "none"),)})
+    inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
+    assert inputs["core bad_core: bad_core.py"] == file_hash(BAD_CORE)
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):

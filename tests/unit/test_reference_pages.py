@@ -43,6 +43,8 @@ def flags_in(tree):
             named = [getattr(getattr(each, "value", each), "id", "") for each in node.targets]
             held = [node.value, *(each.slice for each in node.targets if isinstance(each, ast.Subscript))]
             values = held if {"flags", "conditions", "masks"} & set(named) else []
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            values = [node.value] if getattr(node.target, "id", "") in ("flags", "conditions", "masks") else []
         elif isinstance(node, ast.keyword) and node.arg == "flags":
             values = [node.value]
         else:
@@ -60,7 +62,7 @@ def flags():
 
 
 def test_flags_are_found_in_the_code():
-    assert {"missing_isovalues", "misfit", "cut", "clouds_refused", "round", "vignetted", "dim"} <= flags()
+    assert {"missing_isovalues", "misfit", "cut", "clouds_refused", "round", "vignetted", "dim", "small"} <= flags()
 
 
 def test_every_flag_is_explained():

@@ -387,6 +387,29 @@ def test_a_broken_parquet_file_is_refused(record, tmp_path):
         read_answers(tmp_path / "t.parquet", record, "mine")
 
 
+@pytest.mark.parametrize(
+    ("column", "values"),
+    [("normal_x", [[0.0]]), ("normal_x", [{"x": 0.0}]), ("frame", [[FRAME]]), ("normal_x", [b"0"])],
+)
+def test_columns_of_another_type_are_refused(record, tmp_path, column, values):
+    columns = {key: [value if key == "frame" else float(value)] for key, value in GOOD.items()}
+    pl.DataFrame({**columns, column: values}).write_parquet(tmp_path / "t.parquet")
+    with pytest.raises(InputError, match=f"column {column} is .*; must hold (numbers|text)|row 1: {column}") as error:
+        read_answers(tmp_path / "t.parquet", record, "mine")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "x" * 81, "two\nlines"])
+def test_a_name_that_cannot_stand_in_results_is_refused(sensor, tmp_path, name):
+    with pytest.raises(InputError, match=r"--name = .*: must be 1 to 80 printable characters without /"):
+        score_table(tmp_path / "t.csv", sensor, tmp_path / "out", name)
+
+
+def test_an_estimator_of_a_row_is_checked_too(record, tmp_path):
+    with pytest.raises(InputError, match="row 1: estimator = a/b: must be 1 to 80 printable characters"):
+        read_answers(write(tmp_path / "t.csv", {**GOOD, "estimator": "a/b"}), record, "mine")
+
+
 @pytest.mark.parametrize("path", ["nothing.csv", "."])
 def test_a_table_that_cannot_be_read_is_refused(record, tmp_path, path):
     with pytest.raises(InputError, match=r"cannot be read .*; must be a CSV or Parquet table"):

@@ -12,7 +12,7 @@ import polars as pl
 from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.scoring.answers import Answer, TableEstimator
 from simtest.dataset.scoring.record import Record, Source, check_frame, open_source, read_record
-from simtest.dataset.scoring.table import Answers, read_answers
+from simtest.dataset.scoring.table import Answers, check_name, read_answers
 from simtest.dataset.scoring.views import CaseViews, ShardViews, Shown, Views
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
@@ -106,8 +106,10 @@ def score_table(
         If the table is malformed, nothing was exported, or a frame comes out otherwise than it was exported.
     """
     started, clock = datetime.now(UTC), time.monotonic()
+    method = table.stem if name is None else name
+    check_name(method, "--name")
     record = read_record(on)
-    answers = read_answers(table, record, name or table.stem)
+    answers = read_answers(table, record, method)
     source = open_source(on, record)
     _check_apart(on, out)
     with exclusive_folder(out):

@@ -36,6 +36,9 @@ UNIT_TOLERANCE = 1e-3
 ROUNDING = 1e-9
 """A normal whose length differs from 1 by less stays as it is."""
 
+LONGEST_NAME = 80
+"""Characters of a method's name."""
+
 LARGEST_VARIANCE = np.pi**2
 """rad^2; no direction is less certain."""
 
@@ -105,6 +108,7 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
             continue
         frame, estimator = table.texts["frame"][row], table.texts["estimator"][row] or name
         own = made.setdefault(estimator, {}).setdefault(frame, [])
+        check_name(estimator, f"{shown(path)}: row {row + 1}: estimator")
         where = ("specularity", numbers[row]) if numbers[row] is not None else ("pixel", *points[row].tolist())
         if (before := seen.setdefault((estimator, frame, *where), row)) != row:
             raise table.refuse(row, f"frame {frame}: answers the same highlight as row {before + 1}; must be one row")
@@ -114,6 +118,12 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     if not made:
         raise InputError(f"{shown(path)}: holds no answer; must have a row for each normal")
     return made
+
+
+def check_name(name: str, what: str) -> None:
+    """Raise `InputError` where a method's name cannot stand in results, pages and names of folders."""
+    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name:
+        raise InputError(f"{what} = {shown(name, 40)}: must be 1 to {LONGEST_NAME} printable characters without /")
 
 
 # Reading ------------------------------------------------------------------------------------------------------------
@@ -136,11 +146,14 @@ def _read(path: Path) -> _Table:
     numbers = {name: np.full(frame.height, np.nan) for name in (*NUMBERS, "specularity")}
     texts = {name: [""] * frame.height for name in TEXTS}
     for name in frame.columns:
-        if name in texts:
-            column = frame[name].cast(pl.String, strict=False).fill_null("").str.strip_chars()
-            texts[name] = column.to_list()
-        elif name in numbers:
-            numbers[name] = _number_column(path, frame[name])
+        try:
+            if name in texts:
+                texts[name] = frame[name].cast(pl.String).fill_null("").str.strip_chars().to_list()
+            elif name in numbers:
+                numbers[name] = _number_column(path, frame[name])
+        except pl.exceptions.PolarsError as error:
+            kind = "text" if name in texts else "numbers"
+            raise InputError(f"{shown(path)}: column {name} is {frame[name].dtype}; must hold {kind}") from error
     return _Table(path, numbers, texts, frame.height)
 
 

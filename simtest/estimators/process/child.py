@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import IO
 
 from simtest.errors import Reason
 from simtest.estimators.process.wire import CoreFault, Message, MessageReader, broken, excerpt
@@ -28,9 +29,11 @@ PIPE_BYTES = 1 << 20
 KEPT_STDERR_BYTES = 4096
 SHOWN_STDERR = 300
 
-_GUARD = 'read -r group && read -r _ || { [ "$group" ] && kill -s KILL -- "-$group"; rm -rf -- "$1"; }'
+_GUARD = """exec 3<&0
+(read -r group && read -r _ || { [ "$group" ] && kill -s KILL -- "-$group"; rm -rf -- "$1"; }) <&3 3<&- &"""
 """A shell that outlives this process if it is killed: when its input ends without a second line, it kills the core's
-process group and removes its folder."""
+process group and removes its folder. It runs in the background of another one that ends at once, so that it is no child
+of this process: a cluster kills those of its workers with them."""
 
 
 @dataclass
@@ -65,15 +68,17 @@ class Child:
     ----------
     folder : str
         Its own temporary folder, in which it runs.
-    process, guard : Popen
-        The core, leader of its process group, and the shell that watches over it.
+    process : Popen
+        The core, leader of its process group.
+    guard : file
+        Input of the shell that watches over it.
     owner : int
         Process that started it; a fork of that one must not use its pipes.
     """
 
     folder: str
     process: "subprocess.Popen[bytes]"
-    guard: "subprocess.Popen[bytes]"
+    guard: IO[bytes]
     owner: int = field(default_factory=os.getpid)
     _stderr: bytes = b""
     _stderr_open: bool = True
@@ -90,10 +95,7 @@ class Child:
         folder = tempfile.mkdtemp(prefix="simtest-core-")
         guard = None
         try:
-            guard = subprocess.Popen(
-                ["/bin/sh", "-c", _GUARD, "sh", folder], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL, cwd="/", env={"PATH": os.defpath}, start_new_session=True, bufsize=0,
-            )  # fmt: skip
+            guard = _start_guard(folder)
             process = subprocess.Popen(
                 list(arguments), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder,
                 env={**environment, "TMPDIR": folder}, start_new_session=True, bufsize=0,
@@ -104,9 +106,8 @@ class Child:
             shutil.rmtree(folder, ignore_errors=True)
             raise
         child = cls(folder, process, guard)
-        assert guard.stdin is not None
         with contextlib.suppress(OSError):
-            guard.stdin.write(b"%d\n" % process.pid)
+            guard.write(b"%d\n" % process.pid)
         for pipe in child._pipes:
             os.set_blocking(pipe, False)
             with contextlib.suppress(OSError):
@@ -187,7 +188,11 @@ class Child:
         """Return whether the process has ended; it stays as a zombie, so that its group's number is not used again."""
         if self.process.returncode is not None:
             return True
-        return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        try:
+            return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        except ChildProcessError:
+            # Where the user's program ignores SIGCHLD nothing is left of a process that has ended.
+            return True
 
     def close(self, wait_s: float = END_S) -> None:
         """Close the core's standard input, wait for its end, then kill what is left of its process group."""
@@ -267,15 +272,25 @@ def _discard(pipes: Sequence[int], wait_s: float) -> None:
             time.sleep(min(wait_s, 0.001))
 
 
-def _release(guard: "subprocess.Popen[bytes]") -> None:
-    """Let the guard end without doing anything."""
+def _start_guard(folder: str) -> IO[bytes]:
+    """Start the shell that watches over a core with this folder; return its input."""
+    guard = subprocess.Popen(
+        ["/bin/sh", "-c", _GUARD, "sh", folder], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, cwd="/", env={"PATH": os.defpath}, start_new_session=True, bufsize=0,
+    )  # fmt: skip
+    # Its background part goes on.
+    guard.wait()
     assert guard.stdin is not None
+    return guard.stdin
+
+
+def _release(guard: IO[bytes]) -> None:
+    """Let the guard end without doing anything."""
     # Where no group has been told yet, this is it, and the next line is the one that lets it go.
     with contextlib.suppress(OSError):
-        guard.stdin.write(b"\n\n")
+        guard.write(b"\n\n")
     with contextlib.suppress(OSError):
-        guard.stdin.close()
-    guard.wait()
+        guard.close()
 
 
 def _exit(code: int) -> str:

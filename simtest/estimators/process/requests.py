@@ -20,6 +20,9 @@ Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]
 """How each array on offer is made; the making returns a text where there is none, which says why."""
 
+MOST_KEPT_RAYS = 1_000_000
+"""Pixels of the largest camera whose sightlines are kept: they take 24 bytes each."""
+
 
 @lru_cache(maxsize=8)
 def camera_message(camera: Camera) -> dict[str, Any]:
@@ -156,9 +159,10 @@ def _whole_rays(camera: Camera) -> Array:
 
 
 def _rays(camera: Camera, origin: tuple[int, int], shape: tuple[int, int]) -> Array:
-    """Return the unit sightlines of a region's pixels, shape (h, w, 3); those of a camera are computed once."""
+    """Return the unit sightlines of a region's pixels, shape (h, w, 3); those of a small camera are computed once."""
     (x, y), (height, width) = origin, shape
-    if min(x, y) >= 0 and x + width <= camera.width and y + height <= camera.height:
+    inside = min(x, y) >= 0 and x + width <= camera.width and y + height <= camera.height
+    if inside and camera.width * camera.height <= MOST_KEPT_RAYS:
         return _whole_rays(camera)[y : y + height, x : x + width]
     across, down = np.arange(width) + x + PIXEL_CENTRE, np.arange(height) + y + PIXEL_CENTRE
     return camera.unproject(np.stack(np.meshgrid(across, down), axis=-1))

@@ -1,5 +1,6 @@
 """Keeps one realisation of the published protocol for the gallery, with the pictures of the pipeline's stages."""
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -79,11 +80,14 @@ def save_realisation(path: Path, experiment: Experiment, case: Case, number: int
 def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: int) -> str:
     """Return the command that makes a realisation alone and prints its estimates."""
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
-    return (
-        'python -c "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; '
+    code = (
+        "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; "
         "from simtest.validation.paper.rows import pipeline_with; "
-        f'print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"'
+        f"print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"
     )
+    # Double quotes are easier to read, but the command of a core may hold what a shell would replace in them.
+    plain = f'"{code}"' if not set(code) & set('"$`\\!') else shlex.quote(code)
+    return f"python -c {plain}"
 
 
 def _bp(setting: PaperSetting, stages: Stages) -> Array:

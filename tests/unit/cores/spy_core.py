@@ -8,6 +8,13 @@ import sys
 SIZES = {"<f8": 8, "<f4": 4, "<u2": 2, "|u1": 1, "<i4": 4, "|b1": 1}
 
 
+KIND = "frame" if "--frame" in sys.argv else "patch"
+ARRAYS = {
+    "patch": ["values", "raw", "noise", "saturated", "seen", "rays", "isophote_0.5"],
+    "frame": ["encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays"],
+}
+
+
 def main():
     with open(sys.argv[1], "ab") as file:
         tree = [[folder, names, held] for folder, names, held in os.walk(".")]
@@ -28,10 +35,14 @@ def main():
             file.flush()
             if header["type"] == "hello":
                 answer = {
-                    "type": "hello", "protocol": 1, "name": "spy", "version": "1", "kind": "patch", "isophotes": [0.5],
-                    "arrays": ["values", "raw", "noise", "saturated", "seen", "rays", "isophote_0.5"],
+                    "type": "hello", "protocol": 1, "name": "spy", "version": "1", "kind": KIND, "arrays": ARRAYS[KIND],
+                    "isophotes": [0.5] if KIND == "patch" else [],
                 }  # fmt: skip
                 sys.stdout.buffer.write(json.dumps(answer).encode() + b"\n")
+            elif KIND == "frame":
+                estimates = [{"normal": [0, 0, -1], "look_px": [100, 75]}]
+                told = {"type": "estimates", "id": header["id"], "estimates": estimates}
+                sys.stdout.buffer.write(json.dumps(told).encode() + b"\n")
             else:
                 normal = struct.pack("<3d", 0, 0, -1)
                 listed = [{"name": "normal", "dtype": "<f8", "shape": [3]}]

@@ -1,0 +1,91 @@
+"""A dataset's frames without their truth, and answers to them; every shipped experiment can be exported."""
+
+import json
+
+import polars as pl
+import pytest
+
+from simtest.dataset.export import export_dataset
+from simtest.dataset.scoring.frames import scored_frames
+from simtest.dataset.scoring.run import score_table
+from simtest.dataset.shard_writer import write_dataset
+from simtest.dataset.verify import verify
+from simtest.runtime.engines import make_engine
+from simtest.runtime.resources import data_root
+from simtest.spec import calibration_toml, load_dataset, load_experiment
+from simtest.validation.cases import expand
+
+EXPERIMENTS = sorted(path.stem for path in data_root("scenes").glob("experiments/*.toml"))
+FEW = 6
+
+LEFT_OUT = {"split", "index", "isovalue", "isovalues", "axis_ratio_seen_law"}
+OF_CANDIDATES = {"error_oracle_deg", "n_candidates", "rank_correct", "error_law_deg"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A dataset and its export."""
+    base = tmp_path_factory.mktemp("dataset")
+    write_dataset(load_dataset("tiny", {"samples": FEW, "samples_per_anatomy": 1}), base / "data", make_engine())
+    export_dataset(base / "data", base / "frames", make_engine())
+    return base / "data", base / "frames"
+
+
+def test_an_exported_dataset_is_sound(made):
+    assert verify(made[0]) == []
+
+
+def test_a_dataset_has_a_frame_for_each_sample(made):
+    data, frames = made
+    scored = list(scored_frames(data))
+    assert sorted(frame.realisation for frame in scored) == list(range(FEW))
+    assert {frame.name for frame in scored} == {path.stem for path in (frames / "frames").iterdir()}
+    drawn = dict(pl.read_parquet(data / "index.parquet").select("index", "drawn").iter_rows())
+    for frame in scored:
+        assert frame.swept == json.loads(drawn[frame.realisation])
+        assert frame.view.highlights
+
+
+def test_own_estimates_of_a_dataset_are_scored_as_they_were(made, tmp_path):
+    data, _ = made
+    uses = pl.DataFrame(json.loads((data / "export.json").read_text())["uses"]).select("frame", index="realisation")
+    ours = pl.read_parquet(data / "estimates.parquet")
+    named = ours.filter(pl.col("specularity").is_not_null()).join(uses, on="index")
+    table = named.select(
+        "frame", "estimator", "specularity", "normal_x", "normal_y", "normal_z", "cov_11", "cov_12", "cov_22", "target",
+        "axis_ratio", "choice_margin", "flags", "status", x_px="look_x_px", y_px="look_y_px",
+    )  # fmt: skip
+    table.write_csv(tmp_path / "own.csv")
+    again = score_table(tmp_path / "own.csv", data, tmp_path / "scored").results
+    keys = ["realisation", "specularity", "estimator", "true_id"]
+    ours, again = ours.with_columns(realisation="index").sort(keys), again.sort(keys)
+    assert len(ours) == len(again)
+    for name in set(ours.columns) - LEFT_OUT:
+        if not name.startswith("budget_"):
+            single = ours["n_candidates"].fill_null(1) == 1
+            kept = single if name in OF_CANDIDATES else single | True
+            assert ours[name].filter(kept).equals(again[name].filter(kept), null_equal=True), name
+    assert again["setting"].equals(ours["split"])
+    summary = json.loads((tmp_path / "scored" / "summary.json").read_text())
+    assert set(summary["experiments"]["tiny"]["settings"]) == set(ours["split"])
+
+
+def test_the_command_exports(made, here):
+    data, frames = made
+    code, output, errors = here("dataset", "export", data, "--out", "again", "--quiet")
+    assert (code, output) == (0, "again/README.md\n"), errors
+    from pathlib import Path
+
+    assert Path("again/frames.csv").read_bytes() == (frames / "frames.csv").read_bytes()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_calibrations_of_every_experiment_stand_in_files(name):
+    experiment = load_experiment(name)
+    labels = {}
+    for case in expand(experiment):
+        if not case.is_paper:
+            labels.setdefault(case.label, case)
+    for case in labels.values():
+        scene, _ = case.scene(experiment, case.numbers()[0])
+        assert "[camera]" in calibration_toml(scene.calibration(20.0))
