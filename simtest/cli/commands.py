@@ -30,6 +30,7 @@ COMMANDS = {
     "validate": "Run an experiment and write its report.",
     "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
+    "bench": "Run the frozen benchmark, verify its certificates, make a table of them.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
     "completion": "Print or install the completion of commands, options and names for a shell.",

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 _PACKAGE = Path(__file__).resolve().parents[1]
 TEMPLATES = [
     _PACKAGE / "pages" / "templates",
-    *(_PACKAGE / room for room in ("report", "realism", "reconstruction", "nightly/page", "dataset/scoring/dense")),
+    *(
+        _PACKAGE / room
+        for room in ("report", "realism", "reconstruction", "nightly/page", "bench", "dataset/scoring/dense")
+    ),
 ]
 
 

@@ -215,8 +215,8 @@ def test_reports_are_json_on_request():
     reports = {"core check", "score",
                "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
-               "dataset export",
-               "mesh check", "mesh colon", "mesh liver"}  # fmt: skip
+               "dataset export", "mesh check", "mesh colon", "mesh liver", "bench run", "bench verify", "bench table",
+               "bench seal", "bench cases", "bench frames"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]

@@ -72,7 +72,7 @@ def test_own_estimates_of_a_dataset_are_scored_as_they_were(made, tmp_path):
 
 def test_the_command_exports(made, here):
     data, frames = made
-    code, output, errors = here("dataset", "export", data, "--out", "again", "--quiet")
+    code, output, errors = here("dataset", "export", data, "--out", "again")
     assert (code, output) == (0, "again/README.md\n"), errors
     from pathlib import Path
 

@@ -513,7 +513,7 @@ def test_the_rows_do_not_depend_on_the_workers(sensor, base, table):
 
 
 def test_the_command_prints_what_a_run_prints(sensor, here, table):
-    code, output, errors = here("score", table, "--on", sensor, "--out", "scored", "--quiet")
+    code, output, errors = here("score", table, "--on", sensor, "--out", "scored")
     assert code == 0, errors
     assert output.splitlines()[-1] == "scored/index.html"
     code, output, errors = here("score", table, "--on", sensor / "gallery")

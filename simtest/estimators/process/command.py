@@ -25,6 +25,9 @@ PASSED = ("PATH", "HOME", "LANG", "LD_LIBRARY_PATH")
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
+INTERPRETERS = re.compile(r"(python|pypy|octave|matlab|julia|java|node|ruby|perl|Rscript|bash|sh|env)([-0-9.]|$)")
+"""Names of programs that run a file, by how they begin."""
+
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -143,7 +146,9 @@ def _resolved(text: str, command: str, folder: Path) -> tuple[tuple[str, ...], t
         if found is not None and found.is_file():
             files.append(Path(os.path.normpath(found)))
     named = [file for file in files[1:] if str(file) in arguments]
-    name = re.sub("[^A-Za-z0-9_.-]+", "_", (named or [program])[-1].stem).lstrip("_.-")[:40]
+    # A program of the user's own has a name; what runs a script has that of the script.
+    source = named[0] if named and ("/" not in words[0] or INTERPRETERS.match(program.name)) else program
+    name = re.sub("[^A-Za-z0-9_.-]+", "_", source.stem).lstrip("_.-")[:40]
     return tuple(arguments), tuple(dict.fromkeys(files)), name or "core"
 
 

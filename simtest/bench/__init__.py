@@ -1,0 +1,1 @@
+"""The frozen benchmark: cases, seeds, run, certificate and table."""

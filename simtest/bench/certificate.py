@@ -1,0 +1,118 @@
+"""The certificate of a run: what was run, on what, by which core, with which results; checked when it is read."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from simtest.bench.suite import SUITES, Suite, digest_of
+from simtest.errors import InputError
+from simtest.runtime import provenance
+from simtest.runtime.files import JsonObject, require_plain, write_json
+from simtest.runtime.resources import shown
+
+CERTIFICATE = "certificate.json"
+KIND = "simtest-bench certificate"
+FORMAT = 1
+
+OF_CERTIFICATE = "sha256"
+"""Key of the hash of everything else."""
+
+_KEYS = {"kind", "format", "suite", "cases", "seeds", "core", "environment", "parts", "overall", "timing"}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A certificate that was read and checked.
+
+    Parameters
+    ----------
+    path : Path
+        Of its file.
+    content : dict
+        As it stands there, without its own hash.
+    """
+
+    path: Path
+    content: JsonObject
+
+    @property
+    def core(self) -> JsonObject:
+        """Name, version and hashes of the core."""
+        return dict(self.content["core"])
+
+    @property
+    def parts(self) -> dict[str, JsonObject]:
+        """Figures by part."""
+        return dict(self.content["parts"])
+
+    @property
+    def commitment(self) -> str | None:
+        """Commitment to the sealed seeds; None where the seeds are public."""
+        held = self.content["seeds"].get("commitment")
+        return None if held is None else str(held)
+
+
+def environment() -> JsonObject:
+    """Return what of the machine and its packages the figures may depend on; neither paths nor the host's name."""
+    made_by: dict[str, Any] = dict(provenance.environment())
+    # The kernel says nothing of the figures, and its text may name the host.
+    del made_by["system"]
+    return made_by | {"source_sha256": provenance.source_hash()}
+
+
+def suite_record(suite: Suite) -> JsonObject:
+    """Return what a certificate tells of its suite."""
+    return {"name": suite.spec.name, "version": suite.version, "sha256": suite.digest}
+
+
+def write_certificate(folder: Path, content: JsonObject) -> Path:
+    """Write a certificate into a run's folder, with the hash of its content."""
+    path = folder / CERTIFICATE
+    plain = json.loads(json.dumps(content, allow_nan=False))
+    write_json(path, {**plain, OF_CERTIFICATE: digest_of(plain)})
+    return path
+
+
+def read_certificate(path: Path) -> Certificate:
+    """Read a certificate.
+
+    Raises
+    ------
+    InputError
+        If it is no certificate, was altered, or is of another version of the format.
+    """
+    if path.is_dir():
+        path = path / CERTIFICATE
+    try:
+        told = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{shown(path)}: cannot be read as a certificate ({why})") from error
+    if not isinstance(told, dict) or told.get("kind") != KIND:
+        raise InputError(f"{shown(path)}: is no certificate; its kind must be {KIND!r}")
+    if told.get("format") != FORMAT:
+        raise InputError(f"{shown(path)}: format = {shown(told.get('format'), 20)}; this release reads {FORMAT}")
+    stated = told.pop(OF_CERTIFICATE, None)
+    if missing := sorted(_KEYS - told.keys()):
+        raise InputError(f"{shown(path)}: has no key {missing[0]}; a certificate has {', '.join(sorted(_KEYS))}")
+    if stated != digest_of(told):
+        raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
+    return Certificate(path, told)
+
+
+def check_suite(certificate: Certificate, suite: Suite) -> None:
+    """Raise `InputError` where a certificate is of other cases than a suite's."""
+    told = certificate.content["suite"]
+    if told.get("version") != suite.version:
+        own = SUITES.get(suite.version, suite.version)
+        raise InputError(
+            f"{shown(certificate.path)}: is of version {shown(told.get('version'), 20)!r}; must be of {own}"
+        )
+    for name, digest in certificate.content["cases"].items():
+        if suite.hashes.get(name) != digest:
+            raise InputError(
+                f"{shown(certificate.path)}: case {shown(name, 60)} is not that of {SUITES[suite.version]}"
+            )
+    if told.get("sha256") != suite.digest:
+        raise InputError(f"{shown(certificate.path)}: its suite's hash is not that of {SUITES[suite.version]}")

@@ -1,0 +1,181 @@
+"""The table of certificates: cores ranked by their penalised errors, with ties where intervals overlap."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from simtest.bench.certificate import CERTIFICATE, Certificate, check_suite, read_certificate
+from simtest.bench.phrases import COLUMNS, NONE, degrees, part_cells, spanned
+from simtest.bench.suite import Suite
+from simtest.bench.verify import check_quick
+from simtest.errors import InputError
+from simtest.pages.html import environment
+from simtest.runtime import provenance
+from simtest.runtime.files import JsonObject, make_folder, write_atomically
+from simtest.runtime.resources import shown
+
+PAGE = "index.html"
+MOST_CERTIFICATES = 1000
+
+Figure = Callable[[Certificate], tuple[float | None, Sequence[float] | None]]
+"""What a table is ranked by: a value and its interval, of a certificate."""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A row of a table: a certificate and the ranks that its interval allows; None where it has no figure."""
+
+    certificate: Certificate
+    first: int | None
+    last: int | None
+
+    @property
+    def rank(self) -> str:
+        """The rank, or the first and the last of those that are tied."""
+        if self.first is None:
+            return NONE
+        return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
+
+
+@dataclass(frozen=True)
+class Board:
+    """The certificates of one set of seeds, ranked over all parts and by part.
+
+    Parameters
+    ----------
+    seeds : str
+        "public seed N", or the commitment.
+    overall : list of Ranked
+        By the mean of the parts' penalised errors.
+    parts : dict
+        By each part's penalised error.
+    """
+
+    seeds: str
+    overall: list[Ranked]
+    parts: dict[str, list[Ranked]]
+
+    def to_json(self) -> JsonObject:
+        """Return the ranks by core."""
+        return {
+            "seeds": self.seeds,
+            "overall": _names(self.overall),
+            "parts": {part: _names(rows) for part, rows in self.parts.items()},
+        }
+
+
+def _names(rows: list[Ranked]) -> JsonObject:
+    """Return the ranks of a table, by core and version, best first."""
+    cores = [(row.certificate.core, row.rank) for row in rows]
+    return {f"{core['name']} {core['version'] or ''}".strip(): rank for core, rank in cores}
+
+
+def read_entries(folder: Path, suite: Suite) -> list[Board]:
+    """Read the certificates below a folder and rank them; those of different seeds are ranked apart.
+
+    Raises
+    ------
+    InputError
+        If there are none, or one was altered, is inconsistent, or is of another version.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{shown(folder)}: must be a folder that holds certificates")
+    files = sorted(file for file in folder.rglob("*.json") if _is_certificate(file))
+    if not files or len(files) > MOST_CERTIFICATES:
+        raise InputError(f"{shown(folder)}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
+    entries: dict[str, list[Certificate]] = {}
+    for file in files:
+        certificate = read_certificate(file)
+        check_suite(certificate, suite)
+        if problems := check_quick(certificate, suite).problems:
+            raise InputError(f"{shown(file)}: {problems[0]}")
+        entries.setdefault(_seeds(certificate), []).append(certificate)
+    return [_board(suite, seeds, held) for seeds, held in sorted(entries.items())]
+
+
+def _is_certificate(file: Path) -> bool:
+    """Return whether a file is meant as a certificate: by its name, or by what it begins with."""
+    if file.name == CERTIFICATE:
+        return True
+    try:
+        with file.open("rb") as opened:
+            return b"simtest-bench certificate" in opened.read(200)
+    except OSError:
+        return False
+
+
+def _seeds(certificate: Certificate) -> str:
+    told = certificate.content["seeds"]
+    return f"public seed {told['seed']}" if certificate.commitment is None else f"sealed, {certificate.commitment}"
+
+
+def _board(suite: Suite, seeds: str, certificates: list[Certificate]) -> Board:
+    def overall(certificate: Certificate) -> tuple[float | None, Sequence[float] | None]:
+        told = certificate.content["overall"]
+        return told["penalised_deg"], told["penalised_interval"]
+
+    def of_part(part: str) -> Figure:
+        def figure(certificate: Certificate) -> tuple[float | None, Sequence[float] | None]:
+            told = certificate.parts[part]
+            return told["penalised_deg"], told["penalised_interval"]
+
+        return figure
+
+    parts = {
+        part.name: ranked([entry for entry in certificates if part.name in entry.parts], of_part(part.name))
+        for part in suite.spec.parts
+        if any(part.name in entry.parts for entry in certificates)
+    }
+    return Board(seeds, ranked(certificates, overall), parts)
+
+
+def ranked(certificates: list[Certificate], figure: Figure) -> list[Ranked]:
+    """Rank certificates, the smallest figure first; those whose intervals overlap are tied."""
+    told = [figure(entry) for entry in certificates]
+    spans = [
+        None if value is None else (value, value) if interval is None else (float(interval[0]), float(interval[1]))
+        for value, interval in told
+    ]
+    rows = []
+    for entry, own in zip(certificates, spans, strict=True):
+        if own is None:
+            rows.append(Ranked(entry, None, None))
+            continue
+        better = sum(span is not None and span[1] < own[0] for span in spans)
+        not_worse = sum(span is not None and span[0] <= own[1] for span in spans)
+        rows.append(Ranked(entry, 1 + better, not_worse))
+    order = sorted(range(len(rows)), key=lambda i: (told[i][0] is None, told[i][0] or 0.0, str(certificates[i].path)))
+    return [rows[i] for i in order]
+
+
+def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
+    """Write the page of ranked certificates; `out` is an HTML file, or a folder that gets index.html."""
+    page = out if out.suffix == ".html" else out / PAGE
+    make_folder(page.parent)
+    made_by = provenance.environment()
+    html = environment().get_template("leaderboard.html.j2").render(
+        suite=suite, boards=boards, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about,
+        provenance={"commit": made_by["commit"] or NONE, "simtest": made_by["version"]},
+    )  # fmt: skip
+    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
+    return page
+
+
+def _headline(certificate: Certificate) -> str:
+    told = certificate.content["overall"]
+    return spanned(told["penalised_deg"], told["penalised_interval"])
+
+
+def _about(certificate: Certificate) -> dict[str, Any]:
+    """Return what a row tells of the core and its machine."""
+    told, core = certificate.content, certificate.core
+    request = told["timing"]["request"]
+    return {
+        "name": core["name"],
+        "version": core["version"] or NONE,
+        "hash": (core["sha256"] or "")[:12],
+        "processor": told["environment"]["processor"],
+        "time": NONE if request["median_ms"] is None else f"{degrees(request['median_ms'])} ms a {request['unit']}",
+        "verdicts": {part: figures["uncertainty"]["verdict"] for part, figures in certificate.parts.items()},
+    }

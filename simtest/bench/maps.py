@@ -1,0 +1,122 @@
+"""The dense part: its frames for methods that run elsewhere, and the figures of their maps."""
+
+from pathlib import Path
+
+from simtest.bench.draws import Seeds, experiment_of
+from simtest.bench.suite import Suite, digest_of
+from simtest.bench.uncertainty import UNTESTED, UncertaintyScore
+from simtest.dataset.export import check_exportable, export_run
+from simtest.dataset.scoring.dense.conventions import MapOptions
+from simtest.dataset.scoring.dense.score import DenseScore, score_maps
+from simtest.dataset.scoring.dense.scorer import NORMAL, depth_source
+from simtest.errors import InputError
+from simtest.runtime import provenance
+from simtest.runtime.engines import Engine, make_engine
+from simtest.runtime.files import Json, JsonObject
+from simtest.validation.runner import Progress, run_experiments
+
+PART = "dense"
+RUN, FRAMES, SCORES = "run", "frames", "scores"
+"""Folders: of the part's run, of its frames without truth, and of the figures of maps."""
+
+SHADING = "shading"
+"""The method that needs no maps from elsewhere."""
+
+MAPS, BASELINE = "maps", "baseline"
+"""Kinds of cores: a folder of maps, and the method above."""
+
+OF_RUN = "brightest_point"
+"""The quickest estimator: the run is there for its frames."""
+
+
+def export_frames(
+    suite: Suite, folder: Path, seeds: Seeds, engine: Engine | None = None, progress: Progress | None = None
+) -> Path:
+    """Write the frames of the dense part without their truth; return the folder that a stranger gets.
+
+    Raises
+    ------
+    InputError
+        If the folder holds something else.
+    """
+    experiment = experiment_of(suite, PART, OF_RUN, seeds)
+    check_exportable(experiment)
+    chosen = engine or make_engine()
+    (run,) = run_experiments([(experiment, folder / RUN)], "", None, progress, chosen)
+    export_run(run.folder, experiment, folder / FRAMES, chosen, progress)
+    return folder / FRAMES
+
+
+def score_dense(
+    suite: Suite, maps: str | Path, folder: Path, seeds: Seeds, options: MapOptions | None = None,
+    engine: Engine | None = None, progress: Progress | None = None,
+) -> tuple[DenseScore, JsonObject]:  # fmt: skip
+    """Score maps on the frames of the dense part; return the whole score, and the part's figures for a certificate.
+
+    Parameters
+    ----------
+    suite, seeds, engine, progress
+        As of `simtest.bench.run.run_bench`.
+    maps : str or Path
+        Folder of the maps, each called as its frame, or "shading".
+    folder : Path
+        Gets the run, the frames and the scores, a folder each.
+    options : MapOptions, optional
+        What is stated of the maps.
+    """
+    export_frames(suite, folder, seeds, engine, progress)
+
+    def tell(done: int, total: int, what: str) -> None:
+        if progress:
+            progress(done, total, f"scoring {what}")
+
+    score = score_maps(maps, folder / RUN, folder / SCORES, options, "", tell)
+    return score, dense_figures(score)
+
+
+def dense_figures(score: DenseScore) -> JsonObject:
+    """Return a part's figures of the angles at all scored pixels, in the form of other parts, and those by zone.
+
+    They are of normal maps where there are any, else of depth maps after an affine alignment.
+    """
+    sources = sorted({key[0] for key, _ in score.scorer.cells()})
+    if not sources:
+        raise InputError(f"maps {score.name}: hold neither normals nor depths")
+    source = NORMAL if NORMAL in sources else depth_source("affine")
+    zones = {
+        label: _zone(score, source, label) for label in ("all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere")
+    }
+    every, rows = zones["all"], [_plain(row) for row in score.scorer.rows if row["group"] == "zone"]
+    nothing = UncertaintyScore(0, None, None, UNTESTED, None, None, None)
+    return {
+        "n": every["n"], "answered": every["n"] - every["n_unanswered"], "missed": 0, "false": 0,
+        "refused": {"no_value": every["n_unanswered"]} if every["n_unanswered"] else {},
+        "median_deg": every["median_deg"], "median_interval": every["median_interval"], "mean_deg": every["mean_deg"],
+        "p95_deg": every["p95_deg"], "penalised_deg": every["penalised_deg"],
+        "penalised_interval": every["penalised_interval"], "uncertainty": nothing.to_json(),
+        "results": digest_of(rows), "source": source, "zones": zones, "conventions": score.lines[:1],
+    }  # fmt: skip
+
+
+def _zone(score: DenseScore, source: str, label: str) -> JsonObject:
+    found = score.cell(source, "fine", label)
+    intervals = found["ci95"]
+    return {
+        "n": found["n"], "n_unanswered": found["n_unanswered"], "mean_deg": found["mean"],
+        "median_deg": found["median"], "median_interval": intervals.get("median"), "p95_deg": found["p95"],
+        "penalised_deg": found["mean_penalised"], "penalised_interval": intervals.get("mean_penalised"),
+    }  # fmt: skip
+
+
+def _plain(row: JsonObject) -> Json:
+    """Return a row as it is hashed: numbers as they are, what is not finite as null."""
+    return {key: None if isinstance(value, float) and value != value else value for key, value in row.items()}
+
+
+def maps_record(maps: str | Path, score: DenseScore) -> JsonObject:
+    """Return what a certificate tells of maps: the method's name, and the hash of the files by name."""
+    if str(maps) == SHADING:
+        return {"name": score.name, "kind": BASELINE, "version": f"simtest {provenance.version()}", "sha256": None}
+    files = sorted(path for path in Path(maps).rglob("*") if path.is_file())
+    hashes: Json = [[path.name, provenance.file_hash(path)] for path in files]
+    return {"name": score.name, "kind": MAPS, "version": None, "sha256": digest_of(hashes)}

@@ -1,0 +1,171 @@
+"""Runs the benchmark: each part by the ordinary runner, then the figures and the certificate."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from simtest.bench.certificate import FORMAT, KIND, environment, suite_record, write_certificate
+from simtest.bench.cores import check_core, core_record, time_core
+from simtest.bench.draws import Seeds, experiment_of
+from simtest.bench.scores import score_part
+from simtest.bench.suite import Suite, frames_of
+from simtest.errors import InputError
+from simtest.runtime.engines import Engine
+from simtest.runtime.files import JsonObject, make_folder
+from simtest.runtime.resources import shown
+from simtest.validation.runner import Progress, run_experiments
+
+if TYPE_CHECKING:
+    from simtest.dataset.scoring.dense.conventions import MapOptions
+
+HIGHLIGHTS = "highlights"
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """A finished run of the benchmark.
+
+    Parameters
+    ----------
+    certificate : Path
+        Its file.
+    content : dict
+        As in the file, without its hash.
+    """
+
+    certificate: Path
+    content: JsonObject
+
+
+def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
+    """Return the parts that are run: those asked for, or all whose unit is the highlight.
+
+    Raises `InputError` for a part that is unknown, named twice, or scored by maps.
+    """
+    if not wanted:
+        return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    for name in wanted:
+        if suite.part(name).kind != HIGHLIGHTS:
+            raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
+        if list(wanted).count(name) > 1:
+            raise InputError(f"--part {shown(name, 60)}: named twice")
+    return [part.name for part in suite.spec.parts if part.name in wanted]
+
+
+def run_bench(
+    suite: Suite,
+    core: str,
+    folder: Path,
+    seeds: Seeds,
+    parts: Sequence[str] | None = None,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+    variant: str | None = None,
+) -> BenchRun:
+    """Run a core on a suite and write its certificate; a stopped run goes on.
+
+    Parameters
+    ----------
+    suite : Suite
+        What to run.
+    core : str
+        An installed estimator, or a command.
+    folder : Path
+        Gets a run's folder for each part, and certificate.json.
+    seeds : Seeds
+        Public or sealed.
+    parts : sequence of str, optional
+        Default all that are scored by highlights.
+    engine, progress, variant
+        See `simtest.validate`. The figures do not depend on the engine.
+
+    Raises
+    ------
+    InputError
+        If a part or the core is unknown, or the folder holds something else.
+    """
+    check_core(core)
+    chosen = chosen_parts(suite, parts)
+    told = core_record(core)
+    make_folder(folder)
+    scores: dict[str, JsonObject] = {}
+    durations: dict[str, float] = {}
+    for part in chosen:
+        clock = time.monotonic()
+        experiment = experiment_of(suite, part, core, seeds)
+        # Part by part: the colours that one part needs are not those that another is rendered in.
+        (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
+        durations[part] = round(time.monotonic() - clock, 1)
+        scores[part] = score_part(run.results, frames_of(suite)).to_json()
+    timing: JsonObject = {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)}
+    return _certified(suite, seeds, folder, told, scores, timing)
+
+
+def run_maps(
+    suite: Suite,
+    maps: str | Path,
+    folder: Path,
+    seeds: Seeds,
+    options: "MapOptions | None" = None,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+) -> BenchRun:
+    """Score a method's maps on the dense part and write its certificate; see `run_bench`.
+
+    `maps` is a folder of maps, each called as its frame (`simtest.bench.maps.export_frames`), or "shading".
+    """
+    from simtest.bench.maps import PART, maps_record, score_dense
+
+    clock = time.monotonic()
+    make_folder(folder)
+    score, figures = score_dense(suite, maps, folder / PART, seeds, options, engine, progress)
+    durations = {PART: round(time.monotonic() - clock, 1)}
+    timing: JsonObject = {"parts_s": durations, "request": {"unit": "frame", "n": 0, "median_ms": None, "max_ms": None}}
+    return _certified(suite, seeds, folder, maps_record(maps, score), {PART: figures}, timing)
+
+
+def _certified(
+    suite: Suite, seeds: Seeds, folder: Path, core: JsonObject, scores: dict[str, JsonObject], timing: JsonObject
+) -> BenchRun:
+    """Write the certificate of a run's figures by part."""
+    content: JsonObject = {
+        "kind": KIND,
+        "format": FORMAT,
+        "suite": suite_record(suite),
+        "cases": {name: digest for name, digest in suite.hashes.items() if name.partition("/")[0] in scores},
+        "seeds": _seeds_record(suite, seeds),
+        "core": core,
+        "environment": environment(),
+        "parts": scores,
+        "overall": overall_of(suite, scores),
+        # Of this machine; nothing that a verification compares.
+        "timing": timing,
+    }
+    return BenchRun(write_certificate(folder, content), content)
+
+
+def _seeds_record(suite: Suite, seeds: Seeds) -> JsonObject:
+    if seeds.commitment is None:
+        return {"kind": "public", "seed": suite.spec.seed}
+    return {"kind": "sealed", "commitment": seeds.commitment}
+
+
+def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
+    """Return the headline: the mean over parts of the penalised mean error, where every part was run.
+
+    Its interval takes the parts' errors as independent. `parts` holds the figures as they stand in a certificate.
+    """
+    wanted = [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    told = [parts[part] for part in wanted if part in parts]
+    values = [part["penalised_deg"] for part in told if part["penalised_deg"] is not None]
+    if len(values) < len(wanted):
+        return {"complete": False, "penalised_deg": None, "penalised_interval": None}
+    mean = sum(values) / len(values)
+    spans = [part["penalised_interval"] for part in told if part["penalised_interval"] is not None]
+    if len(spans) < len(wanted):
+        return {"complete": True, "penalised_deg": mean, "penalised_interval": None}
+    half = math.hypot(*((high - low) / 2 for low, high in spans)) / len(spans)
+    return {"complete": True, "penalised_deg": mean, "penalised_interval": [max(0.0, mean - half), mean + half]}

@@ -1,0 +1,272 @@
+"""A suite of the benchmark: frozen cases by part, and the hashes that pin them.
+
+A case is a scene with every default written out (scenes/bench/v1/PART/NAME.toml), and the values that are drawn for
+each of its scenes (suite.toml). No later release changes it: a changed case is a new version of the suite.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from simtest.errors import InputError
+from simtest.runtime.files import Json
+from simtest.runtime.provenance import file_hash
+from simtest.runtime.resources import close_names, data_root, shown
+from simtest.spec import AnatomySurface, Scene, read_toml, scene_from_dict
+from simtest.spec.spec_model import Name, Spec, load
+from simtest.surfaces.recipe import load_recipe
+
+FORMAT = 1
+"""Of the cases' files; it enters their hashes."""
+
+SUITES = {"v1": "simtest-bench v1"}
+HASHES, SUITE = "hashes.json", "suite.toml"
+
+PartKind = Literal["highlights", "maps"]
+
+
+class Draw(Spec):
+    """The distribution of a value that is drawn for each scene of a case."""
+
+    kind: Literal["uniform", "log_uniform", "integer", "normal"] = "uniform"
+    low: float | None = Field(None, description="least value; of a normal distribution its mean")
+    high: float = Field(description="largest value; of a normal distribution its standard deviation")
+    blocks: int | None = Field(
+        None,
+        ge=1,
+        description="draw so many values, each for a block of scenes that follow each other; default one each",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Draw":
+        if self.kind != "normal" and (self.low is None or self.low > self.high):
+            raise ValueError(f"low = {self.low} and high = {self.high}: low must be given and not exceed high")
+        if self.kind == "log_uniform" and (self.low or 0) <= 0:
+            raise ValueError(f"low = {self.low}: must be positive where the logarithm is uniform")
+        return self
+
+
+class PartSpec(Spec):
+    """A part of the suite, which has a row of its own in the table."""
+
+    name: Name
+    title: str
+    description: str
+    kind: PartKind = "highlights"
+
+
+class CaseSpec(Spec):
+    """A case: how many scenes are drawn of it, and how many frames are taken of each."""
+
+    part: Name
+    name: Name
+    draws: int = Field(ge=1, le=1000)
+    realisations: int = Field(1, ge=1, le=1000, description="frames of each scene, which differ in noise")
+    isolated: bool = Field(True, description="count isolated highlights only")
+    draw: dict[str, Draw] = Field(default_factory=dict, description="drawn values by key path")
+
+
+class SuiteSpec(Spec):
+    """The content of suite.toml."""
+
+    name: Name
+    title: str
+    description: str
+    format: Literal[1]
+    seed: int = Field(ge=0, lt=2**63, description="the public seed")
+    parts: tuple[PartSpec, ...] = Field(min_length=1)
+    cases: tuple[CaseSpec, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> "SuiteSpec":
+        names = [f"{case.part}/{case.name}" for case in self.cases]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"case {twice}: listed twice")
+        parts = [part.name for part in self.parts]
+        if lost := next((case.part for case in self.cases if case.part not in parts), None):
+            raise ValueError(f"part {lost!r}: not listed; allowed: {', '.join(parts)}")
+        return self
+
+
+@dataclass(frozen=True)
+class FrozenCase:
+    """A case with its scene's tables and its hash.
+
+    Parameters
+    ----------
+    spec : CaseSpec
+        Its entry in suite.toml.
+    file : Path
+        The scene's file.
+    scene : dict
+        The scene's tables.
+    digest : str
+        SHA-256 of what defines the case.
+    """
+
+    spec: CaseSpec
+    file: Path
+    scene: dict[str, Any]
+    digest: str
+
+    @property
+    def name(self) -> str:
+        """Part and name."""
+        return f"{self.spec.part}/{self.spec.name}"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A version of the benchmark, read and checked against its pinned hashes."""
+
+    version: str
+    spec: SuiteSpec
+    cases: tuple[FrozenCase, ...]
+    digest: str
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """Hash of each case, by part and name."""
+        return {case.name: case.digest for case in self.cases}
+
+    def part(self, name: str) -> PartSpec:
+        """Return a part by name; raise `InputError` if there is none."""
+        for part in self.spec.parts:
+            if part.name == name:
+                return part
+        names = [part.name for part in self.spec.parts]
+        meant = "".join(f" (did you mean {close}?)" for close in close_names(name, names))
+        raise InputError(f"--part {shown(name, 60)}: unknown; allowed: {', '.join(names)}{meant}")
+
+    def of_part(self, name: str) -> list[FrozenCase]:
+        """Return the cases of a part."""
+        return [case for case in self.cases if case.spec.part == name]
+
+
+def canonical(value: Json) -> bytes:
+    """Return JSON as bytes that are the same on every machine: keys sorted, no spaces, shortest exact numbers."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
+
+
+def digest_of(value: Json) -> str:
+    """Return the SHA-256 of a value's canonical JSON."""
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def suite_folder(version: str) -> Path:
+    """Return the folder of a shipped suite; raise `InputError` for an unknown version."""
+    if version not in SUITES:
+        raise InputError(f"suite {shown(version, 40)!r}: unknown; allowed: {', '.join(SUITES)}")
+    return data_root("scenes") / "bench" / version
+
+
+def read_suite(folder: Path) -> Suite:
+    """Read a suite and compute its hashes, without a look at the pinned ones.
+
+    Raises `InputError` if a file is missing or malformed.
+    """
+    spec = load(SuiteSpec, folder / SUITE)
+    cases = tuple(_read_case(folder, case) for case in spec.cases)
+    # The suite's prose may be mended; what defines it may not.
+    parts = [{"name": part.name, "kind": part.kind} for part in spec.parts]
+    whole: Json = {
+        "format": FORMAT, "name": spec.name, "seed": spec.seed, "parts": parts,
+        "cases": {case.name: case.digest for case in cases},
+    }  # fmt: skip
+    return Suite(folder.name, spec, cases, digest_of(whole))
+
+
+def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
+    """Read a shipped suite and check it against its pinned hashes.
+
+    Raises
+    ------
+    InputError
+        If the version is unknown, a file is malformed, or a case is not the frozen one.
+    """
+    folder = folder or suite_folder(version)
+    suite = read_suite(folder)
+    try:
+        pinned = json.loads((folder / HASHES).read_text(encoding="utf-8"))
+        told, of_suite = dict(pinned["cases"]), str(pinned["suite"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{shown(folder / HASHES)}: cannot be read as the pinned hashes ({error})") from error
+    for name, digest in suite.hashes.items():
+        if told.get(name) != digest:
+            raise InputError(
+                f"case {name} of {SUITES.get(version, version)}: its hash is {digest[:12]}, pinned is "
+                f"{str(told.get(name))[:12]}; a changed case must be a new version"
+            )
+    if suite.digest != of_suite or set(told) != set(suite.hashes):
+        raise InputError(f"{shown(folder / SUITE)}: parts, seed or list of cases are not those pinned in {HASHES}")
+    return suite
+
+
+def frames_of(suite: Suite) -> dict[str, int]:
+    """Return how many frames each case's scenes are taken in, by case."""
+    return {case.spec.name: case.spec.realisations for case in suite.cases}
+
+
+def _read_case(folder: Path, spec: CaseSpec) -> FrozenCase:
+    file = folder / spec.part / f"{spec.name}.toml"
+    scene = read_toml(file)
+    content: Json = {"format": FORMAT, "case": spec.model_dump(mode="json"), "scene": scene, "files": _meshes(scene)}
+    return FrozenCase(spec, file, scene, digest_of(content))
+
+
+def _meshes(scene: Mapping[str, Any]) -> dict[str, str]:
+    """Return the hashes of mesh files by name; a recipe's values stand in the scene itself."""
+    surface = scene.get("surface", {})
+    if surface.get("type") != "anatomy":
+        return {}
+    file = AnatomySurface.model_validate(surface).file()
+    return {} if file.suffix == ".toml" else {file.name: file_hash(file)}
+
+
+def resolved_tables(scene: Scene) -> dict[str, Any]:
+    """Return a scene's tables with every default written out, and every preset and recipe replaced by its numbers.
+
+    Keys without a value are left out: TOML has none.
+    """
+    tables: dict[str, Any] = scene.model_dump(mode="json", exclude_none=True)
+    if scene.rig.preset is not None:
+        lights = [light.model_dump(mode="json", exclude_none=True) for light in scene.rig.lights]
+        lights = [
+            {key: value for key, value in light.items() if key not in ("offset_mm", "azimuth_deg")} for light in lights
+        ]
+        tables["rig"] = {"lights": lights, "seed": scene.rig.seed, "emission_known": scene.rig.emission_known}
+    tables["sensor"].pop("preset", None)
+    tables["reflectance"].get("albedo", {}).pop("preset", None)
+    if isinstance(scene.surface, AnatomySurface) and (file := scene.surface.file()).suffix == ".toml":
+        recipe = load_recipe(file, scene.surface.recipe_values)
+        # The type says which file it is read with, and the seed is the surface's own.
+        tables["surface"]["recipe"] = recipe.model_dump(mode="json", exclude_none=True, exclude={"type", "seed"})
+        tables["surface"]["seed"] = recipe.seed
+    return tables
+
+
+def unfrozen_keys(case: FrozenCase) -> list[str]:
+    """Return the key paths whose values the frozen file does not state: defaults that were added after the freeze.
+
+    Raises `InputError` if the file's scene resolves to another one than it states.
+    """
+    now = _flat(resolved_tables(scene_from_dict(case.scene, str(case.file))))
+    frozen = _flat(case.scene)
+    for path, value in frozen.items():
+        if now.get(path) != value:
+            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
+    return sorted(now.keys() - frozen.keys())
+
+
+def _flat(value: Any, above: str = "") -> dict[str, Any]:
+    """Return the leaves of nested tables and lists by key path; empty tables and lists are leaves."""
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    flat: dict[str, Any] = {}
+    for key, item in items:
+        flat |= _flat(item, f"{above}.{key}" if above else str(key))
+    return flat or ({above: value} if above else {})

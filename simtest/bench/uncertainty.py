@@ -1,0 +1,179 @@
+"""Scores of a stated uncertainty: coverage with its interval, a test of it, sharpness, and the energy score."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from simtest.geometry import chi_squared
+from simtest.geometry.vectors import tangent_coordinates
+from simtest.runtime.arrays import Array
+from simtest.runtime.files import JsonObject
+
+LEVEL = 0.95
+"""Of the regions whose coverage is tested."""
+
+ALPHA = 0.01
+"""Risk of each one-sided test that a right uncertainty is marked."""
+
+LEAST_STATED = 50
+"""With fewer uncertainties no verdict is given."""
+
+DIRECTIONS = 64
+"""Over which the energy score is averaged."""
+
+_Z_TEST, _Z_INTERVAL = 2.3263478740408408, 1.959963984540054
+"""Quantiles of the normal distribution at 1 - ALPHA and at 97.5 %."""
+
+SCALED, WELL, NARROW = "underconfident", "calibrated", "overconfident"
+UNTESTED = "too few"
+
+
+@dataclass(frozen=True)
+class UncertaintyScore:
+    """How good a stated uncertainty is.
+
+    Parameters
+    ----------
+    n : int
+        Answers that state an uncertainty, of highlights that are true ones.
+    coverage : float or None
+        Share of them whose 95 % region holds the true normal.
+    interval : tuple of float or None
+        95 % interval of the coverage, over scenes.
+    verdict : str
+        overconfident or underconfident where a test of the coverage says so, calibrated where not, else too few.
+    inflation : float or None
+        Factor on the covariances with which 95 % of the regions would hold the true normal.
+    semi_axis_deg : float or None
+        Sharpness: median of the regions' mean semi-axis (the square root of both semi-axes' product), deg.
+    energy_deg : float or None
+        Mean energy score, deg: a proper score; smaller is better, and only the right covariance has the smallest.
+    """
+
+    n: int
+    coverage: float | None
+    interval: tuple[float, float] | None
+    verdict: str
+    inflation: float | None
+    semi_axis_deg: float | None
+    energy_deg: float | None
+
+    def to_json(self) -> JsonObject:
+        """Return the score as a JSON object."""
+        return {**vars(self), "interval": None if self.interval is None else list(self.interval)}
+
+
+def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore:
+    """Score the uncertainties of answers.
+
+    Parameters
+    ----------
+    answered : polars.DataFrame
+        Rows of results with status "ok" and a true highlight.
+    scenes : ndarray of int, shape (N,)
+        Which scene each row is of: rows of one scene are not independent.
+    """
+    squared = answered["mahalanobis2"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    stated = np.isfinite(squared)
+    n, limit = int(stated.sum()), chi_squared.quantile(LEVEL, 2)
+    if n == 0:
+        return UncertaintyScore(0, None, None, UNTESTED, None, None, None)
+    inside = squared[stated] <= limit
+    error = coverage_error(inside, scenes[stated])
+    share = float(np.mean(inside))
+    # Wilson's interval for as many independent rows as would have this error.
+    interval = _wilson(share, LEVEL * (1 - LEVEL) / error**2)
+    coordinates, covariances = _misses(answered)
+    semi_axis = energy = None
+    if len(covariances):
+        areas = np.sqrt(np.maximum(np.linalg.det(covariances), 0.0))
+        semi_axis = float(np.degrees(np.median(np.sqrt(limit * areas))))
+        energy = float(np.degrees(np.mean(energy_scores(coordinates, covariances))))
+    inflation = float(np.quantile(squared[stated], LEVEL) / limit)
+    return UncertaintyScore(n, share, interval, verdict_of(share, error, n), inflation, semi_axis, energy)
+
+
+def coverage_error(inside: Array, scenes: Array) -> float:
+    """Return the standard error of a share of rows that are grouped in scenes, at least that of independent rows.
+
+    The error over scenes is that of a ratio estimator (Cochran 1977, section 2.11): with m_i rows of which a_i lie
+    inside, the variance is that of a_i - p m_i over scenes, over the square of the mean m.
+    """
+    n = len(inside)
+    independent = math.sqrt(LEVEL * (1 - LEVEL) / n)
+    _, index = np.unique(scenes, return_inverse=True)
+    rows, hits = np.bincount(index), np.bincount(index, weights=inside)
+    if len(rows) < 2:
+        return independent
+    rest = hits - np.mean(inside) * rows
+    grouped = math.sqrt(len(rows) / (len(rows) - 1) * float(rest @ rest)) / n
+    return max(independent, grouped)
+
+
+def verdict_of(share: float, error: float, n: int) -> str:
+    """Return what two one-sided tests of the coverage against 95 %, each of risk `ALPHA`, say of `n` regions."""
+    if n < LEAST_STATED:
+        return UNTESTED
+    if share < LEVEL - _Z_TEST * error:
+        return NARROW
+    return SCALED if share > LEVEL + _Z_TEST * error else WELL
+
+
+def energy_scores(misses: Array, covariances: Array) -> Array:
+    """Compute the energy score of normal distributions in the plane, E|X - y| - E|X - X'| / 2.
+
+    The length of a vector is pi/2 times the mean of its parts along all directions, so the score is pi/2 times the
+    mean over directions of the continuous ranked probability score of a normal distribution on a line, which has a
+    closed form (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102, equation 21).
+
+    Parameters
+    ----------
+    misses : ndarray, shape (N, 2)
+        True values less the distributions' means.
+    covariances : ndarray, shape (N, 2, 2)
+        Of the distributions.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Scores, in the unit of `misses`.
+    """
+    from scipy.special import ndtr
+
+    angle = np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    value = misses @ along.T
+    variance = np.einsum("kj,nji,ki->nk", along, covariances, along)
+    sd = np.sqrt(np.maximum(variance, 1e-300))
+    z = value / sd
+    density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
+    ranked = sd * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / math.sqrt(math.pi))
+    return np.asarray(np.pi / 2 * ranked.mean(axis=1))
+
+
+def _misses(answered: pl.DataFrame) -> tuple[Array, Array]:
+    """Return the true normals' coordinates about the proposed ones, rad, and the covariances, where one is stated."""
+    columns = ["normal_x", "normal_y", "normal_z", "error_deg", "cov_11", "cov_12", "cov_22", "mahalanobis2"]
+    names = ["truth_x", "truth_y", "truth_z"]
+    held = answered.select(columns + names).drop_nulls()
+    values = held.select(columns).to_numpy().astype(float)
+    truths = held.select(names).to_numpy().astype(float)
+    misses, covariances = [], []
+    for row, truth in zip(values, truths, strict=True):
+        normal, (c11, c12, c22) = row[:3], row[4:7]
+        across = tangent_coordinates(normal, truth)
+        length = float(np.hypot(*across))
+        # The length is the error that is scored: a base's normal may be the one that is stated.
+        misses.append(across * (math.radians(row[3]) / length) if length > 0 else across)
+        covariances.append([[c11, c12], [c12, c22]])
+    return np.array(misses).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
+
+
+def _wilson(share: float, n: float) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share of `n` independent rows."""
+    z2 = _Z_INTERVAL**2
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = _Z_INTERVAL * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    return max(0.0, centre - half), min(1.0, centre + half)

@@ -1,0 +1,339 @@
+"""A run of the benchmark on a tiny suite: its certificate, its verification and its place in the table."""
+
+import copy
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
+from simtest.bench.draws import Seeds, experiment_of, public_seeds
+from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
+from simtest.bench.maps import export_frames
+from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
+from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, load_suite, read_suite, resolved_tables
+from simtest.bench.verify import check_quick, check_seeds, compare, verify_run
+from simtest.dataset.scoring.dense.conventions import MapOptions
+from simtest.errors import InputError
+from simtest.runtime.engines import make_engine
+from simtest.runtime.files import write_json
+from simtest.spec import load_scene
+from simtest.spec.toml_files import toml_tables
+
+SUITE_TEXT = """
+name = "tiny"
+title = "Tiny"
+description = "Two small planes."
+format = 1
+seed = 5
+[[parts]]
+name = "smooth"
+title = "Smooth"
+description = "Planes."
+[[parts]]
+name = "dense"
+title = "Dense"
+description = "Maps."
+kind = "maps"
+[[cases]]
+part = "smooth"
+name = "plane"
+draws = 3
+realisations = 2
+[cases.draw]
+"surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
+[[cases]]
+part = "dense"
+name = "plane"
+draws = 2
+[cases.draw]
+"surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
+"""
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    folder = tmp_path_factory.mktemp("suites") / "v1"
+    small = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
+    tables = resolved_tables(load_scene("plane", small | {"sensor.noise_sigma": 0.02}))
+    tables.pop("name")
+    for part in ("smooth", "dense"):
+        (folder / part).mkdir(parents=True)
+        (folder / part / "plane.toml").write_text(toml_tables(tables))
+    (folder / SUITE).write_text(SUITE_TEXT)
+    read = read_suite(folder)
+    write_json(folder / HASHES, {"suite": read.digest, "cases": read.hashes})
+    return load_suite("v1", folder)
+
+
+@pytest.fixture(scope="module")
+def made(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> BenchRun:
+    return run_bench(suite, "cone_axis", tmp_path_factory.mktemp("run"), public_seeds(suite))
+
+
+def _copied(made: BenchRun, folder: Path, change: Any = None) -> Path:
+    """Write a certificate with a change and a hash that fits it."""
+    content = copy.deepcopy(made.content)
+    if change:
+        change(content)
+    folder.mkdir(parents=True, exist_ok=True)
+    return write_certificate(folder, content)
+
+
+@pytest.mark.render
+def test_a_certificate_tells_what_was_run(suite: Suite, made: BenchRun) -> None:
+    told = read_certificate(made.certificate).content
+    assert told["cases"] == {"smooth/plane": suite.hashes["smooth/plane"]}
+    assert told["core"]["name"] == "cone_axis"
+    assert told["core"]["version"].startswith("simtest ")
+    assert told["seeds"] == {"kind": "public", "seed": 5}
+    part = told["parts"]["smooth"]
+    assert (part["n"], part["answered"], part["missed"]) == (6, 6, 0)
+    assert 0 < part["median_deg"] < 0.5
+    assert told["overall"] == {
+        "complete": True, "penalised_deg": part["penalised_deg"],
+        "penalised_interval": pytest.approx(told["overall"]["penalised_interval"]),
+    }  # fmt: skip
+    assert told["timing"]["request"]["n"] >= 1
+
+
+@pytest.mark.render
+def test_a_certificate_tells_nothing_of_the_machine_s_owner(made: BenchRun) -> None:
+    text = made.certificate.read_text()
+    assert str(made.certificate.parent) not in text
+    assert str(Path.home()) not in text
+    assert platform.node() not in text or len(platform.node()) < 4
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_run_goes_on_and_is_the_same_by_two_workers(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    again = run_bench(suite, "cone_axis", made.certificate.parent, public_seeds(suite))
+    assert again.content["parts"] == made.content["parts"]
+    two = run_bench(suite, "cone_axis", tmp_path / "two", public_seeds(suite), engine=make_engine(workers=2))
+    assert two.content["parts"] == made.content["parts"]
+    rows = [(run.certificate.parent / "smooth" / "results.parquet").read_bytes() for run in (made, two)]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.render
+def test_a_certificate_is_verified_by_running_again(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    told = read_certificate(made.certificate)
+    found = verify_run(told, suite, tmp_path / "again", public_seeds(suite))
+    assert found.holds
+    assert "smooth: the same rows" in found.notes
+    assert check_quick(told, suite).holds
+
+
+@pytest.mark.render
+def test_other_seeds_are_other_frames(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    sealed = run_bench(suite, "cone_axis", tmp_path, Seeds("secret", "its commitment"))
+    assert sealed.content["seeds"] == {"kind": "sealed", "commitment": "its commitment"}
+    assert sealed.content["parts"]["smooth"]["results"] != made.content["parts"]["smooth"]["results"]
+    told = read_certificate(sealed.certificate)
+    check_seeds(told, suite, Seeds("secret", "its commitment"))
+    for seeds, words in (
+        (public_seeds(suite), "--sealed must name"),
+        (Seeds("x", "other"), "was run with other seeds"),
+    ):
+        with pytest.raises(InputError, match=words):
+            check_seeds(told, suite, seeds)
+    with pytest.raises(InputError, match="leave out --sealed"):
+        check_seeds(read_certificate(made.certificate), suite, Seeds("x", "other"))
+
+
+@pytest.mark.render
+def test_medians_that_differ_are_told(made: BenchRun) -> None:
+    found = copy.deepcopy(made.content)
+    part = found["parts"]["smooth"]
+    part["results"], part["median_deg"] = "other", part["median_deg"] + 5e-4
+    assert compare(made.content, found).holds
+    part["median_deg"] += 1e-3
+    assert "medians differ by 0.0015 deg" in compare(made.content, found).problems[0]
+    part["median_deg"], part["answered"] = made.content["parts"]["smooth"]["median_deg"], 4
+    assert compare(made.content, found).problems == ("smooth: answered 6, here 4; at most 1 may differ",)
+
+
+@pytest.mark.render
+def test_another_core_or_machine_is_told(made: BenchRun) -> None:
+    found = copy.deepcopy(made.content)
+    found["environment"]["processor"] = "another one"
+    assert any("another one" in note for note in compare(made.content, found).notes)
+    assert compare(made.content, found).holds
+    found["core"]["sha256"] = "abc"
+    assert compare(made.content, found).problems == ("core sha256: stated None, here abc",)
+
+
+@pytest.mark.render
+def test_an_altered_certificate_is_refused(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    held = json.loads(made.certificate.read_text())
+    held["parts"]["smooth"]["median_deg"] *= 0.5
+    path = tmp_path / CERTIFICATE
+    path.write_text(json.dumps(held))
+    with pytest.raises(InputError, match="was altered"):
+        read_certificate(path)
+    # with a hash that fits, the figures do not follow from the rows beside it
+    del held[OF_CERTIFICATE]
+    (tmp_path / "smooth").mkdir()
+    (tmp_path / "smooth" / "results.parquet").write_bytes(
+        (made.certificate.parent / "smooth" / "results.parquet").read_bytes()
+    )
+    path.write_text(json.dumps({**held, OF_CERTIFICATE: digest_of(held)}))
+    assert check_quick(read_certificate(path), suite).problems == (
+        "smooth: median_deg does not follow from the results",
+    )
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda c: c["suite"].update(version="v2"), "is of version .v2."),
+        (lambda c: c["cases"].update({"smooth/plane": "0" * 64}), "case smooth/plane is not that of"),
+        (lambda c: c.update(format=9), "format = 9; this release reads 1"),
+        (lambda c: c.update(kind="other"), "is no certificate"),
+        (lambda c: c.pop("core"), "has no key core"),
+        (lambda c: c["parts"]["smooth"].update(missed=3), "do not add up to n = 6"),
+        (lambda c: c["overall"].update(penalised_deg=0.0), "overall: does not follow"),
+    ],
+)
+def test_the_table_refuses_what_is_not_right(
+    suite: Suite, made: BenchRun, tmp_path: Path, change: Any, told: str
+) -> None:
+    _copied(made, tmp_path / "entry", change)
+    with pytest.raises(InputError, match=told) as raised:
+        read_entries(tmp_path, suite)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.render
+def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    def named(name: str, low: float, high: float, seeds: Any = None) -> None:
+        def change(content: Any) -> None:
+            content["core"]["name"] = name
+            content["seeds"] = seeds or content["seeds"]
+            figures = {"penalised_deg": (low + high) / 2, "penalised_interval": [low, high]}
+            content["parts"]["smooth"].update(figures)
+            # the headline of a single part is that part's
+            content["overall"].update(figures)
+
+        _copied(made, tmp_path / "all" / name, change)
+
+    named("best", 1.0, 2.0)
+    named("tied", 1.5, 2.5)
+    named("middle", 2.2, 3.0)
+    named("<worst>", 4.0, 5.0)
+    named("sealed one", 1.0, 2.0, {"kind": "sealed", "commitment": "abc"})
+    boards = read_entries(tmp_path / "all", suite)
+    ranks = [(row.certificate.core["name"], row.rank) for row in boards[0].overall]
+    assert ranks == [("best", "1–2"), ("tied", "1–3"), ("middle", "2–3"), ("<worst>", "4")]
+    assert [row.rank for row in boards[1].overall] == ["1"]
+    page = write_leaderboard(suite, boards, tmp_path / "table").read_text()
+    assert "&lt;worst&gt;" in page
+    assert "<worst>" not in page
+    assert page.count("<h1>") == 1
+
+
+def test_a_core_without_a_figure_has_no_rank(tmp_path: Path) -> None:
+    from simtest.bench.certificate import Certificate
+
+    held = [Certificate(tmp_path / name, {"value": value}) for name, value in (("a", None), ("b", 1.0))]
+    rows = ranked(held, lambda certificate: (certificate.content["value"], None))
+    assert [(row.certificate.path.name, row.rank) for row in rows] == [("b", "1"), ("a", "–")]
+
+
+@pytest.mark.render
+def test_maps_are_scored_on_the_dense_part(suite: Suite, tmp_path: Path) -> None:
+    """A stranger gets frames without truth, and maps that face the camera err by the tilt."""
+    frames = export_frames(suite, tmp_path / "given", public_seeds(suite))
+    pictures = sorted(file.stem for file in (frames / "frames").iterdir())
+    assert len(set(pictures)) == 2
+    assert not [file for file in frames.rglob("*") if "truth" in file.name]
+    maps = tmp_path / "facing"
+    maps.mkdir()
+    for name in set(pictures):
+        np.save(maps / f"{name}.npy", np.tile([0.0, 0.0, -1.0], (96, 96, 1)))
+    options = MapOptions(encoding="components", frame="opencv")
+    made = run_maps(suite, maps, tmp_path / "run", public_seeds(suite), options)
+    told = read_certificate(made.certificate)
+    tilts = experiment_of(suite, "dense", "x", public_seeds(suite)).groups[0].pool[0]["surface.tilt_deg"]
+    part = told.parts["dense"]
+    assert part["mean_deg"] == pytest.approx(np.mean(tilts), abs=1e-3)
+    assert part["n"] == part["answered"] == part["zones"]["all"]["n"] > 10_000
+    assert told.core["kind"] == "maps"
+    assert not told.content["overall"]["complete"]
+    assert check_quick(told, suite).holds
+    with pytest.raises(InputError, match="--maps must name their folder"):
+        verify_run(told, suite, tmp_path / "again", public_seeds(suite))
+    assert read_entries(tmp_path / "run", suite)[0].parts["dense"][0].rank == "1"
+
+
+def test_parts_that_cannot_be_run_are_told(suite: Suite) -> None:
+    assert chosen_parts(suite, None) == ["smooth"]
+    for wanted, told in ((["dense"], "scored by maps"), (["smooth", "smooth"], "named twice"), (["x"], "unknown")):
+        with pytest.raises(InputError, match=told):
+            chosen_parts(suite, wanted)
+
+
+def test_an_unknown_core_is_told_before_anything_is_made(suite: Suite, tmp_path: Path) -> None:
+    for core in ("con_axis", "  "):
+        with pytest.raises(InputError):
+            run_bench(suite, core, tmp_path / "run", public_seeds(suite))
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_empty_folder_has_no_table(suite: Suite, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds 0 certificates"):
+        read_entries(tmp_path, suite)
+
+
+@pytest.mark.render
+def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
+    """A core that answers with the sightline of the peak, in a process of its own."""
+    core = tmp_path / "core.py"
+    core.write_text(CORE)
+    import sys
+
+    made = run_bench(suite, f"command: {sys.executable} {core}", tmp_path / "run", public_seeds(suite))
+    told = made.content["core"]
+    assert (told["kind"], told["name"], told["version"]) == ("command", "core", "1.5")
+    assert len(told["sha256"]) == 64
+    assert made.content["parts"]["smooth"]["answered"] == 6
+    assert str(tmp_path) not in made.certificate.read_text()
+    rows = pl.read_parquet(tmp_path / "run" / "smooth" / "results.parquet")
+    assert rows["estimator"].unique().to_list() == ["core"]
+    with pytest.raises(InputError, match="--core must say"):
+        verify_run(read_certificate(made.certificate), suite, tmp_path / "again", public_seeds(suite))
+
+
+CORE = """
+import json, math, sys
+source, sink = sys.stdin.buffer, sys.stdout.buffer
+
+def send(message):
+    sink.write(json.dumps(message).encode() + b"\\n")
+    sink.flush()
+
+source.readline()
+send({"type": "hello", "protocol": 1, "name": "peak", "version": "1.5", "kind": "patch", "arrays": ["saturated"]})
+for line in source:
+    request = json.loads(line)
+    for array in request.get("arrays", []):
+        source.read(math.prod(array["shape"]) * int(array["dtype"][-1]))
+    if request["type"] != "patch":
+        continue
+    camera, patch = request["camera"]["K"], request["patch"]
+    x, y = patch["peak_px"]
+    ray = [(x - camera[0][2]) / camera[0][0], (y - camera[1][2]) / camera[1][1], 1.0]
+    length = math.sqrt(sum(part * part for part in ray))
+    normal = [-part / length for part in ray]
+    send({"type": "estimate", "id": request["id"], "normal": normal, "look_px": [x, y]})
+"""
+
+
+def test_the_suite_of_the_tests_is_checked(suite: Suite, made: BenchRun) -> None:
+    check_suite(read_certificate(made.certificate), suite)

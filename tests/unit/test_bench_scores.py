@@ -1,0 +1,128 @@
+"""Figures of the benchmark: the uncertainty's scores on distributions that are known, and the penalty of refusals."""
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.bench.scores import results_hash, score_part
+from simtest.bench.uncertainty import coverage_error, energy_scores, score_uncertainty, verdict_of
+from simtest.geometry.vectors import basis_across
+from simtest.validation.results_table import ResultRow, table
+
+SD = np.radians(0.5)
+
+
+def _rows(count: int, stated: float = 1.0, seed: int = 0, per_scene: int = 4) -> pl.DataFrame:
+    """Return rows whose errors are normal with a known covariance, and which state it times a factor."""
+    rng, rows = np.random.default_rng(seed), []
+    true = SD**2 * np.array([[1.0, 0.3], [0.3, 0.6]])
+    shape, inverse = np.linalg.cholesky(true), np.linalg.inv(stated * true)
+    for i in range(count):
+        normal = np.array([0.1, 0.2, -1.0])
+        normal /= np.linalg.norm(normal)
+        miss = shape @ rng.standard_normal(2)
+        angle = np.hypot(*miss)
+        truth = np.cos(angle) * normal + np.sin(angle) / angle * (miss @ basis_across(normal))
+        rows.append(
+            ResultRow(
+                setting="plane",
+                realisation=i,
+                specularity=0,
+                true_id=0,
+                status="ok",
+                estimator="x",
+                target="fine",
+                error_deg=float(np.degrees(angle)),
+                normal_x=normal[0],
+                normal_y=normal[1],
+                normal_z=normal[2],
+                truth_x=truth[0],
+                truth_y=truth[1],
+                truth_z=truth[2],
+                cov_11=stated * true[0, 0],
+                cov_12=stated * true[0, 1],
+                cov_22=stated * true[1, 1],
+                mahalanobis2=float(miss @ inverse @ miss),
+            )
+        )
+    return table(rows, {})
+
+
+def _score(stated: float, seed: int = 0, count: int = 1000) -> object:
+    rows = _rows(count, stated, seed)
+    return score_uncertainty(rows, np.arange(rows.height) // 4)
+
+
+@pytest.mark.parametrize(
+    ("stated", "verdict"),
+    [(1.0, "calibrated"), (0.8, "overconfident"), (2.0, "underconfident"), (0.1, "overconfident")],
+)
+def test_a_scaled_covariance_is_marked(stated: float, verdict: str) -> None:
+    score = _score(stated)
+    assert score.verdict == verdict
+    assert score.inflation == pytest.approx(1 / stated, rel=0.15)
+    low, high = score.interval
+    assert low < score.coverage < high or score.coverage in (low, high)
+
+
+def test_a_right_uncertainty_is_marked_as_seldom_as_stated() -> None:
+    rng, n, marks = np.random.default_rng(1), 1000, []
+    for _ in range(2000):
+        inside = rng.random(n) < 0.95
+        marks.append(verdict_of(float(inside.mean()), coverage_error(inside, np.arange(n)), n))
+    # two tests of 1 % each
+    assert 0.008 < np.mean([mark != "calibrated" for mark in marks]) < 0.035
+
+
+def test_rows_of_one_scene_do_not_count_as_independent() -> None:
+    inside = np.repeat(np.random.default_rng(2).random(50) < 0.9, 20)
+    alone, grouped = coverage_error(inside, np.arange(1000)), coverage_error(inside, np.arange(1000) // 20)
+    assert grouped > 3 * alone
+
+
+def test_few_regions_get_no_verdict() -> None:
+    assert _score(0.01, count=40).verdict == "too few"
+    assert score_uncertainty(_rows(3).with_columns(mahalanobis2=None), np.arange(3)).n == 0
+
+
+def test_the_energy_score_is_that_of_samples() -> None:
+    rng, covariance = np.random.default_rng(3), np.array([[2.0, 0.7], [0.7, 0.5]])
+    miss = np.array([1.2, -0.4])
+    drawn = rng.standard_normal((400_000, 2)) @ np.linalg.cholesky(covariance).T
+    sampled = (
+        np.linalg.norm(drawn - miss, axis=1).mean() - 0.5 * np.linalg.norm(drawn[::2] - drawn[1::2], axis=1).mean()
+    )
+    assert energy_scores(miss[None], covariance[None])[0] == pytest.approx(sampled, rel=5e-3)
+
+
+def test_the_energy_score_is_least_for_the_right_covariance() -> None:
+    energies = {stated: _score(stated, count=2000).energy_deg for stated in (0.25, 0.6, 1.0, 1.6, 4.0)}
+    assert min(energies, key=energies.get) == 1.0
+
+
+def test_the_axis_is_that_of_the_region() -> None:
+    area = SD**2 * np.sqrt(0.6 - 0.3**2)
+    assert _score(1.0).semi_axis_deg == pytest.approx(np.degrees(np.sqrt(5.991 * area)), rel=1e-3)
+
+
+def test_refused_and_missed_highlights_count_90_deg() -> None:
+    rows = _rows(100)
+    others = [
+        ResultRow(setting="plane", realisation=100, true_id=0, status="missed", estimator="x"),
+        ResultRow(setting="plane", realisation=101, specularity=0, true_id=0, status="not_converged", estimator="x"),
+        ResultRow(setting="plane", realisation=102, specularity=0, status="ok", estimator="x", error_deg=None),
+    ]
+    score = score_part(pl.concat([rows, table(others, {})]), {"plane": 4})
+    assert (score.n, score.answered, score.missed, score.false) == (102, 100, 1, 1)
+    assert score.refused == {"not_converged": 1}
+    mean = rows["error_deg"].mean()
+    assert score.penalised_deg == pytest.approx((100 * mean + 180) / 102)
+    assert score.median_interval[0] < score.median_deg < score.median_interval[1]
+    assert score.penalised_interval[0] < score.penalised_deg < score.penalised_interval[1]
+
+
+def test_the_hash_is_of_what_was_answered() -> None:
+    rows = _rows(10)
+    assert results_hash(rows) == results_hash(rows.clone())
+    assert results_hash(rows) != results_hash(rows.with_columns(pl.col("normal_x") + 1e-15))
+    assert results_hash(rows) == results_hash(rows.with_columns(estimator=pl.lit("named otherwise")))

@@ -1,0 +1,156 @@
+"""The frozen benchmark: its cases are pinned, and a changed one is refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from simtest.bench.draws import Seeds, experiment_of, public_seeds
+from simtest.bench.seal import COMMITMENT, SEALED, commitment_of, open_seal, seal
+from simtest.bench.suite import Suite, canonical, load_suite, suite_folder, unfrozen_keys
+from simtest.errors import InputError
+from simtest.spec import scene_from_dict
+from simtest.validation.cases import expand
+
+V1 = "5478d59e67e97d69f8b35702b3bdf650b711bced6237414034c01972a7a1a96f"
+"""Never changed: a changed case, seed or part is a new version of the suite."""
+
+
+@pytest.fixture(scope="module")
+def suite() -> Suite:
+    return load_suite("v1")
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(suite_folder("v1"), tmp_path / "v1"))
+
+
+def test_the_suite_is_pinned(suite: Suite) -> None:
+    assert suite.digest == V1
+
+
+def test_the_parts_have_cases(suite: Suite) -> None:
+    assert [part.name for part in suite.spec.parts] == ["smooth", "tissue", "hard", "real-chain", "dense"]
+    assert all(suite.of_part(part.name) for part in suite.spec.parts)
+
+
+def test_every_default_is_frozen(suite: Suite) -> None:
+    """A key that a later release adds must be told here, with a default that means what was done before."""
+    assert {case.name: unfrozen_keys(case) for case in suite.cases if unfrozen_keys(case)} == {}
+
+
+def test_an_added_default_is_seen(copied: Path) -> None:
+    file = copied / "smooth" / "plane.toml"
+    file.write_text(file.read_text().replace("skew = 0.0\n", ""))
+    (case,) = [case for case in _read(copied).cases if case.name == "smooth/plane"]
+    assert unfrozen_keys(case) == ["camera.skew"]
+
+
+def _read(folder: Path) -> Suite:
+    from simtest.bench.suite import read_suite
+
+    return read_suite(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "told"),
+    [
+        ("smooth/plane.toml", "noise_sigma = 0.03", "noise_sigma = 0.02", "case smooth/plane"),
+        ("hard/colon.toml", "fold_depth_mm = 7.0", "fold_depth_mm = 7.1", "case hard/colon"),
+        ("suite.toml", "draws = 32", "draws = 31", "case smooth/plane"),
+        ("suite.toml", "seed = 22", "seed = 23", "parts, seed or list of cases"),
+        ("suite.toml", 'name = "dense"\n', 'name = "dense2"\n', "not listed"),
+    ],
+)
+def test_a_changed_case_is_refused(copied: Path, name: str, old: str, new: str, told: str) -> None:
+    text = (copied / name).read_text()
+    assert old in text
+    (copied / name).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=told) as raised:
+        load_suite("v1", copied)
+    assert "\n" not in str(raised.value)
+
+
+def test_hashes_are_of_content_and_not_of_layout(copied: Path, suite: Suite) -> None:
+    file = copied / "smooth" / "plane.toml"
+    head, *tables = file.read_text().split("\n\n")
+    file.write_text("# a comment\n" + "\n\n".join([head, *reversed(tables)]) + "\n")
+    prose = copied / "suite.toml"
+    prose.write_text(prose.read_text().replace("Smooth laws", "Other words"))
+    assert load_suite("v1", copied).digest == suite.digest
+
+
+def test_canonical_json_is_the_same_for_equal_content() -> None:
+    assert canonical({"b": 1.0, "a": [True, None, "é"]}) == b'{"a":[true,null,"\\u00e9"],"b":1.0}'
+
+
+def test_presets_and_recipes_are_written_out(suite: Suite) -> None:
+    for case in suite.cases:
+        assert "preset" not in json.dumps(case.scene)
+        if case.scene["surface"]["type"] == "anatomy":
+            assert len(case.scene["surface"]["recipe"]) > 5
+
+
+def test_public_seeds_draw_pinned_scenes(suite: Suite) -> None:
+    experiment = experiment_of(suite, "smooth", "cone_axis", public_seeds(suite))
+    assert experiment.seed == 4242855185012620933
+    assert experiment.groups[0].pool[0]["surface.distance_mm"][:3] == (13.0514, 16.64, 13.8769)
+    hard = experiment_of(suite, "hard", "cone_axis", public_seeds(suite))
+    assert hard.groups[0].pool[0]["surface.seed"][::8] == (958227, 286475, 670874)
+
+
+def test_other_seeds_draw_other_scenes(suite: Suite) -> None:
+    public = experiment_of(suite, "hard", "cone_axis", public_seeds(suite))
+    sealed = experiment_of(suite, "hard", "cone_axis", Seeds("secret", "c"))
+    assert public.seed != sealed.seed
+    for one, other in zip(public.groups, sealed.groups, strict=True):
+        assert not set(one.pool[0]["rig.lights.0.offset_mm"]) & set(other.pool[0]["rig.lights.0.offset_mm"])
+
+
+@pytest.mark.parametrize("secret", ["22", "first", "second"])
+def test_every_drawn_scene_is_valid(suite: Suite, secret: str) -> None:
+    for part in suite.spec.parts:
+        for case in expand(experiment_of(suite, part.name, "cone_axis", Seeds(secret))):
+            scene_from_dict(case.data, case.where)
+
+
+def test_a_part_or_version_that_is_unknown_is_told(suite: Suite) -> None:
+    with pytest.raises(InputError, match=r"did you mean smooth\?"):
+        suite.part("smoth")
+    with pytest.raises(InputError, match="allowed: v1"):
+        load_suite("v9")
+
+
+def test_a_seal_opens_to_its_commitment(suite: Suite, tmp_path: Path) -> None:
+    commitment = seal(suite, tmp_path)
+    assert json.loads((tmp_path / COMMITMENT).read_text())["commitment"] == commitment
+    assert (tmp_path / SEALED).stat().st_mode & 0o077 == 0
+    seeds = open_seal(suite, tmp_path / SEALED)
+    held = json.loads((tmp_path / SEALED).read_text())
+    assert seeds.commitment == commitment == commitment_of(suite, held["secret"], held["salt"])
+    assert held["secret"] not in (tmp_path / COMMITMENT).read_text()
+    # another secret has another commitment
+    held["secret"] = held["secret"][::-1]
+    (tmp_path / SEALED).write_text(json.dumps(held))
+    assert open_seal(suite, tmp_path / SEALED).commitment != commitment
+    with pytest.raises(InputError, match="never replaced"):
+        seal(suite, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("no JSON", "cannot be read as sealed seeds"),
+        ("[]", "cannot be read as sealed seeds"),
+        ("{}", "no key 'kind'"),
+        ('{"kind": "x", "suite": "", "secret": "s", "salt": "t"}', "kind = 'x'; must be"),
+        ('{"kind": "simtest-bench sealed seeds", "suite": "other", "secret": "s", "salt": "t"}', "of another suite"),
+    ],
+)
+def test_what_is_no_sealed_file_is_refused(suite: Suite, tmp_path: Path, content: str, told: str) -> None:
+    path = tmp_path / "seeds.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=told):
+        open_seal(suite, path)
