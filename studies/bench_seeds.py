@@ -48,8 +48,8 @@ def percent(share: float | None) -> str:
 def penalised(suite: Suite, seeds: Seeds, parts: list[str], folder: Path) -> dict[str, list[float]]:
     """Run the estimators on a set of seeds; return the penalised error of each part, deg, by estimator."""
     found: dict[str, list[float]] = {name: [] for name in ESTIMATORS}
-    frames = frames_of(suite)
     for part in parts:
+        frames = frames_of(suite, part)
         experiment = experiment_of(suite, part, ESTIMATORS[0], seeds).model_copy(update={"estimators": ESTIMATORS})
         (run,) = run_experiments([(experiment, folder / part)])
         for name in ESTIMATORS:

@@ -1,15 +1,18 @@
 """The certificate of a run: what was run, on what, by which core, with which results; checked when it is read."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from simtest.bench.certificate_form import CertificateForm
 from simtest.bench.suite import SUITES, Suite, digest_of
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, require_plain, write_json
 from simtest.runtime.resources import shown
+from simtest.spec.spec_model import validate
 
 CERTIFICATE = "certificate.json"
 KIND = "simtest-bench certificate"
@@ -18,7 +21,7 @@ FORMAT = 1
 OF_CERTIFICATE = "sha256"
 """Key of the hash of everything else."""
 
-_KEYS = {"kind", "format", "suite", "cases", "seeds", "core", "environment", "parts", "overall", "timing"}
+_KEYS = CertificateForm.model_fields.keys()
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,11 @@ def suite_record(suite: Suite) -> JsonObject:
     return {"name": suite.spec.name, "version": suite.version, "sha256": suite.digest}
 
 
+def cases_of(suite: Suite, parts: Iterable[str]) -> dict[str, str]:
+    """Return the hashes of the cases of some parts, by part and name."""
+    return {case.name: case.digest for part in parts for case in suite.of_part(part)}
+
+
 def write_certificate(folder: Path, content: JsonObject) -> Path:
     """Write a certificate into a run's folder, with the hash of its content."""
     path = folder / CERTIFICATE
@@ -80,7 +88,7 @@ def read_certificate(path: Path) -> Certificate:
     Raises
     ------
     InputError
-        If it is no certificate, was altered, or is of another version of the format.
+        If it is no certificate, was altered, lacks a figure, or is of another version of the format.
     """
     if path.is_dir():
         path = path / CERTIFICATE
@@ -98,6 +106,7 @@ def read_certificate(path: Path) -> Certificate:
         raise InputError(f"{shown(path)}: has no key {missing[0]}; a certificate has {', '.join(sorted(_KEYS))}")
     if stated != digest_of(told):
         raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
+    validate(CertificateForm, told, str(path))
     return Certificate(path, told)
 
 
@@ -109,8 +118,12 @@ def check_suite(certificate: Certificate, suite: Suite) -> None:
         raise InputError(
             f"{shown(certificate.path)}: is of version {shown(told.get('version'), 20)!r}; must be of {own}"
         )
-    for name, digest in certificate.content["cases"].items():
-        if suite.hashes.get(name) != digest:
+    for part in certificate.parts:
+        if part not in {each.name for each in suite.spec.parts}:
+            raise InputError(f"{shown(certificate.path)}: part {shown(part, 60)!r} is none of {SUITES[suite.version]}")
+    stated, frozen = certificate.content["cases"], cases_of(suite, certificate.parts)
+    for name in (*stated, *frozen):
+        if name not in frozen or stated.get(name) != frozen[name]:
             raise InputError(
                 f"{shown(certificate.path)}: case {shown(name, 60)} is not that of {SUITES[suite.version]}"
             )

@@ -1,5 +1,7 @@
 """What a certificate tells of a core: its name, its version, and hashes of its files; and how long a request takes."""
 
+import os
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +15,7 @@ from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
+from simtest.estimators.process.command import INTERPRETERS
 from simtest.estimators.process.naming import core_hashes, core_name, core_records
 from simtest.estimators.protocol import BatchEstimator, Estimator
 from simtest.geometry import Camera, Patch
@@ -34,6 +37,9 @@ def load_core(text: str) -> tuple[str, AnyEstimator]:
 def core_record(text: str) -> JsonObject:
     """Return what a certificate tells of a core, without paths.
 
+    `sha256` is of the core's own files. An interpreter or another program of the machine, such as docker, is no part
+    of it, since it differs from machine to machine: it stands under `program`.
+
     Raises
     ------
     InputError
@@ -44,14 +50,22 @@ def core_record(text: str) -> JsonObject:
         ((_, package),) = ESTIMATORS.distributions([text]).items()
         return {"name": name, "kind": "installed", "version": package, "sha256": None}
     (record,) = core_records([text]).values()
-    # Files by name, without folders: the same core lies elsewhere on another machine.
     ((_, hashes),) = core_hashes([text]).items()
-    files = sorted([Path(file).name, digest] for file, digest in hashes.items())
+    (program, digest), *files = hashes.items()
+    own = files if _is_shared(Path(program)) else [(program, digest), *files]
     version = record.get("version")
     return {
         "name": core_name(text), "kind": "command", "version": None if version is None else str(version),
-        "sha256": digest_of(files),
+        # Files by name, without folders: the same core lies elsewhere on another machine.
+        "sha256": digest_of(sorted([Path(file).name, of_file] for file, of_file in own)) if own else None,
+        "program": {"name": Path(program).name, "sha256": digest},
     }  # fmt: skip
+
+
+def _is_shared(program: Path) -> bool:
+    """Return whether a program belongs to the machine, not to the core: an interpreter, or one that is on PATH."""
+    found = shutil.which(program.name)
+    return bool(INTERPRETERS.match(program.name)) or (found is not None and os.path.abspath(found) == str(program))
 
 
 class _Timed:

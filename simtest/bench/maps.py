@@ -7,6 +7,7 @@ from simtest.bench.suite import Suite, digest_of
 from simtest.bench.uncertainty import UNTESTED, UncertaintyScore
 from simtest.dataset.export import check_exportable, export_run
 from simtest.dataset.scoring.dense.conventions import MapOptions
+from simtest.dataset.scoring.dense.map_files import find_maps
 from simtest.dataset.scoring.dense.score import DenseScore, score_maps
 from simtest.dataset.scoring.dense.scorer import NORMAL, depth_source
 from simtest.errors import InputError
@@ -24,6 +25,9 @@ SHADING = "shading"
 
 MAPS, BASELINE = "maps", "baseline"
 """Kinds of cores: a folder of maps, and the method above."""
+
+STATED = ("encoding", "frame", "depth", "unit_mm")
+"""Options that say how maps are read, in the order of `MapOptions`."""
 
 OF_RUN = "brightest_point"
 """The quickest estimator: the run is there for its frames."""
@@ -71,7 +75,7 @@ def score_dense(
             progress(done, total, f"scoring {what}")
 
     score = score_maps(maps, folder / RUN, folder / SCORES, options, "", tell)
-    return score, dense_figures(score)
+    return score, dense_figures(score) | {"stated": stated_record(options)}
 
 
 def dense_figures(score: DenseScore) -> JsonObject:
@@ -87,6 +91,7 @@ def dense_figures(score: DenseScore) -> JsonObject:
         label: _zone(score, source, label) for label in ("all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere")
     }
     every, rows = zones["all"], [_plain(row) for row in score.scorer.rows if row["group"] == "zone"]
+    told = [line for line in score.lines if line.startswith(("normals:", "depths:"))]
     nothing = UncertaintyScore(0, None, None, UNTESTED, None, None, None)
     return {
         "n": every["n"], "answered": every["n"] - every["n_unanswered"], "missed": 0, "false": 0,
@@ -94,8 +99,21 @@ def dense_figures(score: DenseScore) -> JsonObject:
         "median_deg": every["median_deg"], "median_interval": every["median_interval"], "mean_deg": every["mean_deg"],
         "p95_deg": every["p95_deg"], "penalised_deg": every["penalised_deg"],
         "penalised_interval": every["penalised_interval"], "uncertainty": nothing.to_json(),
-        "results": digest_of(rows), "source": source, "zones": zones, "conventions": score.lines[:1],
+        "results": digest_of(rows), "source": source, "zones": zones, "conventions": told,
     }  # fmt: skip
+
+
+def stated_record(options: MapOptions | None) -> JsonObject:
+    """Return what was stated of the maps, null where it was found out: a verification must read them alike."""
+    stated = vars(options or MapOptions())
+    return {key: stated[key] for key in STATED}
+
+
+def stated_options(name: str, told: JsonObject) -> MapOptions:
+    """Return the options of a method's maps from the figures of its part (`stated_record`)."""
+    stated = told.get("stated")
+    held = stated if isinstance(stated, dict) else {}
+    return MapOptions(name, *(held.get(key) for key in STATED))
 
 
 def _zone(score: DenseScore, source: str, label: str) -> JsonObject:
@@ -114,9 +132,9 @@ def _plain(row: JsonObject) -> Json:
 
 
 def maps_record(maps: str | Path, score: DenseScore) -> JsonObject:
-    """Return what a certificate tells of maps: the method's name, and the hash of the files by name."""
-    if str(maps) == SHADING:
+    """Return what a certificate tells of maps: the method's name, and the hash of the maps by their place and name."""
+    if not Path(maps).exists():
         return {"name": score.name, "kind": BASELINE, "version": f"simtest {provenance.version()}", "sha256": None}
-    files = sorted(path for path in Path(maps).rglob("*") if path.is_file())
-    hashes: Json = [[path.name, provenance.file_hash(path)] for path in files]
+    files = sorted((one.path.relative_to(maps).as_posix(), one.path) for one in find_maps(Path(maps)))
+    hashes: Json = [[name, provenance.file_hash(path)] for name, path in files]
     return {"name": score.name, "kind": MAPS, "version": None, "sha256": digest_of(hashes)}

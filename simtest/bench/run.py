@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.bench.certificate import FORMAT, KIND, environment, suite_record, write_certificate
+from simtest.bench.certificate import FORMAT, KIND, cases_of, environment, suite_record, write_certificate
 from simtest.bench.cores import check_core, core_record, time_core
 from simtest.bench.draws import Seeds, experiment_of
 from simtest.bench.scores import score_part
@@ -99,7 +99,7 @@ def run_bench(
         # Part by part: the colours that one part needs are not those that another is rendered in.
         (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
         durations[part] = round(time.monotonic() - clock, 1)
-        scores[part] = score_part(run.results, frames_of(suite)).to_json()
+        scores[part] = score_part(run.results, frames_of(suite, part)).to_json()
     timing: JsonObject = {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)}
     return _certified(suite, seeds, folder, told, scores, timing)
 
@@ -135,7 +135,7 @@ def _certified(
         "kind": KIND,
         "format": FORMAT,
         "suite": suite_record(suite),
-        "cases": {name: digest for name, digest in suite.hashes.items() if name.partition("/")[0] in scores},
+        "cases": cases_of(suite, scores),
         "seeds": _seeds_record(suite, seeds),
         "core": core,
         "environment": environment(),

@@ -1,12 +1,14 @@
 """Sealed seeds: a secret that an organiser keeps, and a public commitment to it.
 
 The commitment is the SHA-256 of salt and secret. It tells nothing of the secret, and no other secret fits it, so the
-organiser cannot choose the seeds after the results.
+organiser cannot choose the seeds after the results. Both have a fixed length: otherwise one text could be split into
+salt and secret in several ways.
 """
 
 import hashlib
 import json
 import os
+import re
 import secrets
 from pathlib import Path
 
@@ -59,12 +61,17 @@ def open_seal(suite: Suite, path: Path) -> Seeds:
         kind, of_suite, secret, salt = (str(told[key]) for key in ("kind", "suite", "secret", "salt"))
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"--sealed {shown(path)}: cannot be read as sealed seeds ({_why(error)})") from error
-    if kind != KIND or not secret or not salt:
+    if kind != KIND:
         raise InputError(f"--sealed {shown(path)}: kind = {shown(kind, 60)!r}; must be {KIND!r}")
     if of_suite != suite.digest:
         raise InputError(
             f"--sealed {shown(path)}: is of another suite ({shown(of_suite, 12)}); this one is {suite.digest[:12]}"
         )
+    for key, value in (("secret", secret), ("salt", salt)):
+        if not re.fullmatch(f"[0-9a-f]{{{2 * BYTES}}}", value):
+            raise InputError(
+                f"--sealed {shown(path)}: {key} has {len(value)} characters; must be {2 * BYTES} of 0-9a-f"
+            )
     return Seeds(secret, commitment_of(suite, secret, salt))
 
 

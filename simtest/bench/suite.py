@@ -207,9 +207,9 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     return suite
 
 
-def frames_of(suite: Suite) -> dict[str, int]:
-    """Return how many frames each case's scenes are taken in, by case."""
-    return {case.spec.name: case.spec.realisations for case in suite.cases}
+def frames_of(suite: Suite, part: str) -> dict[str, int]:
+    """Return how many frames each scene of a part's cases is taken in, by case."""
+    return {case.spec.name: case.spec.realisations for case in suite.of_part(part)}
 
 
 def _read_case(folder: Path, spec: CaseSpec) -> FrozenCase:

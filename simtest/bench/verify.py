@@ -8,16 +8,16 @@ import polars as pl
 
 from simtest.bench.certificate import Certificate, check_suite
 from simtest.bench.draws import Seeds
-from simtest.bench.maps import BASELINE, MAPS, SHADING
+from simtest.bench.maps import BASELINE, MAPS, PART, SHADING, stated_options
 from simtest.bench.run import overall_of, run_bench, run_maps
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, frames_of
-from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import shown
 from simtest.validation.runner import RESULTS, Progress
+from simtest.validation.statistics import PENALTY_DEG
 
 MEDIAN_DEG = 1e-3
 """How far medians of two processors may lie apart, deg."""
@@ -72,13 +72,28 @@ def check_quick(certificate: Certificate, suite: Suite) -> Verified:
     """
     check_suite(certificate, suite)
     problems, notes = [], ["the cases are those of the suite"]
+    stated = certificate.content["seeds"]
+    if certificate.commitment is None and (stated["kind"] != "public" or stated.get("seed") != suite.spec.seed):
+        problems.append(f"seeds: neither a commitment nor the public seed {suite.spec.seed}")
     for part, told in certificate.parts.items():
-        if told["n"] != told["answered"] + told["missed"] + sum(told["refused"].values()):
-            problems.append(f"{part}: answered, missed and refused do not add up to n = {told['n']}")
-        problems += _against_results(certificate, suite, part, told, notes)
+        problems += _against_itself(part, told) + _against_results(certificate, suite, part, told, notes)
     if overall_of(suite, certificate.parts) != certificate.content["overall"]:
         problems.append("overall: does not follow from the parts")
     return Verified(tuple(problems), tuple(notes))
+
+
+def _against_itself(part: str, told: JsonObject) -> list[str]:
+    """Compare a part's counts with each other, and its penalised error with the mean of the answers."""
+    refused = told["missed"] + sum(told["refused"].values())
+    if told["n"] != told["answered"] + refused:
+        return [f"{part}: answered, missed and refused do not add up to n = {told['n']}"]
+    if (told["mean_deg"] is None) != (told["answered"] == 0) or (told["penalised_deg"] is None) != (told["n"] == 0):
+        return [f"{part}: mean and penalised error do not go with {told['answered']} answers of {told['n']}"]
+    if told["n"]:
+        expected = ((told["mean_deg"] or 0.0) * told["answered"] + PENALTY_DEG * refused) / told["n"]
+        if not _alike(expected, told["penalised_deg"], 1e-9):
+            return [f"{part}: penalised error {told['penalised_deg']:.6g} does not follow from the mean and the counts"]
+    return []
 
 
 def _against_results(
@@ -90,7 +105,7 @@ def _against_results(
         return []
     try:
         rows = pl.read_parquet(file)
-        score = score_part(rows, frames_of(suite)).to_json()
+        score = score_part(rows, frames_of(suite, part)).to_json()
     except (OSError, pl.exceptions.PolarsError) as error:
         return [f"{part}: its results cannot be read ({error})"]
     if score["results"] != told["results"]:
@@ -149,9 +164,11 @@ def verify_run(
     quick = check_quick(certificate, suite)
     told = certificate.core
     if told["kind"] in (MAPS, BASELINE):
+        if list(certificate.parts) != [PART]:
+            raise InputError(f"{shown(certificate.path)}: is of maps; its only part must be {PART}")
         if maps is None and told["kind"] == MAPS:
             raise InputError(f"{shown(certificate.path)}: is of maps; --maps must name their folder")
-        options = MapOptions(name=str(told["name"]))
+        options = stated_options(str(told["name"]), certificate.parts[PART])
         run = run_maps(suite, maps or SHADING, folder, seeds, options, engine, progress)
     else:
         if core is None and told["kind"] != "installed":
@@ -189,7 +206,10 @@ def _compare_origin(told: JsonObject, found: JsonObject) -> tuple[list[str], lis
         for key, value in found["environment"].items()
         if told["environment"].get(key) != value and not isinstance(value, dict)
     ]
-    stated = told["environment"].get("versions", {})
+    programs = [core["core"].get("program") for core in (told, found)]
+    if programs[0] != programs[1]:
+        notes.append(f"core program: stated {shown(str(programs[0]), 120)}, here {shown(str(programs[1]), 120)}")
+    stated = told["environment"]["versions"]
     notes += [
         f"{name}: stated {stated.get(name)}, here {version}"
         for name, version in found["environment"]["versions"].items()
@@ -208,11 +228,20 @@ def _compare_part(part: str, told: JsonObject, found: JsonObject) -> tuple[list[
         elif apart:
             notes.append(f"{part}: {key} {told[key]}, here {found[key]}: contours changed their topology")
     medians: Sequence[float | None] = (told["median_deg"], found["median_deg"])
-    if None in medians:
-        if medians[0] != medians[1]:
-            problems.append(f"{part}: median {medians[0]}, here {medians[1]}")
-        return problems, notes
-    apart = abs(float(medians[0] or 0) - float(medians[1] or 0))
-    text = f"{part}: medians differ by {apart:.2g} deg"
-    (problems if apart > MEDIAN_DEG else notes).append(f"{text}; at most {MEDIAN_DEG:g} is allowed")
+    # A mean, and a coverage, may change by what the highlights can do that may be answered otherwise.
+    share = most / max(told["n"], 1)
+    figures = (
+        ("medians", medians, MEDIAN_DEG, " deg"),
+        ("penalised errors", (told["penalised_deg"], found["penalised_deg"]), MEDIAN_DEG + PENALTY_DEG * share, " deg"),
+        ("coverages", (told["uncertainty"]["coverage"], found["uncertainty"]["coverage"]),
+         most / max(found["uncertainty"]["n"], 1), ""),
+    )  # fmt: skip
+    for name, pair, allowed, unit in figures:
+        if None in pair:
+            if pair[0] != pair[1]:
+                problems.append(f"{part}: {name} {pair[0]} and {pair[1]}")
+            continue
+        apart = abs(float(pair[0] or 0) - float(pair[1] or 0))
+        text = f"{part}: {name} differ by {apart:.2g}{unit}; at most {allowed:.3g} is allowed"
+        (problems if apart > allowed else notes).append(text)
     return problems, notes

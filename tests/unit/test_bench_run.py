@@ -4,6 +4,7 @@ import copy
 import json
 import platform
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ import pytest
 from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
-from simtest.bench.maps import export_frames
+from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
-from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, load_suite, read_suite, resolved_tables
+from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, frames_of, load_suite, read_suite, resolved_tables
 from simtest.bench.verify import check_quick, check_seeds, compare, verify_run
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import write_json
+from simtest.runtime.provenance import file_hash
 from simtest.spec import load_scene
 from simtest.spec.toml_files import toml_tables
 
@@ -154,7 +156,21 @@ def test_medians_that_differ_are_told(made: BenchRun) -> None:
     assert compare(made.content, found).holds
     part["median_deg"] += 1e-3
     assert "medians differ by 0.0015 deg" in compare(made.content, found).problems[0]
-    part["median_deg"], part["answered"] = made.content["parts"]["smooth"]["median_deg"], 4
+    part["median_deg"], part["penalised_deg"] = (
+        made.content["parts"]["smooth"]["median_deg"],
+        part["penalised_deg"] + 16,
+    )
+    # one highlight of six may be answered otherwise, by up to 90 deg
+    assert "penalised errors differ by 16 deg; at most 15 is allowed" in compare(made.content, found).problems[0]
+    part["penalised_deg"] -= 16
+    told = copy.deepcopy(made.content)
+    for content, coverage in ((told, 0.9), (found, 0.4)):
+        content["parts"]["smooth"]["uncertainty"].update(coverage=coverage, n=6)
+    assert "coverages differ by 0.5; at most 0.167" in compare(told, found).problems[0]
+    found["parts"]["smooth"]["uncertainty"]["coverage"] = 0.8
+    assert compare(told, found).holds
+    part["uncertainty"] = made.content["parts"]["smooth"]["uncertainty"]
+    part["answered"] = 4
     assert compare(made.content, found).problems == ("smooth: answered 6, here 4; at most 1 may differ",)
 
 
@@ -199,6 +215,17 @@ def test_an_altered_certificate_is_refused(suite: Suite, made: BenchRun, tmp_pat
         (lambda c: c.pop("core"), "has no key core"),
         (lambda c: c["parts"]["smooth"].update(missed=3), "do not add up to n = 6"),
         (lambda c: c["overall"].update(penalised_deg=0.0), "overall: does not follow"),
+        (lambda c: c["cases"].clear(), "case smooth/plane is not that of"),
+        (lambda c: c["parts"].update(soft=c["parts"]["smooth"]), "part soft is none of|part 'soft' is none of"),
+        (lambda c: c["seeds"].update(seed=6), "neither a commitment nor the public seed 5"),
+        (lambda c: c["parts"]["smooth"].update(penalised_deg=0.001), "does not follow from the mean and the counts"),
+        (lambda c: c["parts"]["smooth"].update(mean_deg=None), "do not go with 6 answers"),
+        (lambda c: c["parts"]["smooth"].pop("n"), r"parts.smooth.n"),
+        (lambda c: c["parts"]["smooth"].update(median_deg="0.1"), r"parts.smooth.median_deg"),
+        (lambda c: c["parts"]["smooth"]["uncertainty"].update(verdict="best"), r"uncertainty.verdict"),
+        (lambda c: c.update(parts=[]), "parts"),
+        (lambda c: c["core"].update(name=["a"]), r"core.name"),
+        (lambda c: c.update(timing={}), r"timing.request"),
     ],
 )
 def test_the_table_refuses_what_is_not_right(
@@ -217,7 +244,7 @@ def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) 
             content["core"]["name"] = name
             content["seeds"] = seeds or content["seeds"]
             figures = {"penalised_deg": (low + high) / 2, "penalised_interval": [low, high]}
-            content["parts"]["smooth"].update(figures)
+            content["parts"]["smooth"].update(figures, mean_deg=(low + high) / 2)
             # the headline of a single part is that part's
             content["overall"].update(figures)
 
@@ -270,6 +297,33 @@ def test_maps_are_scored_on_the_dense_part(suite: Suite, tmp_path: Path) -> None
     with pytest.raises(InputError, match="--maps must name their folder"):
         verify_run(told, suite, tmp_path / "again", public_seeds(suite))
     assert read_entries(tmp_path / "run", suite)[0].parts["dense"][0].rank == "1"
+    # Axes that were stated are stated again: these maps do not tell them.
+    assert part["stated"] == {"encoding": "components", "frame": "opencv", "depth": None, "unit_mm": None}
+    again = verify_run(told, suite, tmp_path / "again", public_seeds(suite), maps=maps)
+    assert again.problems == ()
+    # What is no map is no part of the method.
+    (maps / "notes.txt").write_text("mine")
+    assert maps_record(maps, made_score(maps))["sha256"] == told.core["sha256"]
+    np.save(maps / f"{pictures[0]}.npy", np.tile([0.0, 0.6, -0.8], (96, 96, 1)))
+    assert maps_record(maps, made_score(maps))["sha256"] != told.core["sha256"]
+
+
+def made_score(maps: Path) -> Any:
+    """Return what of a score a record reads."""
+    return SimpleNamespace(name=maps.name)
+
+
+def test_a_folder_that_is_called_as_the_baseline_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert maps_record("shading", made_score(Path("shading")))["kind"] == "baseline"
+    (tmp_path / "shading").mkdir()
+    np.save(tmp_path / "shading" / "a.npy", np.zeros((4, 4, 3)))
+    assert maps_record("shading", made_score(Path("shading")))["kind"] == "maps"
+
+
+def test_frames_of_a_scene_are_those_of_its_part(suite: Suite) -> None:
+    assert frames_of(suite, "smooth") == {"plane": 2}
+    assert frames_of(suite, "dense") == {"plane": 1}
 
 
 def test_parts_that_cannot_be_run_are_told(suite: Suite) -> None:
@@ -301,7 +355,13 @@ def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
     made = run_bench(suite, f"command: {sys.executable} {core}", tmp_path / "run", public_seeds(suite))
     told = made.content["core"]
     assert (told["kind"], told["name"], told["version"]) == ("command", "core", "1.5")
-    assert len(told["sha256"]) == 64
+    # The hash is of the script: another machine has another interpreter.
+    assert told["sha256"] == digest_of([["core.py", file_hash(core)]])
+    assert told["program"] == {"name": Path(sys.executable).name, "sha256": file_hash(Path(sys.executable))}
+    found = copy.deepcopy(made.content)
+    found["core"]["program"]["sha256"] = "0" * 64
+    assert compare(made.content, found).holds
+    assert any("core program" in note for note in compare(made.content, found).notes)
     assert made.content["parts"]["smooth"]["answered"] == 6
     assert str(tmp_path) not in made.certificate.read_text()
     rows = pl.read_parquet(tmp_path / "run" / "smooth" / "results.parquet")

@@ -3,6 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
+from scipy.stats import binom, chi2
 
 from simtest.bench.scores import results_hash, score_part
 from simtest.bench.uncertainty import coverage_error, energy_scores, score_uncertainty, verdict_of
@@ -65,13 +66,33 @@ def test_a_scaled_covariance_is_marked(stated: float, verdict: str) -> None:
     assert low < score.coverage < high or score.coverage in (low, high)
 
 
-def test_a_right_uncertainty_is_marked_as_seldom_as_stated() -> None:
-    rng, n, marks = np.random.default_rng(1), 1000, []
-    for _ in range(2000):
-        inside = rng.random(n) < 0.95
-        marks.append(verdict_of(float(inside.mean()), coverage_error(inside, np.arange(n)), n))
-    # two tests of 1 % each
-    assert 0.008 < np.mean([mark != "calibrated" for mark in marks]) < 0.035
+@pytest.mark.parametrize("n", [50, 60, 80, 96, 128, 256, 1000])
+def test_a_right_uncertainty_is_marked_as_seldom_as_stated(n: int) -> None:
+    """The exact risk of each mark, over all shares that independent regions can have, and the power at 0.8."""
+    hits, error = np.arange(n + 1), np.sqrt(0.95 * 0.05 / n)
+    verdicts = np.array([verdict_of(k / n, error, n) for k in hits])
+    right, narrow = binom.pmf(hits, n, 0.95), binom.pmf(hits, n, chi2.cdf(0.8 * chi2.ppf(0.95, 2), 2))
+    assert right[verdicts == "overconfident"].sum() <= 0.01
+    assert right[verdicts == "underconfident"].sum() <= 0.01
+    assert right[verdicts != "calibrated"].sum() > 0.001
+    assert narrow[verdicts == "overconfident"].sum() > {256: 0.5, 1000: 0.99}.get(n, 0.1)
+
+
+def test_dependent_rows_are_marked_as_seldom_as_stated() -> None:
+    """256 scenes of 4 rows, half of whose errors hang together: the test of independent rows would mark too many."""
+    rng, limit, marks, naive = np.random.default_rng(1), chi2.ppf(0.95, 2), [], []
+    scenes = np.arange(1024) // 4
+    for _ in range(600):
+        shared = np.repeat(rng.standard_normal((256, 2)), 4, axis=0)
+        misses = np.sqrt(0.8) * shared + np.sqrt(0.2) * rng.standard_normal((1024, 2))
+        inside = (misses**2).sum(axis=1) <= limit
+        share = float(inside.mean())
+        marks.append(verdict_of(share, coverage_error(inside, scenes), 1024))
+        naive.append(verdict_of(share, coverage_error(inside, np.arange(1024)), 1024))
+    for side in ("overconfident", "underconfident"):
+        # 600 runs tell 1 % to 0.4 %
+        assert 0.001 < np.mean([mark == side for mark in marks]) < 0.022
+    assert np.mean([mark != "calibrated" for mark in naive]) > 0.06
 
 
 def test_rows_of_one_scene_do_not_count_as_independent() -> None:

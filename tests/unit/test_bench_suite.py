@@ -154,3 +154,16 @@ def test_what_is_no_sealed_file_is_refused(suite: Suite, tmp_path: Path, content
     path.write_text(content)
     with pytest.raises(InputError, match=told):
         open_seal(suite, path)
+
+
+@pytest.mark.parametrize("key", ["secret", "salt"])
+def test_a_commitment_cannot_be_opened_in_two_ways(suite: Suite, tmp_path: Path, key: str) -> None:
+    """The same text, split into salt and secret elsewhere, has the same hash: the form of both is fixed."""
+    seal(suite, tmp_path)
+    held = json.loads((tmp_path / SEALED).read_text())
+    other = "salt" if key == "secret" else "secret"
+    assert commitment_of(suite, "b c", "a") == commitment_of(suite, "c", "a b")
+    for value in ("b c", held[key][:-1], held[key].upper() + "G", "22"):
+        (tmp_path / "forged.json").write_text(json.dumps({**held, key: value, other: held[other]}))
+        with pytest.raises(InputError, match=f"{key} has {len(value)} characters; must be 64 of 0-9a-f"):
+            open_seal(suite, tmp_path / "forged.json")
