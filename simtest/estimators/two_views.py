@@ -28,14 +28,17 @@ LEAST_SD = 1e-4
 CHANGE_SD = 0.3
 """Standard deviation of the relative change of the curvatures over one working distance along the surface."""
 
-WRONG_SHARE = 0.01
+WRONG_SHARE = 0.02
 """Stated probability that a sign is told, and is wrong."""
 
-CLEAR = -2 * float(np.log(WRONG_SHARE))
+RIVALS = 2
+"""Hypotheses, of four, whose sign along a direction is wrong."""
+
+CLEAR = -2 * float(np.log(WRONG_SHARE / RIVALS))
 """Least difference of two deviances for the better one to be told.
 
-Under a hypothesis, the likelihood of any other one exceeds its own by a factor of 1/p with a probability of p at most
-(Markov's inequality), whatever the number of pictures.
+Under a hypothesis, the likelihood of a given other one exceeds its own by a factor of 1/p with a probability of p at
+most (Markov's inequality), whatever the number of pictures; that of one of two others does with 2 p at most.
 """
 
 FITS_SHARE = 0.999

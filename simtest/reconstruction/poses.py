@@ -69,7 +69,7 @@ class Poses:
         Raises
         ------
         InputError
-            If no frame is named in the file, or the numbers of poses and frames differ.
+            If no frame is named in the file, or there are fewer poses than frames.
         """
         if by_name and self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
@@ -86,6 +86,10 @@ class Poses:
                 f"--poses {shown(self.path)}: {count} poses; must be one for each of the {max(indices) + 1} frames"
             )
         return [self.world_from_camera[index] for index in indices]
+
+    def is_for(self, count: int) -> bool:
+        """Return whether the file names its frames, or holds as many poses as there are frames: `count`."""
+        return bool(self.names) or len(self.world_from_camera) == count
 
 
 def read_poses(path: Path) -> Poses:

@@ -95,6 +95,11 @@ def _checked_poses(path: Path, source: Source, options: Options) -> tuple[Poses,
     check_priors(calibration.priors, options.camera)
     if not source.is_video:
         poses.of_frames([file.name for file in source.files], range(len(source.files)), True)
+        if not poses.is_for(len(source.files)):
+            raise InputError(
+                f"--poses {shown(path)}: {len(poses.world_from_camera)} poses of frames without names; must be one for "
+                f"each of the {len(source.files)} frames"
+            )
     names = options.estimators or default_estimators(calibration)
     return poses, replace(options, estimators=names if NEEDED in names else (*names, NEEDED))
 
@@ -123,6 +128,13 @@ def _reconstruct(
             f"{shown(path)}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
     if poses is not None:
+        # The count of a film is not known before it is read.
+        if source.is_video and not source.is_cut and len(poses.world_from_camera) > run.taken:
+            warnings.warn(
+                f"--poses {shown(poses.path)}: {len(poses.world_from_camera)} poses for {run.taken} frames; the first "
+                "ones are taken in their order",
+                stacklevel=2,
+            )
         run.judge_by_motion(poses, by_name=not source.is_video)
     tracks = tracks_of(run.frames)
     files = _write(out, run.frames, tracks)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
+from simtest.estimators.two_views import WRONG_SHARE
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
 from simtest.pages.palette import SERIES
@@ -25,7 +26,8 @@ def motion_figures(run: Run) -> list[ReliefFigure]:
     share, _, high = pooled.wrong_share
     measured = [
         f"Of {pooled.told} told signs {pooled.wrong} are wrong: {number(100 * share)} % of those asked, at most "
-        f"{number(100 * high)} % (95 % interval); stated is at most 1 %."
+        f"{number(100 * high)} % (95 % interval); stated is at most "
+        f"{number(100 * WRONG_SHARE)} %."
     ]
     labels = rows["label"].unique(maintain_order=True).to_list()
     parts = {label: rows.filter(pl.col("label") == label) for label in labels}

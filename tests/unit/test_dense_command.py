@@ -59,7 +59,7 @@ def run(tmp_path_factory):
 
 def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
     on, truths = run
-    assert len(truths) == 3
+    assert len(truths) == len({truth.scene for truth in truths}) == 3
     assert {truth.excluded["outside_view"] > 0 for truth in truths if truth.setting == "tissue"} == {True}
     (tmp_path / "maps").mkdir()
     for seed, truth in enumerate(truths):

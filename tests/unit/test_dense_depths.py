@@ -40,7 +40,11 @@ def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
     np.save(tmp_path / "a.npy", depth)
     score = scored(tmp_path, truth)
     assert score.conventions.depth == kind
-    assert score.cell("depth_none", quantity="depth_percent")["p95"] < 1e-4
+    percent = score.cell("depth_none", quantity="depth_percent")
+    assert percent["p95"] < 1e-4
+    # 90 deg stand for an unanswered normal; a depth has no such figure.
+    assert "mean_penalised" not in percent
+    assert "mean_penalised" in score.cell("depth_none")
     # At 96 px the central differences of the sphere's rim are coarse; the truth's own rim is not.
     assert score.cell("depth_none")["median"] < 0.2
     assert any("along the" in line and "found out" in line for line in score.lines)

@@ -223,8 +223,8 @@ def test_zones_are_rings_in_radii_of_the_highlight():
     regions[np.hypot(x, y) <= 8] = 1
     found = zones(regions)[50, 50:]
     assert (found[:9] == 0).all()
-    # The radius is that of the circle of the same area; the rings begin at the edge, between pixels.
-    np.testing.assert_array_equal([found[k] for k in (9, 15, 17, 23, 26, 38, 42, 50)], [1, 1, 2, 2, 3, 3, 4, 4])
+    # The radius is that of the circle of the same area, 7.92 px. The edge lies at 8.5; rings end at 16.4, 24.3, 40.2.
+    np.testing.assert_array_equal([found[k] for k in (9, 16, 17, 24, 25, 40, 41, 50)], [1, 1, 2, 2, 3, 3, 4, 4])
     assert (zones(np.zeros((5, 5), dtype=np.int64)) == 4).all()
 
 
@@ -271,13 +271,21 @@ def test_tallies_of_parts_add_up_whatever_their_order():
     assert whole.figures(1)["below_5"] == pytest.approx((values < 5).mean())
 
 
-def test_intervals_are_over_frames_not_pixels():
+def test_intervals_are_over_scenes_not_pixels():
     rng = np.random.default_rng(4)
     few, tally, truth = Tally(1, ()), Tally(1, ()), []
     for number in range(60):
         centre = 10 + 2 * rng.standard_normal()
         truth.append(centre)
         tally.add(f"frame {number}", centre + 0.01 * rng.standard_normal(5000), [np.zeros(5000, dtype=np.int64)])
+    # A scene in several frames is one scene.
+    noisy = Tally(1, ())
+    for number, centre in enumerate(truth):
+        for _ in range(4):
+            noisy.add(f"frame {number}", centre + 0.01 * rng.standard_normal(500), [np.zeros(500, dtype=np.int64)])
+    assert noisy.figures(0)["frames"] == 240
+    np.testing.assert_allclose(noisy.figures(0)["ci95"]["mean"], tally.figures(0)["ci95"]["mean"], atol=0.02)
+    few.add("one", np.ones(10), [np.zeros(10, dtype=np.int64)])
     few.add("one", np.ones(10), [np.zeros(10, dtype=np.int64)])
     low, high = tally.figures(0)["ci95"]["mean"]
     # 1.96 standard errors over 60 frames on each side.

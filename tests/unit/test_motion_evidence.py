@@ -91,8 +91,8 @@ def test_a_told_sign_is_wrong_no_more_often_than_stated(name):
 
 def test_errors_of_the_pose_that_nobody_tells_break_it():
     """Negative control: the same test fails where the method is not told how wrong the poses are."""
-    _, wrong = count(100, 12, [0.1], pose=PoseError(0.0, 0.01), blind=True)
-    assert beyond(wrong, 200) < 1e-6
+    _, wrong = count(200, 12, [0.1], pose=PoseError(0.0, 0.01), blind=True)
+    assert beyond(wrong, 400) < 1e-6
     # Told of them, it says that it does not know.
     told, wrong = count(100, 12, [0.1], pose=PoseError(0.0, 0.01))
     assert beyond(wrong, 200) > 1e-3

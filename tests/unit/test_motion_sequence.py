@@ -152,4 +152,8 @@ def test_what_the_method_needs_is_asked_for_before_the_work(film, tmp_path):
     few.write_text(json.dumps([np.eye(4).tolist()]))
     with pytest.raises(InputError, match="1 poses; must be one for each of the 4 frames"):
         reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=few))
+    # More poses than frames: nobody says which of them are meant.
+    few.write_text(json.dumps([np.eye(4).tolist()] * 5))
+    with pytest.raises(InputError, match="5 poses of frames without names; must be one for each of the 4 frames"):
+        reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=few))
     assert not (tmp_path / "out" / "run.json").exists()

@@ -72,6 +72,9 @@ def test_poses_go_with_frames_by_name_or_by_order(tmp_path):
         read.of_frames(["a.png"], [0], True)
     with pytest.raises(InputError, match="2 poses; must be one for each of the 3 frames"):
         read.of_frames(["a", "b", "c"], [0, 1, 2], False)
+    assert read.is_for(3)
+    path.write_text(json.dumps([T.tolist() for T in TWO]))
+    assert [read_poses(path).is_for(count) for count in (1, 2, 3)] == [False, True, False]
 
 
 MALFORMED = {

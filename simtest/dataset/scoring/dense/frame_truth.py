@@ -1,7 +1,7 @@
 """The truth of one frame, as far as dense maps are scored against it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +56,8 @@ class FrameTruth:
         Of the experiment.
     swept : dict
         Values of the swept parameters.
+    scene : str
+        Names the scene: frames of one scene differ in noise alone. Empty where each frame has its own.
     """
 
     name: str
@@ -71,6 +73,7 @@ class FrameTruth:
     calibration: Calibration | None = None
     setting: str = ""
     swept: Mapping[str, object] = field(default_factory=dict)
+    scene: str = ""
 
     __repr__ = short_repr
 
@@ -126,6 +129,7 @@ def truth_of_view(
 ) -> FrameTruth:  # fmt: skip
     """Return the truth of a rendered view; the session stands at its scene."""
     eps = float(np.linalg.norm(view.scene.rig.true_mm(), axis=1).max())
-    return frame_truth(
+    truth = frame_truth(
         name, session.truth(), session.camera, eps, view.spots.regions, image, view.calibration, setting, swept
     )
+    return replace(truth, scene=view.scene.model_dump_json())

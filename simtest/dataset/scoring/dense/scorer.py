@@ -9,7 +9,7 @@ from simtest.dataset.scoring.dense.conventions import Answer, Conventions, MapOp
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, answered, depth_factor, normals_of_distance
 from simtest.dataset.scoring.dense.frame_truth import SURFACES, FrameTruth
 from simtest.dataset.scoring.dense.map_files import decode_depth
-from simtest.dataset.scoring.dense.tally import Tally, named
+from simtest.dataset.scoring.dense.tally import PENALTY, Tally, named
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
@@ -103,8 +103,8 @@ class Scorer:
         source, quantity, surface = key
         below = BELOW[quantity]
         if key not in self.tallies:
-            self.tallies[key] = Tally(len(CELLS), below)
-        sums = self.tallies[key].add(truth.name, values, sorted_in)
+            self.tallies[key] = Tally(len(CELLS), below, PENALTY if quantity == ANGLE else None)
+        sums = self.tallies[key].add(truth.scene or truth.name, values, sorted_in)
         common = {"frame": truth.name, "setting": truth.setting, **truth.swept, "source": source,
                   "quantity": quantity, "surface": surface}  # fmt: skip
         for number, cell in enumerate(CELLS):
@@ -118,7 +118,7 @@ class Scorer:
             self.rows.append({
                 **common, "group": cell.group, "label": cell.label, "scope": cell.scope,
                 "n": int(sums[number, 0] + sums[number, 1]), "n_unanswered": int(sums[number, 1]),
-                **named(sums[number], below),
+                **named(sums[number], below, self.tallies[key].penalty),
                 "median": float(np.median(own)) if own.size else None,
                 "p95": float(np.percentile(own, 95)) if own.size else None,
             })  # fmt: skip

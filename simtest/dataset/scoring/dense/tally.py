@@ -1,8 +1,9 @@
 """Figures of very many values, held in little memory: sums and histograms that can be added frame by frame.
 
-The frames, not the pixels, are the sample: intervals come from a bootstrap over frames. Each replicate weighs a frame
-with a Poisson number of mean 1, drawn from the frame's name, so that it can be computed frame by frame and in parts
-[Chamandy et al. 2012, Estimating uncertainty for massive data streams, section 3].
+The scenes, not the pixels, are the sample: intervals come from a bootstrap over scenes. Each replicate weighs a frame
+with a Poisson number of mean 1, drawn from its scene's name, so that it can be computed frame by frame and in parts
+[Chamandy et al. 2012, Estimating uncertainty for massive data streams, section 3]. Frames of one scene, which differ in
+noise alone, have the same weight.
 """
 
 from collections.abc import Sequence
@@ -37,11 +38,14 @@ class Tally:
         Number of cells.
     below : sequence of float
         Thresholds; the share of the pixels below each is kept.
+    penalty : float or None
+        What an unanswered pixel counts in `mean_penalised`; None where the values have no such figure.
     """
 
-    def __init__(self, cells: int, below: Sequence[float]) -> None:
-        self.below = tuple(below)
+    def __init__(self, cells: int, below: Sequence[float], penalty: float | None = PENALTY) -> None:
+        self.below, self.penalty = tuple(below), penalty
         self.frames = np.zeros(cells, dtype=np.int64)
+        self.scenes: list[set[int]] = [set() for _ in range(cells)]
         # count, unanswered, sum, sum of squares, and the counts below each threshold
         self.sums = np.zeros((cells, 4 + len(below)))
         self.counts = np.zeros((cells, BINS), dtype=np.int64)
@@ -49,13 +53,13 @@ class Tally:
         self._weighed = np.zeros((REPLICATES, cells, 4 + len(below)))
         self._weighed_counts = np.zeros((REPLICATES, cells, _COARSE), dtype=np.float32)
 
-    def add(self, frame: str, values: Array, labels: Sequence[IntArray]) -> Array:
+    def add(self, scene: str, values: Array, labels: Sequence[IntArray]) -> Array:
         """Add the values of a frame; return its own sums, shape (cells, 4 + thresholds).
 
         Parameters
         ----------
-        frame : str
-            Its name.
+        scene : str
+            Name of its scene, which several frames may show.
         values : ndarray, shape (N,)
             NaN where there is no answer.
         labels : sequence of ndarray of int, shape (N,)
@@ -79,8 +83,10 @@ class Tally:
         self.sums += sums
         held = sums[:, 0] + sums[:, 1] > 0
         self.frames += held
+        for cell in np.flatnonzero(held):
+            self.scenes[cell].add(key(scene))
         # the bootstrap's replicates, where this frame counts as often as its weight says
-        weights = from_integer(key(frame)).poisson(1.0, REPLICATES)
+        weights = from_integer(key(scene)).poisson(1.0, REPLICATES)
         coarse = counts[:, :BINS].reshape(cells, _COARSE, PER_COARSE).sum(axis=2)
         rows, columns = np.nonzero(coarse)
         self._weighed += weights[:, None, None] * sums
@@ -103,9 +109,11 @@ class Tally:
         """Add what another tally of other frames and the same cells has counted."""
         for name in ("frames", "sums", "counts", "totals", "_weighed", "_weighed_counts"):
             getattr(self, name).__iadd__(getattr(other, name))
+        for own, others in zip(self.scenes, other.scenes, strict=True):
+            own |= others
 
     def figures(self, cell: int) -> JsonObject:
-        """Return the figures of a cell, with 95 % intervals where two frames or more hold pixels of it."""
+        """Return the figures of a cell, with 95 % intervals where two scenes or more hold pixels of it."""
         sums, frames = self.sums[cell], int(self.frames[cell])
         means = self.totals[cell] / np.maximum(self.counts[cell], 1)
         median, p95 = (_quantile(self.counts[cell], means, q) for q in (0.5, 0.95))
@@ -113,11 +121,11 @@ class Tally:
             "frames": frames,
             "n": int(sums[0] + sums[1]),
             "n_unanswered": int(sums[1]),
-            **named(sums, self.below),
+            **named(sums, self.below, self.penalty),
             "median": median,
             "p95": p95,
         }
-        found["ci95"] = self._intervals(cell) if frames > 1 else {}
+        found["ci95"] = self._intervals(cell) if len(self.scenes[cell]) > 1 else {}
         return found
 
     def _intervals(self, cell: int) -> JsonObject:
@@ -128,7 +136,7 @@ class Tally:
         holds = self._weighed[:, cell, 0] > 0
         if holds.sum() < 2:
             return {}
-        rows = [named(sums, self.below) for sums in self._weighed[holds, cell]]
+        rows = [named(sums, self.below, self.penalty) for sums in self._weighed[holds, cell]]
         drawn = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         cumulated = np.cumsum(self._weighed_counts[holds, cell], axis=1, dtype=float)
         for name, share in (("median", 0.5), ("p95", 0.95)):
@@ -137,18 +145,19 @@ class Tally:
         return {name: np.percentile(values, [2.5, 97.5]).tolist() for name, values in drawn.items()}
 
 
-def named(sums: Array, below: Sequence[float]) -> JsonObject:
+def named(sums: Array, below: Sequence[float], penalty: float | None = PENALTY) -> JsonObject:
     """Return the figures that sums hold: shares are of all pixels, the unanswered among them."""
     answered, unanswered = sums[0], sums[1]
     everything = answered + unanswered
     if everything == 0:
-        return {"mean": None, "rms": None, "mean_penalised": None, "share_unanswered": None} | {
+        penalised: JsonObject = {} if penalty is None else {"mean_penalised": None}
+        return {"mean": None, "rms": None, **penalised, "share_unanswered": None} | {
             f"below_{most:g}": None for most in below
         }
     return {
         "mean": float(sums[2] / answered) if answered else None,
         "rms": float(np.sqrt(sums[3] / answered)) if answered else None,
-        "mean_penalised": float((sums[2] + PENALTY * unanswered) / everything),
+        **({} if penalty is None else {"mean_penalised": float((sums[2] + penalty * unanswered) / everything)}),
         "share_unanswered": float(unanswered / everything),
         **{f"below_{most:g}": float(sums[4 + i] / everything) for i, most in enumerate(below)},
     }

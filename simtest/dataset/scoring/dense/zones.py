@@ -44,7 +44,8 @@ def _radii_away(regions: IntArray) -> Array:
         top, bottom = max(rows[0] - reach, 0), min(rows[-1] + reach + 1, height)
         left, right = max(columns[0] - reach, 0), min(columns[-1] + reach + 1, width)
         window = np.where(inside[top:bottom, left:right], 0, 1).astype(np.uint8)
-        away = cv2.distanceTransform(window, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) / radius
+        # To the centre of the highlight's outermost pixel: its edge lies half a pixel nearer.
+        away = (cv2.distanceTransform(window, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5) / radius
         view = nearness[top:bottom, left:right]
         np.minimum(view, away, out=view)
     return nearness
