@@ -13,6 +13,7 @@ from simtest.bench.run import overall_of, run_bench, run_maps
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, frames_of
 from simtest.errors import InputError
+from simtest.estimators.installed import ESTIMATORS
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import shown
@@ -173,6 +174,12 @@ def verify_run(
     else:
         if core is None and told["kind"] != "installed":
             raise InputError(f"{shown(certificate.path)}: is of a command; --core must say how to start it here")
+        if core is None and told["name"] not in ESTIMATORS.names():
+            # A stranger wrote the name: a command in its place is never run.
+            raise InputError(
+                f"{shown(certificate.path)}: core {shown(told['name'], 60)!r} is not installed here; install its "
+                "package, or give --core"
+            )
         run = run_bench(suite, core or str(told["name"]), folder, seeds, list(certificate.parts), engine, progress)
     compared = compare(certificate.content, run.content)
     return Verified((*quick.problems, *compared.problems), (*quick.notes, *compared.notes))

@@ -149,6 +149,19 @@ def test_other_seeds_are_other_frames(suite: Suite, made: BenchRun, tmp_path: Pa
 
 
 @pytest.mark.render
+@pytest.mark.parametrize("kind", ["command", "toml"])
+def test_a_certificate_runs_no_command(suite: Suite, made: BenchRun, tmp_path: Path, kind: str) -> None:
+    """A stranger's certificate names a command in place of an installed estimator: it is not started."""
+    command = f"touch {tmp_path / 'started'}"
+    (tmp_path / "core.toml").write_text(f"[core]\nname = 'x'\ncommand = '{command}'\n")
+    name = f"command: {command}" if kind == "command" else str(tmp_path / "core.toml")
+    path = _copied(made, tmp_path / "entry", lambda content: content["core"].update(name=name))
+    with pytest.raises(InputError, match="is not installed here"):
+        verify_run(read_certificate(path), suite, tmp_path / "run", public_seeds(suite))
+    assert not (tmp_path / "started").exists()
+
+
+@pytest.mark.render
 def test_medians_that_differ_are_told(made: BenchRun) -> None:
     found = copy.deepcopy(made.content)
     part = found["parts"]["smooth"]
