@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
@@ -11,6 +12,7 @@ from simtest.bench.seal import COMMITMENT, SEALED, commitment_of, open_seal, sea
 from simtest.bench.suite import Suite, canonical, load_suite, suite_folder, unfrozen_keys
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
+from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
 
 V1 = "9b31bc328b783cb134bbd5ac2df12be0b35b551364ca1ef27af1c5d28b9b7f57"
@@ -167,3 +169,25 @@ def test_a_commitment_cannot_be_opened_in_two_ways(suite: Suite, tmp_path: Path,
         (tmp_path / "forged.json").write_text(json.dumps({**held, key: value, other: held[other]}))
         with pytest.raises(InputError, match=f"{key} has {len(value)} characters; must be 64 of 0-9a-f"):
             open_seal(suite, tmp_path / "forged.json")
+
+
+SURFACES = {
+    "colon": (-21.4451, -22.5975, -2.4337, 67.5371, 20.9011, 110.3139, 5.7061, -0.1302, 31.7267),
+    "liver": (-102.8511, -76.4292, -56.134, 109.4487, 74.1469, 56.1142, -34.7472, -59.2632, 180.4235),
+    "gallbladder": (-20.7456, -20.7456, -15.0633, 20.7456, 20.7456, -0.0, -0.0602, 0.6576, 20.7351),
+}
+"""Of the first public scene of some tissue cases: the box of the shape's vertices and the camera's position, mm."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(SURFACES))
+def test_frozen_scenes_keep_their_surfaces(suite: Suite, name: str) -> None:
+    """The hashes pin what is asked of the program that makes meshes; this pins what it makes of it."""
+    experiment = experiment_of(suite, "tissue", "cone_axis", public_seeds(suite))
+    case = next(case for case in expand(experiment) if case.setting == name)
+    surface = make_surface(case.scene(experiment, 0)[0].surface)
+    mesh = surface.shape().mesh
+    assert mesh is not None
+    box = (*mesh.vertices.min(axis=0), *mesh.vertices.max(axis=0))
+    found = [*box, *surface.model_from_camera[:3, 3]]
+    np.testing.assert_allclose(found, SURFACES[name], rtol=0, atol=2e-3)
