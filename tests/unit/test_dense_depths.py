@@ -50,6 +50,17 @@ def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
     assert any("along the" in line and "found out" in line for line in score.lines)
 
 
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("kind", ["z", "ray"])
+@pytest.mark.parametrize("shift", [-4.0, 4.0])
+def test_kind_of_relative_depths_is_found_out(lens, kind, shift, tmp_path):
+    truth = sphere_truth(camera=LENSES[lens])
+    np.save(tmp_path / "a.npy", 0.5 * truth.distance * depth_factor(truth.camera, kind) + shift)
+    score = scored(tmp_path, truth)
+    assert score.conventions.depth == kind
+    assert score.cell("depth_affine")["median"] < 0.2
+
+
 def test_a_wrong_scale_is_told_and_mended_by_alignment(tmp_path):
     truths = [sphere_truth("a"), sphere_truth("b", centre=(-5.0, 0.0, 28.0))]
     for truth in truths:

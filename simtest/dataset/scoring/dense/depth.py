@@ -113,18 +113,23 @@ def normals_of_distance(distance: Array, rays: Array) -> Array:
 
 @dataclass
 class DepthEvidence:
-    """How well depths fit the truth as each kind, over all frames that were added."""
+    """How well depths fit the truth as each kind, over all frames that were added.
+
+    Each kind is judged after its own affine alignment: the shift of relative depths would otherwise hide the kind.
+    """
 
     spreads: dict[DepthKind, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
-    """Spread of the logarithm of truth over depth, a frame: 0 where a factor alone is missing."""
+    """Spread of the relative residuals, a frame: 0 where a factor and a shift alone are missing."""
 
     def add(self, depth: Array, distance: Array, factors: dict[DepthKind, Array]) -> None:
         """Add a frame: depths, true distances and `depth_factor` of its answered pixels, shape (N,)."""
         if len(depth) < LEAST_PIXELS:
             return
-        spreads = {kind: _spread(np.log(distance * factors[kind] / depth)) for kind in KINDS}
-        for kind, value in spreads.items():
-            self.spreads[kind].append(value)
+        for kind in KINDS:
+            sound = np.isfinite(factors[kind])
+            true, own = distance[sound] * factors[kind][sound], depth[sound]
+            factor, shift = align(own, true, "affine")
+            self.spreads[kind].append(_spread((factor * own + shift) / true - 1))
 
     @property
     def best(self) -> DepthKind:
