@@ -72,6 +72,9 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
     depth, truth = depth[::every], truth[::every]
     columns = [depth / truth] if how == "scale" else [depth / truth, 1 / truth]
     design = np.stack(columns, axis=1)
+    # Units differ by orders of magnitude: columns of about 1 keep the equations well conditioned.
+    scale = np.median(design, axis=0)
+    design = design / scale
     fitted = _start(design)
     for _ in range(ROUNDS):
         residual = np.abs(design @ fitted - 1)
@@ -81,6 +84,7 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
         last, fitted = fitted, np.linalg.lstsq(weighed.T @ design, weighed.sum(axis=0), rcond=None)[0]
         if np.allclose(last, fitted, rtol=1e-10, atol=1e-12):
             break
+    fitted = fitted / scale
     return float(fitted[0]), float(fitted[1]) if how == "affine" else 0.0
 
 
