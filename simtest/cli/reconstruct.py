@@ -31,13 +31,14 @@ Calibrated = Annotated[
 ]
 FieldOfView = Annotated[
     float | None,
-    Parameter(
-        help="Field of view in deg across the whole picture, where there is no calibration; crop black borders first."
-    ),
+    Parameter(help="Field of view in deg across the whole picture, where there is no calibration; see --fov-of."),
 ]
 FieldOfViewOf = Annotated[
-    Literal["width", "height", "diagonal"],
-    Parameter(help="What --fov spans. Makers of endoscopes mostly state the diagonal."),
+    Literal["width", "height", "diagonal", "view"],
+    Parameter(
+        help="What --fov spans: a side or the diagonal of the whole picture, or the round view found in it. "
+        "Makers of endoscopes mostly state the diagonal."
+    ),
 ]
 Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
 Encoding = Annotated[
@@ -214,11 +215,12 @@ def _print_assumed(assumed: "Sequence[Assumption]") -> None:
 
 def _print_counts(record: "PictureRecord", image: Path) -> None:
     """Print how many highlights were found, how many have a normal, and what the others are."""
+    from simtest.reconstruction.borders import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
-    from simtest.reconstruction.picture import BORDERED
 
-    if BORDERED in record.warnings:
-        print(f"note: {BORDERED}")
+    for warning in record.warnings:
+        if warning.startswith(BORDERED):
+            print(f"note: {warning}")
 
     spots, others = record.specularities, record.other_highlights
     answered = sum(spot.best is not None for spot in spots)

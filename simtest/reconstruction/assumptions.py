@@ -8,7 +8,7 @@ from typing import Literal
 from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.geometry import Camera
+from simtest.geometry import Camera, ViewMask
 
 FOCAL_SD = 0.1
 """Standard deviation of a focal length that follows from a stated field of view, as a share of it: makers state it
@@ -33,8 +33,8 @@ class Assumption:
         return f"{self.what}: {self.distribution} (to narrow: {self.how_to_narrow})"
 
 
-Extent = Literal["width", "height", "diagonal"]
-"""Extents of a picture that a stated field of view may span."""
+Extent = Literal["width", "height", "diagonal", "view"]
+"""Extents of a picture that a stated field of view may span; the last is the round view in it."""
 
 LIGHT = "light"
 
@@ -56,15 +56,26 @@ NEAR_MISSES = Assumption(
 def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent = "width") -> Calibration:
     """Return the calibration of a camera of which the field of view alone is known, deg, across the whole picture.
 
-    `across` names the extent that the angle spans: the picture's width, height or diagonal. Raises `InputError` if the
+    `across` names the extent that the angle spans: the picture's width, height or diagonal; for its round view see
+    `calibration_of_round_view`. Raises `InputError` if the
     angle or the extent is none of those allowed.
     """
-    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD)
     extents = {"width": width, "height": height, "diagonal": math.hypot(width, height)}
     if across not in extents:
         raise InputError(f"--fov-of {across}: must be one of {', '.join(extents)}")
-    focal = Camera.from_fov(fov_deg, width, height).fx * extents[across] / width
-    return Calibration(Camera(width, height, focal, focal, width / 2, height / 2), priors=Priors(camera=prior))
+    return _guessed(fov_deg, width, height, extents[across], (width / 2, height / 2))
+
+
+def calibration_of_round_view(fov_deg: float, width: int, height: int, view: ViewMask) -> Calibration:
+    """Return the same where the angle, deg, spans the round view in the picture; the lens is centred on that view."""
+    return _guessed(fov_deg, width, height, 2 * view.radius, (view.cx, view.cy))
+
+
+def _guessed(fov_deg: float, width: int, height: int, extent_px: float, centre: tuple[float, float]) -> Calibration:
+    """Return a pinhole's calibration whose angle spans `extent_px`, with the priors of a guess."""
+    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD)
+    focal = Camera.from_fov(fov_deg, width, height).fx * extent_px / width
+    return Calibration(Camera(width, height, focal, focal, *centre), priors=Priors(camera=prior))
 
 
 def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
