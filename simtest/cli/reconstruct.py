@@ -204,13 +204,13 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
 
 
 def _print_assumed(assumed: "Sequence[Assumption]") -> None:
-    """Print what the normals are without the light's position; what nobody told, how it is taken, how to narrow it."""
+    """Print what the normals are without the light's position; what is given with a spread; what is assumed."""
     from simtest.reconstruction.assumptions import light_note
 
     if note := light_note(assumed):
         print(f"note: {note}")
-    for each in assumed:
-        print(f"assumed: {each}")
+    for each in sorted(assumed, key=lambda each: not each.given):
+        print(f"{'given' if each.given else 'assumed'}: {each}")
 
 
 def _print_counts(record: "PictureRecord", image: Path) -> None:

@@ -167,6 +167,31 @@ def test_a_full_calibration_leaves_nothing_open(tmp_path):
     assert assumptions(replace(told, priors=replace(told.priors, plane=True)), None, "fine") == []
 
 
+def test_what_a_file_states_is_given_and_not_assumed(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlights_mm = [[3, 0, 0]]\ndistance_range_mm = [20, 60]\n"
+        "[uncertainty]\nfocal_sd = 0.05\ncentre_sd_px = 15.0\n"
+    )
+    made = assumptions(load_calibration(path), None, "base")
+    assert {each.what for each in made if each.given} == {"distance of the tissue", "focal length", "principal point"}
+    assert {each.what for each in made if not each.given} == {
+        "response", "falloff towards the border", "slope of the relief", "highlights",
+    }  # fmt: skip
+    assert (
+        str(made[0])
+        == "distance of the tissue: uniform from 20 to 60 mm along the sightline (given by the calibration)"
+    )
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlight_offset_mm = [2, 4]\n[surface]\nrelief_slope_deg = 2.0\n"
+        "[uncertainty]\nfalloff_power = [0, 2]\n"
+    )
+    made = assumptions(load_calibration(path), None, "base")
+    assert {each.what for each in made if each.given} == {"light", "falloff towards the border", "slope of the relief"}
+    # A field of view states nothing of these.
+    assert not any(each.given for each in assumptions(calibration_of_view(70.0, 200, 160), None, "base"))
+
+
 def test_the_keys_that_narrow(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text(

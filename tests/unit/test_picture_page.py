@@ -126,6 +126,20 @@ def left_out(kind, at):
     return Highlight(region, kind, 0.2, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
 
 
+def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path, capsys):
+    first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
+    record = replace(record_of(many(1)), assumed=[first, *(replace(each, given=True) for each in others)])
+    write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Given by the calibration, not exactly: distance of the tissue, focal length" in page
+    assert "Assumed, because nothing states it: light</summary>" in page
+    _print_assumed(record.assumed)
+    _, *lines = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[:2] for line in (lines[0], lines[-1])] == [
+        ["given", "distance of the tissue"], ["assumed", "light"]
+    ]  # fmt: skip
+
+
 def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path, capsys):
     others = [left_out(Kind.SMALL, (40, 40)), left_out(Kind.BORDER, (80, 40)), left_out(Kind.BORDER, (90, 60))]
     spots = [*many(2), spot(2, (50, 90), {"cone_axis": Failure(Reason.CLUSTER, "two")}, None)]
