@@ -60,8 +60,13 @@ class CameraPrior:
     guessed: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("focal_sd", "centre_sd_px", "distortion_sd"):
-            check_number(name, getattr(self, name), least=0)
+        for name, deviation in self.deviations.items():
+            check_number(name, deviation, least=0)
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """The standard deviations by name."""
+        return {name: getattr(self, name) for name in ("focal_sd", "centre_sd_px", "distortion_sd")}
 
     @property
     def is_exact(self) -> bool:
