@@ -136,6 +136,7 @@ def reconstruct(
     if record.stated is not None:
         print(f"stated: {record.stated}")
         print(MEANING)
+    _print_silent(record.specularities)
     _print_assumed(record.assumed)
     _print_counts(record, image)
     print_files(files, as_json)
@@ -203,6 +204,18 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     print(f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them")
 
 
+def _print_silent(spots: "Sequence[SpecularityRecord]") -> None:
+    """Print why best normals have no ±, and how many."""
+    from collections import Counter
+
+    from simtest.reconstruction.explanations import why_no_error
+
+    reasons = Counter(why_no_error(s.best, s.best_estimate) for s in spots if s.best and s.best_estimate)
+    for reason, count in reasons.items():
+        if reason:
+            print(f"no ± at {counted(count, 'best normal')}: {reason}")
+
+
 def _print_assumed(assumed: "Sequence[Assumption]") -> None:
     """Print what the normals are without the light's position; what is given with a spread; what is assumed."""
     from simtest.reconstruction.assumptions import light_note
@@ -210,7 +223,7 @@ def _print_assumed(assumed: "Sequence[Assumption]") -> None:
     if note := light_note(assumed):
         print(f"note: {note}")
     for each in sorted(assumed, key=lambda each: not each.given):
-        print(f"{'given' if each.given else 'assumed'}: {each}")
+        print(f"given: {each.what}: {each.distribution}" if each.given else f"assumed: {each}")
 
 
 def _print_counts(record: "PictureRecord", image: Path) -> None:
