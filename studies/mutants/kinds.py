@@ -51,7 +51,8 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 MEASURES: dict[str, tuple[str, ...]] = {
     "sightlines": ("sightlines",), "sub_pixel": ("isophotes",), "isovalue": ("isophotes",),
     "conditioning": ("conditioning",), "circle_pose": ("pose",), "ellipse": ("ellipse",), "published": ("published",),
-    "photometry": ("photometry",), "exposure": ("exposure",), "truth": ("truth",), "light_offset": ("plane_errors",),
+    "photometry": ("photometry",), "exposure": ("exposure",), "truth": ("truth",), "plane": ("plane_errors",),
+    "light_offset": ("plane_errors",),
     "cylinder": ("curved_errors",), "axis_ratio": ("curved_errors",), "rotated_camera": ("rotated",),
     "noise": ("noises", "protocol_noise"), "seeds": ("branches",), "lens": ("lenses",), "lens_rays": ("lens_rays",),
     "view_mask": ("view_masks",), "camera files": ("camera_files",), "rig": ("rigs",),
