@@ -260,14 +260,14 @@ def validate(
     from simtest.validation.runner import run_experiment
 
     if export is not None:
-        from simtest.dataset.export import check_exportable, export_run
+        from simtest.dataset.export import check_export, export_run
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
     with exclusive_folder(Path(out)):
         try:
             if export is not None:
-                check_exportable(described)
+                check_export(described, Path(out), Path(export))
             run = run_experiment(described, Path(out), command, variant, progress, chosen)
             page = write_report(run.folder, progress)
             if export is not None:

@@ -1,6 +1,7 @@
 """Messages: framing byte by byte, what a request tells, and answers field by field."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +100,12 @@ def test_an_isovalue_of_which_no_array_is_named_gets_both():
 
 
 # Requests -------------------------------------------------------------------------------------------------------------
+
+
+def test_isovalues_whose_arrays_would_have_one_name_are_refused():
+    with pytest.raises(CoreFault, match="must differ in their first six digits"):
+        hello_of(greeting(isophotes=[0.1234567, 0.12345671]))
+    assert hello_of(greeting(isophotes=[0.5, 0.5, 1e-7])).arrays[-1] == "isophote_rays_1e-07"
 
 
 def test_a_request_about_a_highlight_tells_all_of_it():
@@ -227,6 +234,13 @@ def test_a_covariance_in_another_basis_is_turned_into_ours():
     np.testing.assert_allclose(answered(covariance=given.tolist()).covariance, given)
 
 
+def test_a_covariance_of_few_digits_is_made_symmetric():
+    given = [[4e-4, 1.0e-4], [1.0003e-4, 2e-4]]
+    found = answered(covariance=given).covariance
+    assert np.array_equal(found, found.T)
+    np.testing.assert_allclose(found, given, atol=1e-7)
+
+
 def test_a_budget_is_kept_part_by_part():
     found = answered(budget={"noise": [[1e-4, 0], [0, 1e-4]], "shape": [[2e-4, 0], [0, 0]]})
     assert set(found.budget) == {"noise", "shape"}
@@ -294,6 +308,14 @@ def test_fields_may_be_arrays():
         Message({"type": "estimate"}, {"normal": arrays["normal"][0], "look_px": np.ones(2)}), CAMERA, HELLO
     )
     assert isinstance(single, Estimate)
+
+
+def test_arrays_of_very_many_estimates_are_refused_before_a_list_is_made_of_them():
+    tracemalloc.start()
+    found = estimates_of(Message({"type": "estimates"}, {"normal": np.empty((60_000_000, 0))}), CAMERA, HELLO)
+    assert "60000000 estimates of a frame; at most 10000" in found.detail
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
 
 
 def test_one_malformed_estimate_refuses_those_of_a_frame():

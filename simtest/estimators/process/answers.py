@@ -62,11 +62,12 @@ def estimates_of(answer: Message, camera: Camera, hello: Hello) -> list[Estimate
 def _listed(answer: Message) -> list[dict[str, Any]]:
     """Return the fields of each estimate: those of the list, and an element of each array."""
     lengths = {len(array) if array.ndim else -1 for array in answer.arrays.values()}
-    listed = answer.header.get("estimates", [{}] * max(lengths, default=0))
+    count = max(lengths, default=0)
+    listed = answer.header.get("estimates", [{}] * min(count, MAX_ESTIMATES))
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
         raise _Refused(Reason.ESTIMATOR_ERROR, f"estimates: {_told(listed)}; must be a list of objects")
-    if len(listed) > MAX_ESTIMATES:
-        raise _Refused(Reason.ESTIMATOR_ERROR, f"{len(listed)} estimates of a frame; at most {MAX_ESTIMATES}")
+    if (most := max(count, len(listed))) > MAX_ESTIMATES:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{most} estimates of a frame; at most {MAX_ESTIMATES}")
     if lengths - {len(listed)}:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"arrays of lengths {sorted(lengths)} for {len(listed)} estimates")
     return [each | {name: array[i] for name, array in answer.arrays.items()} for i, each in enumerate(listed)]
@@ -157,7 +158,8 @@ def _covariance(fields: Mapping[str, Any], name: str, turn: Array) -> Array:
     size = float(np.abs(given).max())
     if abs(given[0, 1] - given[1, 0]) > ROUNDED * size or np.linalg.eigvalsh(given).min() < -ROUNDED * size:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: must be symmetric and have no negative eigenvalue")
-    return np.asarray(turn @ given @ turn.T)
+    # Few digits may leave it not quite symmetric.
+    return np.asarray(turn @ ((given + given.T) / 2) @ turn.T)
 
 
 def _isophotes(given: object) -> tuple[FittedIsophote, ...]:

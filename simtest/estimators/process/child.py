@@ -168,7 +168,7 @@ class Child:
                 # Its own children may hold the pipes open, so the end of the process may not show there.
                 looked = now
                 # ... and it may have answered just before its end.
-                if self.has_ended() and not select.select([stdout], [], [], 0)[0]:
+                if self.has_ended() and not _is_readable(stdout):
                     raise self._ended()
         return answer
 
@@ -253,11 +253,18 @@ class Child:
     def said(self) -> str:
         """Return the last of what the core wrote to standard error, as the end of a sentence."""
         for _ in range(16):
-            if not self._stderr_open or not select.select([self._pipes[2]], [], [], 0)[0]:
+            if not self._stderr_open or not _is_readable(self._pipes[2]):
                 break
             self._drain()
         text = self._stderr.replace(self.folder.encode(), b".")[-SHOWN_STDERR:]
         return f"; its last words: {excerpt(text, SHOWN_STDERR)}" if text.strip() else ""
+
+
+def _is_readable(pipe: int) -> bool:
+    """Return whether a pipe holds something or has closed; unlike `select`, poll takes descriptors above 1023."""
+    poll = select.poll()
+    poll.register(pipe, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def _discard(pipes: Sequence[int], wait_s: float) -> None:

@@ -82,8 +82,11 @@ class CoreCommand:
     @property
     def absolute(self) -> str:
         """The same core under a name that means the same in every folder."""
-        toml = [file for file in self.files if self.text.endswith(".toml") and file.suffix == ".toml"]
-        return str(toml[-1]) if toml else f"{PREFIX} {shlex.join(self.arguments)}"
+        if not self.text.startswith(PREFIX):
+            return str(self.files[-1])
+        # A program that is found on PATH stays one, since the core's name depends on it.
+        program = shlex.split(self.text.removeprefix(PREFIX))[0]
+        return f"{PREFIX} {shlex.join((program if '/' not in program else self.arguments[0], *self.arguments[1:]))}"
 
     def hashes(self) -> dict[str, str]:
         """Return the SHA-256 of each of the files, by path."""

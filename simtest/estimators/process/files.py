@@ -51,6 +51,10 @@ def exchange(
         # An answer that fits on the line needs no file.
         if said.header.get("type") != "done":
             return said
+        if said.header.get("id") != number:
+            raise broken(
+                f"a line of type done with id {excerpt(repr(said.header.get('id')).encode(), 60)} to request {number}"
+            )
         told = _read(folder)
         return Message({"id": said.header.get("id"), **told.header}, told.arrays)
     finally:
