@@ -32,7 +32,7 @@ from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
 from simtest.runtime.engines import Engine, OnStep
-from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
@@ -279,8 +279,7 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
 
 def _check_apart(folder: Path, out: Path, option: str) -> None:
     """Raise `InputError` where an export would lie in the folder of its run or dataset, or hold that folder."""
-    own, other = folder.resolve(), out.resolve()
-    if own == other or own in other.parents or other in own.parents:
+    if are_nested(folder, out):
         raise InputError(f"{option} {shown(out)}: must be neither {shown(folder)} nor inside or around it")
 
 

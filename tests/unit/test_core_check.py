@@ -170,6 +170,7 @@ def changed_core(folder, change):
         ("answer['normal'][1] *= -1", "in the core's normals y points up; must be x to the right, y down"),
         ("answer['normal'][0] *= -1", "in the core's normals x points to the left"),
         ("answer['normal'] = [-answer['normal'][0], -answer['normal'][1], answer['normal'][2]]", "both reversed"),
+        ("answer['normal'][:2] = answer['normal'][1::-1]", "x and y are swapped; must be x to the right, y down"),
         ("answer['normal'] = [-n for n in answer['normal']]", "the normal faces away from the camera"),
         ("del answer['look_ray']; answer['look_px'] = [36.0, 36.0]", "outside the region; must count from the corner"),
         ("answer['normal'] = [0.0, 0.6 + 1e-4 * random.random(), -0.8]", "the answers differ"),

@@ -399,7 +399,7 @@ def test_columns_of_another_type_are_refused(record, tmp_path, column, values):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "x" * 81, "two\nlines"])
+@pytest.mark.parametrize("name", ["", " ", ".", "..", "a/b", "x" * 81, "two\nlines"])
 def test_a_name_that_cannot_stand_in_results_is_refused(sensor, tmp_path, name):
     with pytest.raises(InputError, match=r"--name = .*: must be 1 to 80 printable characters without /"):
         score_table(tmp_path / "t.csv", sensor, tmp_path / "out", name)
@@ -499,8 +499,16 @@ def test_a_run_without_an_export_is_refused(sensor, tmp_path, table):
 
 
 def test_the_run_itself_is_not_replaced(sensor, table):
-    with pytest.raises(InputError, match="is the run that is scored on; must be another folder"):
-        score_table(table, sensor, sensor)
+    for out in (sensor, sensor / "scored", sensor.parent):
+        with pytest.raises(InputError, match="must be neither the run that is scored on nor inside or around it"):
+            score_table(table, sensor, out)
+
+
+def test_another_exported_run_is_not_replaced(sensor, table, tmp_path):
+    shutil.copytree(sensor, tmp_path / "other")
+    with pytest.raises(InputError, match="holds a run whose frames were exported; must be another folder"):
+        score_table(table, sensor, tmp_path / "other")
+    assert (tmp_path / "other" / "export.json").exists()
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, OnStep, make_engine
-from simtest.runtime.files import Json
+from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
@@ -140,9 +140,11 @@ def score_table(
 
 
 def _check_apart(on: Path, out: Path) -> None:
-    """Raise `InputError` where the scored run would replace the run it is scored on."""
-    if on.resolve() == out.resolve():
-        raise InputError(f"--out {shown(out)}: is the run that is scored on; must be another folder")
+    """Raise `InputError` where the scored run would replace, or lie in, a run whose frames were exported."""
+    if are_nested(on, out):
+        raise InputError(f"--out {shown(out)}: must be neither the run that is scored on nor inside or around it")
+    if (out / EXPORT).exists():
+        raise InputError(f"--out {shown(out)}: holds a run whose frames were exported; must be another folder")
 
 
 def _seed(source: Source) -> int:

@@ -122,8 +122,9 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
 
 def check_name(name: str, what: str) -> None:
     """Raise `InputError` where a method's name cannot stand in results, pages and names of folders."""
-    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name:
-        raise InputError(f"{what} = {shown(name, 40)}: must be 1 to {LONGEST_NAME} printable characters without /")
+    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name or name.strip() in ("", ".", ".."):
+        allowed = f"1 to {LONGEST_NAME} printable characters without /, and neither . nor .."
+        raise InputError(f"{what} = {shown(name, 40)}: must be {allowed}")
 
 
 # Reading ------------------------------------------------------------------------------------------------------------
