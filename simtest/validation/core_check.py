@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -122,7 +123,9 @@ def check_core(text: str) -> CoreReport:
     InputError
         If the program or the file cannot be used.
     """
-    command = parse_core(text if is_core(text) else f"{PREFIX} {text}")
+    # A command may end with the name of a TOML file too, which is an argument of it.
+    is_named = text.startswith(PREFIX) or (is_core(text) and (len(text.split()) == 1 or Path(text).exists()))
+    command = parse_core(text if is_named else f"{PREFIX} {text}")
     report = CoreReport(text)
     core = Core(command)
     try:

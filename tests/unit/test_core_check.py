@@ -188,6 +188,15 @@ def test_a_core_that_ends_badly_is_told_its_exit_code(tmp_path):
     assert [step.text for step in report.steps if not step.is_ok] == ["ends with exit code 7; must be 0"]
 
 
+def test_a_command_may_end_with_a_toml_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "settings.toml").write_text("[core]\n")
+    report = check_core(f"{sys.executable} -c 'import sys; sys.exit(3)' settings.toml")
+    assert [step.text for step in report.steps] == ["core_died: the core ended with exit code 3"]
+    (tmp_path / "my core.toml").write_text(f"[core]\nname = 'mine'\ncommand = \"{sys.executable} -c 'exit(4)'\"\n")
+    assert "exit code 4" in check_core("my core.toml").steps[0].text
+
+
 def test_a_command_that_cannot_be_run_is_bad_input(tmp_path):
     with pytest.raises(InputError, match="no program 'no_such_core' on PATH"):
         check_core("no_such_core --fast")

@@ -323,10 +323,18 @@ def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
     assert "Estimate(normal=(0, 0, -1)" in done.stdout
 
 
-def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores():
+def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores(tmp_path):
     dataset = load_dataset("smooth").model_copy(update={"estimators": (command(BAD_CORE, "none"),)})
     inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
     assert inputs["core bad_core: bad_core.py"] == file_hash(BAD_CORE)
+    for number in "12":
+        (tmp_path / number).mkdir()
+        (tmp_path / number / "net.bin").write_text(number)
+    text = command(BAD_CORE, "none", str(tmp_path / "1" / "net.bin"), str(tmp_path / "2" / "net.bin"))
+    dataset = dataset.model_copy(update={"estimators": (text,)})
+    inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
+    assert inputs["core bad_core: net.bin"] == file_hash(tmp_path / "1" / "net.bin")
+    assert inputs["core bad_core: net.bin (2)"] == file_hash(tmp_path / "2" / "net.bin")
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
