@@ -111,6 +111,15 @@ def test_a_missing_column_is_named(record, tmp_path, missing):
         read_answers(write(tmp_path / "t.csv", row), record, "mine")
 
 
+def test_a_header_with_blanks_is_read_and_one_with_semicolons_is_shown(record, tmp_path):
+    file = tmp_path / "t.csv"
+    file.write_text(", ".join(GOOD) + "\n" + ", ".join(GOOD.values()) + "\n")
+    assert set(read_answers(file, record, "mine")["mine"]) == {FRAME}
+    file.write_text(file.read_text().replace(", ", ";"))
+    with pytest.raises(InputError, match=r"column frame is missing; .*; has frame;x_px;y_px;normal_x;normal_y"):
+        read_answers(file, record, "mine")
+
+
 def test_unknown_columns_are_told(record, tmp_path):
     with pytest.warns(UserWarning, match=r"columns that are not read: normal_xx \(is normal_x meant\?\)"):
         read_answers(write(tmp_path / "t.csv", {**GOOD, "normal_xx": "1"}), record, "mine")

@@ -143,6 +143,10 @@ def _read(path: Path) -> _Table:
     except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
         kind = "Parquet" if is_parquet else "CSV"
         raise InputError(f"{shown(path)}: no {kind} table ({str(error).splitlines()[0][:120]})") from error
+    # "frame, x_px" is a header that people write.
+    names = [name.strip() for name in frame.columns]
+    if len(set(names)) == len(names):
+        frame.columns = names
     _check_columns(path, frame.columns)
     numbers = {name: np.full(frame.height, np.nan) for name in (*NUMBERS, "specularity")}
     texts = {name: [""] * frame.height for name in TEXTS}
@@ -169,7 +173,8 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
     if missing:
         raise InputError(
             f"{shown(path)}: column {missing[0]} is missing; must have frame, x_px and y_px or specularity, "
-            f"{', '.join(NORMAL)}, and all of a group such as {', '.join(COVARIANCE)} or none"
+            f"{', '.join(NORMAL)}, and all of a group such as {', '.join(COVARIANCE)} or none; "
+            f"has {shown(', '.join(columns), 120)}"
         )
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown:
