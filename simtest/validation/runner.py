@@ -184,23 +184,23 @@ def run_experiments(
         _prepare(job.folder, job.digest)
     try:
         resumed = _work(left, variant, engine or make_engine(), progress)
+        # Write results and summaries, which describe the estimators.
+        for job in left:
+            record = RunRecord(
+                variant=variant,
+                llvm=backend.library_in_use(),
+                fingerprint=job.digest,
+                seed=job.experiment.seed,
+                realisations=job.experiment.realisations,
+                started=started.isoformat(timespec="seconds"),
+                duration_s=round(time.monotonic() - clock, 1),
+                command=command,
+                inputs=input_hashes(job.cases),
+                cores=cores[job.folder],
+            )
+            finished[job.folder] = _finish(job, record, resumed[job.folder])
     finally:
         close_cores()
-    # Write results and summaries.
-    for job in left:
-        record = RunRecord(
-            variant=variant,
-            llvm=backend.library_in_use(),
-            fingerprint=job.digest,
-            seed=job.experiment.seed,
-            realisations=job.experiment.realisations,
-            started=started.isoformat(timespec="seconds"),
-            duration_s=round(time.monotonic() - clock, 1),
-            command=command,
-            inputs=input_hashes(job.cases),
-            cores=cores[job.folder],
-        )
-        finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
 
 

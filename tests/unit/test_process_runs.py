@@ -260,10 +260,11 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
     assert wait_until(lambda: not processes_with(mark))
 
 
-def test_a_run_closes_its_cores(tmp_path, published):
+@pytest.mark.parametrize("kind", ["published", "experiment"])
+def test_a_run_closes_its_cores(tmp_path, kind, request):
     mark = f"--mark={tmp_path.name}"
     core = command(BAD_CORE, "none", mark)
-    simtest.validate(published, tmp_path / "run", realisations=1, estimators=[core])
+    simtest.validate(request.getfixturevalue(kind), tmp_path / "run", realisations=1, estimators=[core])
     assert processes_with(mark) == []
     assert [child for child in psutil.Process().children() if "simtest-core" in " ".join(child.cmdline())] == []
 
