@@ -14,12 +14,13 @@ import psutil
 import pytest
 
 import simtest
-from simtest.dataset.manifest import new_manifest
+from simtest.dataset.manifest import new_manifest, read_manifest
 from simtest.dataset.plan import Plan
+from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.estimators.process.naming import close_cores
 from simtest.runtime.provenance import file_hash
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.dataset_recipe import Dataset, load_dataset
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.gallery_item import reproduce_command
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
@@ -336,6 +337,26 @@ def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores(tmp_path):
     inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
     assert inputs["core bad_core: net.bin"] == file_hash(tmp_path / "1" / "net.bin")
     assert inputs["core bad_core: net.bin (2)"] == file_hash(tmp_path / "2" / "net.bin")
+
+
+def test_a_worker_of_a_dataset_finds_its_core_in_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "core.py").write_text(BAD_CORE.read_text())
+    monkeypatch.chdir(tmp_path)
+    named = f"command: {sys.executable} core.py none"
+    dataset = load_dataset("smooth").model_copy(update={"estimators": (named,)})
+    tasks = []
+
+    class Stopping:
+        def run(self, _, given, __):
+            tasks.extend(given)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(dataset, tmp_path / "data", Stopping())
+    (estimator,) = Dataset.model_validate_json(tasks[0].dataset).estimators
+    assert str(tmp_path / "core.py") in estimator
+    # The manifest names it as the user did.
+    assert read_manifest(tmp_path / "data").dataset["estimators"] == [named]
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
