@@ -27,6 +27,7 @@ from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample
 from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
+from simtest.estimators import load_estimators
 from simtest.estimators.process.naming import absolute_names
 from simtest.runtime.engines import Engine, OnStep
 from simtest.runtime.files import sync_folder
@@ -79,6 +80,8 @@ def write_dataset(
         If the dataset cannot be made as described, or the folder holds something else or cannot be written.
     """
     plan = Plan(dataset)
+    # Refused before anything is written; who reads the dataset needs neither packages nor cores.
+    load_estimators(dataset.estimators)
     with _one_line_errors(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)

@@ -143,7 +143,8 @@ def source_of_dataset(folder: Path) -> Source:
     """Return a dataset as a source of frames; raise `InputError` where there is none, or one of another version."""
     manifest = open_manifest(folder)
     plan, variant = manifest.plan(), str(manifest.origin["variant"])
-    views = [ShardViews(plan.dataset, number, variant) for number in range(len(plan.shards))]
+    bare = plan.dataset.model_copy(update={"estimators": ()})
+    views = [ShardViews(bare, number, len(shard.indices), variant) for number, shard in enumerate(plan.shards)]
     is_of = hashlib.sha256(plan.dataset.model_dump_json().encode()).hexdigest()
     version, source = provenance.version(), str(manifest.origin["source"])
     return Source(folder, views, "dataset", version, source, is_of, variant, dataset=plan.dataset)
