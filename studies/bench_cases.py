@@ -125,7 +125,7 @@ def tissue_base(organ: str, sensor: Tables) -> Tables:
 
 def tissue() -> list[Tables]:
     """Return the tissue cases."""
-    how = {"part": "tissue", "draws": 24, "realisations": 1, "isolated": True}
+    how = {"part": "tissue", "draws": 60, "realisations": 1, "isolated": True}
     return [
         {"name": organ, "base": f"tissue_{organ}", "set": tissue_base(organ, TISSUE["sensor"]),
          "draw": RELIEF | BESIDE | VIEWS[organ]} | how
@@ -135,7 +135,7 @@ def tissue() -> list[Tables]:
 
 def hard() -> list[Tables]:
     """Return the hard cases."""
-    how = {"part": "hard", "draws": 24, "realisations": 1, "isolated": True}
+    how = {"part": "hard", "draws": 36, "realisations": 1, "isolated": True}
     chain = PICTURE | {
         "vignetting": {"type": "cosine", "power": 2.0}, "vignetting_known": False,
         "sharpening": {"radius_px": 1.3, "amount": 0.6}, "coding": {"type": "jpeg", "quality": 80},
@@ -150,7 +150,7 @@ def hard() -> list[Tables]:
 
 def real_chain() -> list[Tables]:
     """Return the cases of the camera chain's stages."""
-    how = {"part": "real-chain", "draws": 16, "realisations": 1, "isolated": True}
+    how = {"part": "real-chain", "draws": 24, "realisations": 1, "isolated": True}
     stages: dict[str, Tables] = {
         "mosaic": {"mosaic": {"pattern": "rggb", "demosaicing": "edge_aware"}},
         "sharpening": {"sharpening": {"radius_px": 1.3, "amount": 0.9}},

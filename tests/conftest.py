@@ -5,6 +5,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# No test depends on wall time; all else is as hypothesis has it, in CI for one.
+settings.register_profile("untimed", settings(), deadline=None)
+settings.load_profile("untimed")
 
 # Tests change constants and functions that the key of a kept array does not know of.
 os.environ["SIMTEST_CACHE"] = "off"

@@ -21,7 +21,7 @@ MOST_FLAGS = 3
 """Flags named in a row of the summary, the most frequent first."""
 
 MEANING = (
-    "± is one standard deviation of a normal's direction: 95 % of errors lie within 1.7 to 2 times it "
+    "± is the root mean square error that is expected of a normal: 95 % of errors lie within 1.7 to 2 times it "
     "(docs/concepts/uncertainty.md)"
 )
 

@@ -71,8 +71,8 @@ PARTS = {
 TERMS = {
     "best": "The best normal of a highlight has the smallest stated error. Normals that state none come last.",
     "tilt": "Tilt is the angle between the normal and the camera's optical axis: 0° faces the camera.",
-    "deviation": "± is the stated standard deviation of the normal's direction, all parts of its budget together. The "
-    "error should stay below 1.7 to 2 times this figure for 95 % of the normals.",
+    "deviation": "± is the root mean square error that is expected of the normal, all parts of its budget together. "
+    "The error should stay below 1.7 to 2 times this figure for 95 % of the normals.",
     "arrow": "An arrow shows the part of the normal across the view. It points to the side that the surface faces; a "
     "steep surface has a long arrow, and one that faces the camera has a dot alone.",
     "cloud": "Rough tissue breaks one highlight into a cloud of glints. The cloud's centre carries the normal of the "

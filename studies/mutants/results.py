@@ -102,7 +102,7 @@ COVARIANCE: tuple[Mutant, ...] = (
            "simtest.estimators.lobe_fit:_with_covariance", "variance = chi2 / (count - parameters)",
            "variance = 0.8 * chi2 / (count - parameters)"),
     mutant("Mahalanobis by the covariance, not its inverse", "covariance", f"{_ROWS}:mahalanobis2",
-           "miss @ np.linalg.solve(estimate.covariance, miss)", "miss @ estimate.covariance @ miss"),
+           "miss @ np.linalg.solve(covariance, miss)", "miss @ covariance @ miss"),
     mutant("budget keeps its first part alone", "budget", "simtest.estimators.budget:total",
            "whole = whole + part", "pass"),
     mutant("part by the light's offset a quarter", "budget", "simtest.estimators.prior_parts:light_offset_part",
