@@ -218,14 +218,21 @@ def test_the_target_of_the_greeting_holds_where_an_estimate_tells_none():
 def test_an_estimate_may_look_along_a_ray():
     ray = CAMERA.unproject(np.array([100.0, 50.0]))
     assert answered(look_px=None, look_ray=ray.tolist()).look_px == pytest.approx([100, 50])
+    for lens in (BrownConrady(k1=-0.2, p1=1e-3), KannalaBrandt(k1=-0.02)):
+        camera = replace(CAMERA, distortion=lens)
+        ray = 3.0 * camera.unproject(np.array([100.0, 50.0]))
+        header = {"type": "estimate", "normal": NORMAL.tolist(), "look_ray": ray.tolist()}
+        assert estimate_of(Message(header), camera, HELLO).look_px == pytest.approx([100, 50], abs=1e-6)
     behind = answered(look_px=None, look_ray=[0, 0, -1])
     assert isinstance(behind, Failure)
     assert "images no such direction" in behind.detail
 
 
-def test_a_covariance_in_another_basis_is_turned_into_ours():
+@pytest.mark.parametrize("hand", [1, -1], ids=["right-handed", "left-handed"])
+def test_a_covariance_in_another_basis_is_turned_into_ours(hand):
     first, second = basis_across(NORMAL)
     turned = np.array([np.cos(0.7) * first + np.sin(0.7) * second, -np.sin(0.7) * first + np.cos(0.7) * second])
+    turned = turned[::hand]
     given = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
     found = answered(covariance=given.tolist(), basis=turned.tolist()).covariance
     # The same covariance in space.
