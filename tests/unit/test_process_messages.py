@@ -218,7 +218,7 @@ def test_the_target_of_the_greeting_holds_where_an_estimate_tells_none():
 def test_an_estimate_may_look_along_a_ray():
     ray = CAMERA.unproject(np.array([100.0, 50.0]))
     assert answered(look_px=None, look_ray=ray.tolist()).look_px == pytest.approx([100, 50])
-    for lens in (BrownConrady(k1=-0.2, p1=1e-3), KannalaBrandt(k1=-0.02)):
+    for lens in (BrownConrady(k1=-0.1, p1=1e-3), KannalaBrandt(k1=-0.02)):
         camera = replace(CAMERA, distortion=lens)
         ray = 3.0 * camera.unproject(np.array([100.0, 50.0]))
         header = {"type": "estimate", "normal": NORMAL.tolist(), "look_ray": ray.tolist()}
