@@ -257,6 +257,7 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
             sha256=each["sha256"],
             camera=each["camera"],
             peaks=tuple(detected["peak_px"] for detected in each["detections"]),
+            boxes=tuple(detected["box"] for detected in each["detections"]),
         )
         for each in made
     }

@@ -23,7 +23,7 @@ GOOD = {"frame": FRAME, "x_px": "50", "y_px": "40", "normal_x": "0", "normal_y":
 def record():
     """The record of an export with two frames of known names, and a camera in front."""
     camera = camera_table(Camera(96, 80, 96.0, 96.0, 48.0, 40.0))
-    frame = ExportedFrame(sha256="", camera="c.toml", peaks=((47.5, 39.5),))
+    frame = ExportedFrame(sha256="", camera="c.toml", peaks=((47.5, 39.5),), boxes=((33, 25, 29, 29),))
     return Record(
         kind="run", version="", fingerprint="", definition="", variant="", experiment={}, uses=(),
         cameras={"c.toml": json.loads(json.dumps(camera))}, frames={FRAME: frame, "f" + "1" * 16: frame},

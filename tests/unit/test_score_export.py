@@ -278,6 +278,6 @@ def test_the_readme_names_every_column(made):
         with (frames / name).open() as file:
             for column in file.readline().strip().split(","):
                 assert column in text or column.startswith("box"), column
-    from simtest.dataset.scoring.table import COLUMNS
+    from simtest.dataset.scoring.table_file import COLUMNS
 
     assert all(f"`{column}`" in text for column in COLUMNS if column != "cov_21")

@@ -127,7 +127,8 @@ class Child:
         _, stdout, _ = self._pipes
         with contextlib.suppress(BlockingIOError):
             data = os.read(stdout, CHUNK_BYTES)
-            raise broken(f"an answer that nobody asked for: {excerpt(data)}") if data else self._ended()
+            told = excerpt(data) or "an empty line"
+            raise broken(f"an answer that nobody asked for: {told}") if data else self._ended()
 
     def exchange(self, parts: Sequence[memoryview], limit_s: float) -> Message:
         """Write a request and read its answer, the two at once, so that neither side can block the other.
@@ -162,7 +163,7 @@ class Child:
             if stdout in ready:
                 data = self._read(stdout)
                 if answer is not None:
-                    raise broken(f"more than one answer to a request: {excerpt(data)}")
+                    raise broken(f"more than one answer to a request: {excerpt(data) or 'an empty line'}")
                 answer = reader.feed(data)
             elif now - looked > LOOK_S:
                 # Its own children may hold the pipes open, so the end of the process may not show there.

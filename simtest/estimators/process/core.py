@@ -195,6 +195,11 @@ class Core:
             self._faults = 0
             return answer
 
+    def forgive(self) -> None:
+        """Count the faults from 0 again."""
+        with self._lock:
+            self._faults, self._last = 0, None
+
     def record(self) -> dict[str, object]:
         """Return what a run's record says of the core."""
         hello = self.start() if self.hello is None else self.hello
@@ -290,3 +295,9 @@ def close_cores() -> None:
     """End all cores of this process; those that are asked again are started again."""
     for core in list(_started):
         core.close()
+
+
+def forgive_cores() -> None:
+    """Count the faults of all cores of this process from 0 again."""
+    for core in list(_started):
+        core.forgive()

@@ -1,7 +1,10 @@
 """The names of cores among those of estimators: in results, in records, and in other processes."""
 
+import hashlib
+import json
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
@@ -48,8 +51,15 @@ def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
 
 
 def core_hashes(estimators: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the SHA-256 of the files of the cores among estimators, by name and path."""
-    return {name: _parsed(name).hashes() for name in estimators if is_core(name)}
+    """Return the SHA-256 of the files of the cores among estimators, by name and path, and of their other arguments."""
+    return {name: _hashes(_parsed(name)) for name in estimators if is_core(name)}
+
+
+def _hashes(command: "CoreCommand") -> dict[str, str]:
+    hashes = command.hashes()
+    # Without folders: the same core may lie elsewhere on another machine.
+    words = [Path(word).name if word in hashes else word for word in command.arguments]
+    return {**hashes, "arguments": hashlib.sha256(json.dumps(words).encode()).hexdigest()}
 
 
 def close_cores() -> None:
@@ -57,6 +67,12 @@ def close_cores() -> None:
     # Where no core was named the module is not even loaded.
     if loaded := sys.modules.get("simtest.estimators.process.core"):
         loaded.close_cores()
+
+
+def forgive_cores() -> None:
+    """Count the faults of all cores from 0 again, so that no part of a run depends on those before it."""
+    if loaded := sys.modules.get("simtest.estimators.process.core"):
+        loaded.forgive_cores()
 
 
 def _parsed(name: str) -> "CoreCommand":
