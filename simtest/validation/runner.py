@@ -225,8 +225,8 @@ def _warn_of_kept(finished: Sequence[_Job]) -> None:
     kept = [job.folder for job in finished if any(map(is_core, job.experiment.estimators))]
     if kept:
         warnings.warn(
-            f"{shown(kept[0])}: is kept, since the core's command and files are the same; other files that it reads are "
-            "not compared (core.files of its TOML file names them)", stacklevel=4,
+            f"{shown(kept[0])}: is kept, since the core's command and files are the same; other files that it reads "
+            "are not compared (core.files of its TOML file names them)", stacklevel=4,
         )  # fmt: skip
 
 

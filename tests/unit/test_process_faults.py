@@ -222,6 +222,53 @@ for line in sys.stdin:
     core.close()
 
 
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        ("os.mkdir(request['folder'] + '/answer.json')", "answer.json: must be a plain file"),
+        ("os.mkdir('request-2'); answer(request)", "changed the folder that it runs in"),
+        ("answer(request); shutil.rmtree(os.getcwd())", "answer.json cannot be read (No such file"),
+    ],
+)
+def test_a_core_that_spoils_its_folder_breaks_the_protocol(folder, act, words):
+    script = folder / "files_core.py"
+    script.write_text(f"""import json, os, shutil, sys
+hello = {{"type": "hello", "protocol": 1, "name": "files", "kind": "patch", "transport": "files"}}
+def answer(request):
+    fields = {{"type": "estimate", "normal": [0, 0, -1], "look_px": [320, 240]}}
+    open(request["folder"] + "/answer.json", "w").write(json.dumps(fields))
+for line in sys.stdin:
+    request = json.loads(line)
+    if "folder" in request:
+        {act}
+    print(json.dumps({{"type": "done", "id": request["id"]}} if "folder" in request else hello), flush=True)
+""")
+    core = Core(CoreCommand("files core", "files_core", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    failures = [each for each in (answer_of(core), answer_of(core)) if isinstance(each, Failure)]
+    core.close()
+    assert {each.reason for each in failures} == {Reason.CORE_PROTOCOL}
+    assert words in failures[0].detail
+
+
+def test_an_empty_line_after_an_answer_is_named(folder):
+    script = folder / "core.py"
+    script.write_text(
+        """import json, sys
+hello = {"type": "hello", "protocol": 1, "name": "core", "kind": "patch", "arrays": []}
+for line in sys.stdin:
+    request = json.loads(line)
+    answer = {"type": "estimate", "id": request.get("id"), "normal": [0, 0, -1], "look_px": [320, 240]}
+    sys.stdout.write(json.dumps(hello) + "\\n" if "id" not in request else json.dumps(answer) + "\\n\\n")
+    sys.stdout.flush()
+""".replace("\\\\n", "\\n")
+    )
+    core = Core(CoreCommand("core", "core", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    assert "an empty line" in answer_of(core).detail
+    core.close()
+
+
 def test_a_process_with_many_open_files_has_cores_too(folder):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 2048:

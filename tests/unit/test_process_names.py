@@ -10,7 +10,7 @@ import simtest
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.process.command import parse_core
-from simtest.estimators.process.naming import absolute_names, close_cores, short_names
+from simtest.estimators.process.naming import absolute_names, close_cores, core_hashes, short_names
 from tests.unit.core_helpers import BAD_CORE
 
 TABLE = """
@@ -144,6 +144,24 @@ def test_a_malformed_toml_file_is_refused(folder, more, words):
     (folder / "core.toml").write_text(text)
     with pytest.raises(InputError, match=words):
         load_estimators(["core.toml"])
+
+
+def test_further_files_and_arguments_make_another_core(folder):
+    (folder / "helper.py").write_text("scale = 1")
+    table = folder / "core.toml"
+    table.write_text(
+        TABLE.format(command=f"{sys.executable} script.py --fast") + 'files = ["helper.py", "model.onnx"]\n'
+    )
+    ((_, first),) = core_hashes(["core.toml"]).items()
+    assert {str(folder / "helper.py"), str(folder / "model.onnx"), str(table), "arguments"} <= set(first)
+    (folder / "helper.py").write_text("scale = 2")
+    assert core_hashes(["core.toml"]) != {"core.toml": first}
+    fast, slow = (f"command: {sys.executable} script.py --{word}" for word in ("fast", "slow"))
+    hashes = core_hashes([fast, slow])
+    assert hashes[fast]["arguments"] != hashes[slow]["arguments"]
+    table.write_text(TABLE.format(command="./program") + 'files = ["lost.py"]\n')
+    with pytest.raises(InputError, match=r"core.files: lost.py is no file in .*; must be a file"):
+        parse_core("core.toml")
 
 
 def test_the_kind_and_the_environment_of_a_toml_file_hold(folder, monkeypatch):

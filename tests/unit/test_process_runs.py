@@ -306,13 +306,22 @@ def test_a_changed_program_is_another_run(tmp_path, published):
     arguments = {"realisations": 1, "estimators": [command(script, "none")]}
     simtest.validate(published, tmp_path / "run", **arguments)
     before = (tmp_path / "run" / "summary.json").read_text()
-    simtest.validate(published, tmp_path / "run", **arguments)
+    with pytest.warns(UserWarning, match="run: is kept, since the core's command and files are the same"):
+        simtest.validate(published, tmp_path / "run", **arguments)
     assert (tmp_path / "run" / "summary.json").read_text() == before
     script.write_text(BAD_CORE.read_text().replace('"0.1"', '"0.2"'))
     with pytest.warns(UserWarning, match="another"):
         simtest.validate(published, tmp_path / "run", **arguments)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
+
+
+def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, published):
+    # Every request breaks down: at the sixth in a row the core is not asked any more, in each part anew.
+    arguments = {"realisations": 3, "estimators": [command(BAD_CORE, "exit")]}
+    whole = simtest.validate(published, tmp_path / "run", **arguments).results
+    assert len(whole) == 6
+    assert not whole["flags"].str.contains("not asked").any()
 
 
 @pytest.mark.parametrize("extra", ["", "'$HOME' '\"!'"])

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.dataset.scoring.record import ExportedFrame, Record
+from simtest.dataset.scoring.record import ExportedFrame, Record, read_record
 from simtest.dataset.scoring.run import score_table
 from simtest.dataset.scoring.table import read_answers
 from simtest.errors import InputError, Reason
@@ -41,6 +41,20 @@ WRONG_ROWS = {
     "not a number": ({"normal_x": "left"}, "row 1: normal_x = left: must be a finite number or empty"),
     "NaN": ({"normal_x": "NaN"}, "row 1: normal_x = NaN: must be a finite number or empty"),
     "infinite": ({"x_px": "inf"}, "row 1: x_px = inf: must be a finite number or empty"),
+    "capitals": ({"status": "OK"}, "row 1: status = OK: must be ok or empty where a normal is given"),
+    "left of the frame": ({"x_px": "-500"}, "row 1: x_px = -500, y_px = 40: must lie in the frame of 96 x 80 px"),
+    "far away": ({"x_px": "1e300"}, "row 1: x_px = 1e.300, y_px = 40: must lie in the frame of 96 x 80 px"),
+    "elsewhere": (
+        {"specularity": "0", "x_px": "95", "y_px": "1"},
+        "row 1: x_px = 95, y_px = 1: must lie at detection 0, whose box is 29 x 29 px at .33, 25. .highlights.csv",
+    ),
+    "negative ratio": ({"axis_ratio": "-7"}, "row 1: axis_ratio = -7: must be in .0, 1."),
+    "no variance": (
+        {"cov_11": "0", "cov_12": "0", "cov_22": "0"},
+        "row 1: cov_11, cov_12, cov_22: singular; must have a variance",
+    ),
+    "rank 1": ({"cov_11": "1e-4", "cov_12": "1e-4", "cov_22": "1e-4"}, "row 1: cov_11, cov_12, cov_22: singular"),
+    "denormal": ({"cov_11": "1e-320", "cov_12": "0", "cov_22": "1e-320"}, "row 1: cov_11, cov_12, cov_22: singular"),
     "no normal": ({"normal_y": ""}, "row 1: normal_y is empty; must be a number, or status must name why"),
     "no pixel": ({"x_px": ""}, "row 1: x_px or y_px is empty; both must be given, or none and specularity"),
     "unknown frame": ({"frame": "f1"}, "row 1: frame = f1: must be among the 2 names of frames.csv"),
@@ -109,6 +123,19 @@ def test_a_missing_column_is_named(record, tmp_path, missing):
     row = {key: value for key, value in GOOD.items() if key != missing}
     with pytest.raises(InputError, match=f"column {missing} is missing; must have frame, x_px and y_px or specularity"):
         read_answers(write(tmp_path / "t.csv", row), record, "mine")
+
+
+def test_a_column_that_is_given_twice_is_refused(record, tmp_path):
+    file = tmp_path / "t.csv"
+    file.write_text(",".join([*GOOD, "normal_x"]) + "\n" + ",".join([*GOOD.values(), "0"]) + "\n")
+    with pytest.raises(InputError, match="column normal_x is given twice; must be one column"):
+        read_answers(file, record, "mine")
+
+
+def test_a_record_that_lacks_a_camera_is_none(record, tmp_path):
+    (tmp_path / "export.json").write_text(json.dumps({**record.model_dump(mode="json"), "cameras": {}}))
+    with pytest.raises(InputError, match=r"no record of an export \(whole: Value error, has no camera c.toml\)"):
+        read_record(tmp_path)
 
 
 def test_a_header_with_blanks_is_read_and_one_with_semicolons_is_shown(record, tmp_path):
