@@ -83,7 +83,7 @@ SLOW = {
 OF_FRAMES = {
     "nan": "not_finite: estimate 0: normal holds NaN",
     "away": "the normal faces away",
-    "none": r"look_px = \[320.0, 240.0\]: must lie in the frame",
+    "none": r"looks at the pixel \(320, 240\); must lie in the frame of 160 x 120 px",
     "unknown_type": "must be estimates or failure",
     "exit": "core_died",
     "level": "must be none, since a frame has no peak",
