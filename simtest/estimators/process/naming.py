@@ -1,10 +1,7 @@
 """The names of cores among those of estimators: in results, in records, and in other processes."""
 
-import hashlib
-import json
 import sys
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
@@ -51,15 +48,8 @@ def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
 
 
 def core_hashes(estimators: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the SHA-256 of the files of the cores among estimators, by name and path, and of their other arguments."""
-    return {name: _hashes(_parsed(name)) for name in estimators if is_core(name)}
-
-
-def _hashes(command: "CoreCommand") -> dict[str, str]:
-    hashes = command.hashes()
-    # Without folders: the same core may lie elsewhere on another machine.
-    words = [Path(word).name if word in hashes else word for word in command.arguments]
-    return {**hashes, "arguments": hashlib.sha256(json.dumps(words).encode()).hexdigest()}
+    """Return the SHA-256 of the files of the cores among estimators, by name and path."""
+    return {name: _parsed(name).hashes() for name in estimators if is_core(name)}
 
 
 def close_cores() -> None:
