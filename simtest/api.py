@@ -252,6 +252,7 @@ def validate(
     >>> run.page.name, run.results["estimator"].unique().to_list()
     ('index.html', ['cone_axis'])
     """
+    from simtest.estimators.process.naming import close_cores
     from simtest.report import write_report
     from simtest.report.run_results import RunResults
     from simtest.runtime.engines import make_engine
@@ -260,14 +261,14 @@ def validate(
     from simtest.validation.runner import run_experiment
 
     if export is not None:
-        from simtest.dataset.export import check_exportable, export_run
+        from simtest.dataset.export import check_export, export_run
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
     with exclusive_folder(Path(out)):
         try:
             if export is not None:
-                check_exportable(described)
+                check_export(described, Path(out), Path(export))
             run = run_experiment(described, Path(out), command, variant, progress, chosen)
             page = write_report(run.folder, progress)
             if export is not None:
@@ -278,6 +279,9 @@ def validate(
                 raise
             kept = "what is finished is kept, and the same command goes on from there"
             raise write_error(error, out, kept) from error
+        finally:
+            # The page's worst cases are estimated again.
+            close_cores()
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":

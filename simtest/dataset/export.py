@@ -4,6 +4,8 @@ import csv
 import hashlib
 import io
 import json
+import os
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +32,7 @@ from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
 from simtest.runtime.engines import Engine, OnStep
-from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
@@ -94,6 +96,14 @@ def check_exportable(experiment: Experiment) -> None:
     views_of_cases(experiment, expand(experiment), "")
 
 
+def check_export(experiment: Experiment, folder: Path, out: Path) -> None:
+    """Raise `InputError` where a run in a folder could not be exported to another one: before it is run."""
+    check_exportable(experiment)
+    _check_apart(folder, out, "--export")
+    if out.exists():
+        _check_folder(out, "--export")
+
+
 def export_run(
     folder: Path, experiment: Experiment, out: Path, engine: Engine, progress: Progress | None = None
 ) -> Path:
@@ -137,12 +147,14 @@ def export_dataset(folder: Path, out: Path, engine: Engine, progress: Progress |
 def _export(
     source: Source, experiment: dict[str, Any], out: Path, engine: Engine, progress: Progress | None, option: str
 ) -> Path:
+    _check_apart(source.folder, out, option)
     with exclusive_folder(out, option):
         _check_folder(out, option)
         try:
             made = _write_frames(source, out, engine, progress)
             _write_tables(out, made)
             _write_record(source, experiment, made)
+            _set_one_time(out)
         except OSError as error:
             raise write_error(error, out) from error
     return out / README
@@ -214,6 +226,13 @@ def _write_tables(out: Path, made: Sequence[Exported]) -> None:
     _write_text(out / README, _readme(len(frames), len(found)))
 
 
+def _set_one_time(out: Path) -> None:
+    """Set one time of change for all files: in the order in which they were written, the settings follow each other."""
+    moment = time.time_ns()
+    for path in (file for file in out.rglob("*") if file.is_file()):
+        os.utime(path, ns=(moment, moment))
+
+
 def _readme(frames: int, highlights: int) -> str:
     """Return what a stranger is told: the files, and what to send back."""
     env = Environment(
@@ -238,6 +257,7 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
             sha256=each["sha256"],
             camera=each["camera"],
             peaks=tuple(detected["peak_px"] for detected in each["detections"]),
+            boxes=tuple(detected["box"] for detected in each["detections"]),
         )
         for each in made
     }
@@ -256,6 +276,12 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
         frames=frames,
         uses=uses,
     ).write(source.folder)
+
+
+def _check_apart(folder: Path, out: Path, option: str) -> None:
+    """Raise `InputError` where an export would lie in the folder of its run or dataset, or hold that folder."""
+    if are_nested(folder, out):
+        raise InputError(f"{option} {shown(out)}: must be neither {shown(folder)} nor inside or around it")
 
 
 def _check_folder(out: Path, option: str) -> None:

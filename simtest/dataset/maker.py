@@ -15,6 +15,7 @@ from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.errors import Failure, InputError
 from simtest.estimators import load_estimators
+from simtest.estimators.process.naming import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
@@ -57,6 +58,7 @@ class Maker:
 
         Raises `InputError` if the drawn scene cannot be rendered.
         """
+        forgive_cores()
         drawn, attempt, seen, frame = self._choose(index)
         session = self._at(drawn)
         scene, anatomy = drawn.scene, drawn.anatomy

@@ -102,12 +102,14 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
 
 def _core_files(plan: Plan) -> dict[str, str]:
     """Return the hashes of the files of the estimators that are cores, named without the folders of this machine."""
-    hashes = core_hashes(plan.dataset.estimators)
-    return {
-        f"core {core_name(name)}: {Path(path).name}": digest
-        for name, of_core in hashes.items()
-        for path, digest in of_core.items()
-    }
+    made: dict[str, str] = {}
+    for name, hashes in core_hashes(plan.dataset.estimators).items():
+        for path, digest in hashes.items():
+            label = f"core {core_name(name)}: {Path(path).name}"
+            # Files of one name in several folders are numbered in the command's order.
+            count = sum(each.split(" (")[0] == label for each in made)
+            made[f"{label} ({count + 1})" if count else label] = digest
+    return made
 
 
 def read_manifest(folder: Path) -> Manifest:

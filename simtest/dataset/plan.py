@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import JsonValue
 
 from simtest.errors import InputError
-from simtest.estimators import load_estimators
 from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
@@ -105,7 +104,7 @@ class Plan:
     Raises
     ------
     InputError
-        If a scene would be malformed anywhere in the ranges, there are too few anatomies, or an estimator is unknown.
+        If a scene would be malformed anywhere in the ranges, or there are too few anatomies.
     """
 
     def __init__(self, dataset: Dataset) -> None:
@@ -114,7 +113,6 @@ class Plan:
         for k, family in enumerate(dataset.families):
             self._check(k, family)
         self._check_shared()
-        load_estimators(dataset.estimators)
         self._blocks = self._lay_out()
         self._splits = self._assign()
 

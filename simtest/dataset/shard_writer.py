@@ -27,6 +27,8 @@ from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.sample import Sample
 from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
+from simtest.estimators import load_estimators
+from simtest.estimators.process.naming import absolute_names
 from simtest.runtime.engines import Engine, OnStep
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
@@ -78,6 +80,8 @@ def write_dataset(
         If the dataset cannot be made as described, or the folder holds something else or cannot be written.
     """
     plan = Plan(dataset)
+    # Refused before anything is written; who reads the dataset needs neither packages nor cores.
+    load_estimators(dataset.estimators)
     with _one_line_errors(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
@@ -88,7 +92,10 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
     """Write what a manifest lacks: shards, then tables and card."""
     # what is left to do
     missing = [number for number, shard in enumerate(plan.shards) if shard.name not in manifest.shards]
-    variant, text = str(manifest.origin["variant"]), plan.dataset.model_dump_json()
+    # A worker, on another machine of a cluster for one, may have another current folder.
+    estimators = absolute_names(plan.dataset.estimators)
+    variant = str(manifest.origin["variant"])
+    text = plan.dataset.model_copy(update={"estimators": estimators}).model_dump_json()
     tasks = [ShardTask(str(folder), text, number, variant) for number in missing]
     total = plan.dataset.samples
     done = total - sum(len(plan.shards[number].indices) for number in missing)

@@ -24,6 +24,12 @@ from simtest.geometry import Array, Camera, Patch
 
 UNIT_TOLERANCE = 1e-6
 
+LEAST_VARIANCE = 1e-24
+"""rad^2; below it a normal is more certain than its own digits."""
+
+LEAST_SHARE = 1e-12
+"""Of the largest variance squared: a determinant below it is rounding."""
+
 
 @dataclass(frozen=True)
 class FrameResults:
@@ -185,7 +191,7 @@ def _checked(result: object, camera: Camera, peak_px: Array | None = None) -> Es
         return result
     if not isinstance(result, Estimate):
         return Failure(Reason.ESTIMATOR_ERROR, f"gave a {type(result).__name__}; must be an Estimate or a Failure")
-    return _malformed(result) or _facing_away(result, camera, peak_px) or result
+    return _malformed(result) or _singular(result) or _facing_away(result, camera, peak_px) or result
 
 
 def _malformed(estimate: Estimate) -> Failure | None:
@@ -245,6 +251,23 @@ def _malformed_budget(estimate: Estimate) -> Failure | None:
 def _is_finite(values: Array) -> bool:
     """Return whether all of a few numbers are finite; `np.isfinite` takes three times as long."""
     return all(map(math.isfinite, values.ravel().tolist()))
+
+
+def _singular(estimate: Estimate) -> Failure | None:
+    """Return a Failure where a covariance has no variance in a direction: it would escape the coverage."""
+    if estimate.covariance is None:
+        return None
+    # Plain numbers: this is done for each estimate.
+    (first, mixed), (_, second) = estimate.covariance.tolist()
+    if not is_singular(first, mixed, second):
+        return None
+    return Failure(Reason.ESTIMATOR_ERROR, "covariance: singular; must have a variance in each direction")
+
+
+def is_singular(first: float, mixed: float, second: float) -> bool:
+    """Return whether a covariance of these elements 11, 12 and 22, rad^2, has no variance in a direction."""
+    least, largest = min(first, second), max(first, second)
+    return least <= LEAST_VARIANCE or first * second - mixed * mixed <= LEAST_SHARE * largest * largest
 
 
 def _equal(one: Array, other: Array) -> bool:

@@ -1,5 +1,6 @@
 """Estimator protocols, and the estimate that an estimator returns."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
@@ -220,6 +221,13 @@ class CloudEstimator(FrameEstimator, Protocol):
     @property
     def least_spots(self) -> int:
         """Fewest highlights of a cloud."""
+
+
+LARGEST_VARIANCE = math.pi**2
+"""rad^2; no direction is less certain. What states more has other units."""
+
+NEAR_PX = 1.0
+"""An estimate that was made elsewhere looks at a pixel at most so far outside the frame."""
 
 
 @runtime_checkable

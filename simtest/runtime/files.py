@@ -44,6 +44,12 @@ def make_folder(folder: Path, option: str = "--out") -> None:
         raise cannot_write(error, f"{option} {shown(folder)}", folder) from error
 
 
+def are_nested(one: Path, other: Path) -> bool:
+    """Return whether two folders, which need not exist, are the same one, or one lies inside the other."""
+    first, second = one.resolve(), other.resolve()
+    return first == second or first in second.parents or second in first.parents
+
+
 def require_plain(path: Path, limited_by: str | None = None) -> Path:
     """Return a path that is a plain file, and within a limit of `simtest.runtime.limits` where one is named.
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -31,11 +32,12 @@ WRONG = (Reason.ESTIMATOR_ERROR, Reason.NOT_FINITE, Reason.CORE_DIED, Reason.COR
 FAR_DEG = 10.0
 NEAR_DEG = 3.0
 FLIPS = {
-    "x points to the left": (-1.0, 1.0, 1.0),
-    "y points up": (1.0, -1.0, 1.0),
-    "x and y are both reversed": (-1.0, -1.0, 1.0),
+    "x points to the left": np.diag([-1.0, 1.0, 1.0]),
+    "y points up": np.diag([1.0, -1.0, 1.0]),
+    "x and y are both reversed": np.diag([-1.0, -1.0, 1.0]),
+    "x and y are swapped": np.eye(3)[[1, 0, 2]],
 }
-"""Frames that a core may state its normals in by mistake, each as the signs that lead to ours."""
+"""Frames that a core may state its normals in by mistake, each as the matrix that leads to ours."""
 
 Answer = Failure | list[Estimate]
 
@@ -121,7 +123,9 @@ def check_core(text: str) -> CoreReport:
     InputError
         If the program or the file cannot be used.
     """
-    command = parse_core(text if is_core(text) else f"{PREFIX} {text}")
+    # A command may end with the name of a TOML file too, which is an argument of it.
+    is_named = text.startswith(PREFIX) or (is_core(text) and (len(text.split()) == 1 or Path(text).exists()))
+    command = parse_core(text if is_named else f"{PREFIX} {text}")
     report = CoreReport(text)
     core = Core(command)
     try:
@@ -250,7 +254,7 @@ def _judge_frame(pairs: list[tuple[Array, Array]]) -> CheckStep:
     """Return whether the normals are in the camera frame: far off, but near after a flip of axes, they are not."""
     normals, truth = (np.array(part) for part in zip(*pairs, strict=True))
     gap = float(np.median(angle_deg(normals, truth)))
-    flipped = {name: float(np.median(angle_deg(normals * signs, truth))) for name, signs in FLIPS.items()}
+    flipped = {name: float(np.median(angle_deg(normals @ flip.T, truth))) for name, flip in FLIPS.items()}
     name = min(flipped, key=flipped.__getitem__)
     if gap > FAR_DEG and flipped[name] < NEAR_DEG:
         wrong = f"in the core's normals {name}; must be x to the right, y down, z forward"

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from simtest.estimators import AnyEstimator, load_estimators
+from simtest.estimators.process.naming import forgive_cores
 from simtest.runtime.engines import OnStep
 from simtest.spec import Experiment
 from simtest.validation import gallery_items as gallery
@@ -79,6 +80,8 @@ def parts_of(
 
 def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     """Make a part's rows, in the order of its realisations; `tell` is called after each."""
+    # The rows must not depend on the parts that this process has made before.
+    forgive_cores()
     if part.case.is_paper:
         made = completed(_published(part), part.swept)
         for _ in part.numbers:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.estimators.process import is_core
 from simtest.estimators.process.naming import absolute_names, close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
@@ -174,6 +175,7 @@ def run_experiments(
     ]
     finished = {job.folder: held for job in jobs if (held := _finished(job.folder, job.digest, len(job.cases)))}
     left = [job for job in jobs if job.folder not in finished]
+    _warn_of_kept([job for job in jobs if job.folder in finished])
     # Check: everything that may be refused is refused before a folder is touched.
     cores = _check_estimators(left)
     for job in jobs:
@@ -184,23 +186,23 @@ def run_experiments(
         _prepare(job.folder, job.digest)
     try:
         resumed = _work(left, variant, engine or make_engine(), progress)
+        # Write results and summaries, which describe the estimators.
+        for job in left:
+            record = RunRecord(
+                variant=variant,
+                llvm=backend.library_in_use(),
+                fingerprint=job.digest,
+                seed=job.experiment.seed,
+                realisations=job.experiment.realisations,
+                started=started.isoformat(timespec="seconds"),
+                duration_s=round(time.monotonic() - clock, 1),
+                command=command,
+                inputs=input_hashes(job.cases),
+                cores=cores[job.folder],
+            )
+            finished[job.folder] = _finish(job, record, resumed[job.folder])
     finally:
         close_cores()
-    # Write results and summaries.
-    for job in left:
-        record = RunRecord(
-            variant=variant,
-            llvm=backend.library_in_use(),
-            fingerprint=job.digest,
-            seed=job.experiment.seed,
-            realisations=job.experiment.realisations,
-            started=started.isoformat(timespec="seconds"),
-            duration_s=round(time.monotonic() - clock, 1),
-            command=command,
-            inputs=input_hashes(job.cases),
-            cores=cores[job.folder],
-        )
-        finished[job.folder] = _finish(job, record, resumed[job.folder])
     return [finished[job.folder] for job in jobs]
 
 
@@ -216,6 +218,16 @@ class _Job:
     def missing(self) -> list[int]:
         """Return the indices of the cases that are not done yet."""
         return [index for index in range(len(self.cases)) if not _part_file(self.folder / PARTS, index).exists()]
+
+
+def _warn_of_kept(finished: Sequence[_Job]) -> None:
+    """Say that the answers of a core are those of an earlier run: not all that it reads is known."""
+    kept = [job.folder for job in finished if any(map(is_core, job.experiment.estimators))]
+    if kept:
+        warnings.warn(
+            f"{shown(kept[0])}: is kept, since the core's command and files are the same; other files that it reads "
+            "are not compared (core.files of its TOML file names them)", stacklevel=4,
+        )  # fmt: skip
 
 
 def _check_estimators(jobs: Sequence[_Job]) -> dict[Path, Cores]:

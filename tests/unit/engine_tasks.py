@@ -27,3 +27,8 @@ def fails(number, tell):
 
 def meets_a_full_disk(number, tell):
     raise OSError(28, "No space left on device")
+
+
+def blocked_signals(_, tell):
+    """Return which signals the worker has blocked: as it was started, since nothing changes that."""
+    return sorted(map(int, signal.pthread_sigmask(signal.SIG_BLOCK, [])))

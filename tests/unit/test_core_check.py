@@ -83,7 +83,7 @@ SLOW = {
 OF_FRAMES = {
     "nan": "not_finite: estimate 0: normal holds NaN",
     "away": "the normal faces away",
-    "none": r"look_px = \[320.0, 240.0\]: must lie in the frame",
+    "none": r"looks at the pixel \(320, 240\); must lie in the frame of 160 x 120 px",
     "unknown_type": "must be estimates or failure",
     "exit": "core_died",
     "level": "must be none, since a frame has no peak",
@@ -170,6 +170,7 @@ def changed_core(folder, change):
         ("answer['normal'][1] *= -1", "in the core's normals y points up; must be x to the right, y down"),
         ("answer['normal'][0] *= -1", "in the core's normals x points to the left"),
         ("answer['normal'] = [-answer['normal'][0], -answer['normal'][1], answer['normal'][2]]", "both reversed"),
+        ("answer['normal'][:2] = answer['normal'][1::-1]", "x and y are swapped; must be x to the right, y down"),
         ("answer['normal'] = [-n for n in answer['normal']]", "the normal faces away from the camera"),
         ("del answer['look_ray']; answer['look_px'] = [36.0, 36.0]", "outside the region; must count from the corner"),
         ("answer['normal'] = [0.0, 0.6 + 1e-4 * random.random(), -0.8]", "the answers differ"),
@@ -185,6 +186,15 @@ def test_a_core_that_ends_badly_is_told_its_exit_code(tmp_path):
     script.write_text(f"import sys\nsys.path.insert(0, {str(EXAMPLES)!r})\nimport core\ncore.main()\nsys.exit(7)\n")
     report = check(tmp_path, [sys.executable, str(script)], limit_s=10.0)
     assert [step.text for step in report.steps if not step.is_ok] == ["ends with exit code 7; must be 0"]
+
+
+def test_a_command_may_end_with_a_toml_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "settings.toml").write_text("[core]\n")
+    report = check_core(f"{sys.executable} -c 'import sys; sys.exit(3)' settings.toml")
+    assert [step.text for step in report.steps] == ["core_died: the core ended with exit code 3"]
+    (tmp_path / "my core.toml").write_text(f"[core]\nname = 'mine'\ncommand = \"{sys.executable} -c 'exit(4)'\"\n")
+    assert "exit code 4" in check_core("my core.toml").steps[0].text
 
 
 def test_a_command_that_cannot_be_run_is_bad_input(tmp_path):

@@ -1,5 +1,8 @@
 """Whatever a core does is a Failure that is counted or one line, and leaves neither a process nor a folder."""
 
+import os
+import resource
+import sys
 import tempfile
 
 import numpy as np
@@ -9,6 +12,7 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.dispatch import run, run_in_frame
+from simtest.estimators.process.command import CoreCommand
 from simtest.estimators.process.core import MAX_FAULTS, Core
 from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
 from simtest.estimators.process.wire import CoreFault
@@ -185,6 +189,9 @@ def test_after_some_faults_in_a_row_a_core_is_not_started_again(folder):
     assert {each.reason for each in made} == {Reason.CORE_DIED}
     assert [each.detail.startswith("not asked after 5 faults in a row") for each in made] == [False] * 5 + [True] * 2
     assert processes_with(mark) == []
+    # The end of a run closes its cores; the next run asks again.
+    core.close()
+    assert "exit code 3" in answer_of(core).detail
 
 
 def test_a_good_answer_between_faults_lets_a_core_go_on(folder):
@@ -193,6 +200,92 @@ def test_a_good_answer_between_faults_lets_a_core_go_on(folder):
     made = [answer_of(core) for _ in range(2 * MAX_FAULTS + 4)]
     assert [isinstance(each, Estimate) for each in made] == [True, False] * (MAX_FAULTS + 2)
     assert not any("not asked" in str(each) for each in made)
+    core.close()
+
+
+def test_a_line_of_type_done_has_the_number_of_its_request(folder):
+    script = folder / "files_core.py"
+    script.write_text("""import json, sys
+hello = {"type": "hello", "protocol": 1, "name": "files", "kind": "patch", "transport": "files"}
+answer = {"type": "estimate", "normal": [0, 0, -1], "look_px": [320, 240]}
+for line in sys.stdin:
+    request = json.loads(line)
+    if "folder" in request:
+        open(request["folder"] + "/answer.json", "w").write(json.dumps(answer))
+    print(json.dumps({"type": "done", "id": 1} if "folder" in request else hello), flush=True)
+""")
+    core = Core(CoreCommand("files core", "files_core", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    assert isinstance(answer_of(core), Estimate)
+    late = answer_of(core)
+    assert (late.reason, late.detail) == (Reason.CORE_PROTOCOL, "a line of type done with id 1 to request 2")
+    core.close()
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        ("os.mkdir(request['folder'] + '/answer.json')", "answer.json: must be a plain file"),
+        ("os.mkdir('request-2'); answer(request)", "changed the folder that it runs in"),
+        ("answer(request); shutil.rmtree(os.getcwd())", "answer.json cannot be read (No such file"),
+    ],
+)
+def test_a_core_that_spoils_its_folder_breaks_the_protocol(folder, act, words):
+    script = folder / "files_core.py"
+    script.write_text(f"""import json, os, shutil, sys
+hello = {{"type": "hello", "protocol": 1, "name": "files", "kind": "patch", "transport": "files"}}
+def answer(request):
+    fields = {{"type": "estimate", "normal": [0, 0, -1], "look_px": [320, 240]}}
+    open(request["folder"] + "/answer.json", "w").write(json.dumps(fields))
+for line in sys.stdin:
+    request = json.loads(line)
+    if "folder" in request:
+        {act}
+    print(json.dumps({{"type": "done", "id": request["id"]}} if "folder" in request else hello), flush=True)
+""")
+    core = Core(CoreCommand("files core", "files_core", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    failures = [each for each in (answer_of(core), answer_of(core)) if isinstance(each, Failure)]
+    core.close()
+    assert {each.reason for each in failures} == {Reason.CORE_PROTOCOL}
+    assert words in failures[0].detail
+
+
+def test_an_empty_line_after_an_answer_is_named(folder):
+    script = folder / "core.py"
+    script.write_text(
+        """import json, sys
+hello = {"type": "hello", "protocol": 1, "name": "core", "kind": "patch", "arrays": []}
+for line in sys.stdin:
+    request = json.loads(line)
+    answer = {"type": "estimate", "id": request.get("id"), "normal": [0, 0, -1], "look_px": [320, 240]}
+    sys.stdout.write(json.dumps(hello) + "\\n" if "id" not in request else json.dumps(answer) + "\\n\\n")
+    sys.stdout.flush()
+""".replace("\\\\n", "\\n")
+    )
+    core = Core(CoreCommand("core", "core", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    assert "an empty line" in answer_of(core).detail
+    core.close()
+
+
+def test_a_process_with_many_open_files_has_cores_too(folder):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 2048:
+        pytest.skip(f"at most {hard} open files")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 2048), hard))
+    held = [os.dup(0) for _ in range(1100)]
+    try:
+        core = Core(bad_command("grandchild", "--spared1")[0])
+        core.start()
+        assert core._child.process.stdout.fileno() > 1023
+        assert isinstance(answer_of(core), Estimate)
+        failure = answer_of(core)
+    finally:
+        for file in held:
+            os.close(file)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert (failure.reason, "grandchild" in failure.detail) == (Reason.CORE_DIED, True)
     core.close()
 
 

@@ -1,6 +1,7 @@
 """Messages: framing byte by byte, what a request tells, and answers field by field."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +100,12 @@ def test_an_isovalue_of_which_no_array_is_named_gets_both():
 
 
 # Requests -------------------------------------------------------------------------------------------------------------
+
+
+def test_isovalues_whose_arrays_would_have_one_name_are_refused():
+    with pytest.raises(CoreFault, match="must differ in their first six digits"):
+        hello_of(greeting(isophotes=[0.1234567, 0.12345671]))
+    assert hello_of(greeting(isophotes=[0.5, 0.5, 1e-7])).arrays[-1] == "isophote_rays_1e-07"
 
 
 def test_a_request_about_a_highlight_tells_all_of_it():
@@ -211,20 +218,34 @@ def test_the_target_of_the_greeting_holds_where_an_estimate_tells_none():
 def test_an_estimate_may_look_along_a_ray():
     ray = CAMERA.unproject(np.array([100.0, 50.0]))
     assert answered(look_px=None, look_ray=ray.tolist()).look_px == pytest.approx([100, 50])
+    for lens in (BrownConrady(k1=-0.1, p1=1e-3), KannalaBrandt(k1=-0.02)):
+        camera = replace(CAMERA, distortion=lens)
+        ray = 3.0 * camera.unproject(np.array([100.0, 50.0]))
+        header = {"type": "estimate", "normal": NORMAL.tolist(), "look_ray": ray.tolist()}
+        assert estimate_of(Message(header), camera, HELLO).look_px == pytest.approx([100, 50], abs=1e-6)
     behind = answered(look_px=None, look_ray=[0, 0, -1])
     assert isinstance(behind, Failure)
     assert "images no such direction" in behind.detail
 
 
-def test_a_covariance_in_another_basis_is_turned_into_ours():
+@pytest.mark.parametrize("hand", [1, -1], ids=["right-handed", "left-handed"])
+def test_a_covariance_in_another_basis_is_turned_into_ours(hand):
     first, second = basis_across(NORMAL)
     turned = np.array([np.cos(0.7) * first + np.sin(0.7) * second, -np.sin(0.7) * first + np.cos(0.7) * second])
+    turned = turned[::hand]
     given = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
     found = answered(covariance=given.tolist(), basis=turned.tolist()).covariance
     # The same covariance in space.
     ours = basis_across(NORMAL)
     np.testing.assert_allclose(ours.T @ found @ ours, turned.T @ given @ turned, atol=1e-15)
     np.testing.assert_allclose(answered(covariance=given.tolist()).covariance, given)
+
+
+def test_a_covariance_of_few_digits_is_made_symmetric():
+    given = [[4e-4, 1.0e-4], [1.0003e-4, 2e-4]]
+    found = answered(covariance=given).covariance
+    assert np.array_equal(found, found.T)
+    np.testing.assert_allclose(found, given, atol=1e-7)
 
 
 def test_a_budget_is_kept_part_by_part():
@@ -242,6 +263,9 @@ def test_a_budget_is_kept_part_by_part():
         {"flags": ["x" * 61]}, {"flags": ["a"] * 17}, {"curvature": 3}, {"curvature": {"axis_ratio": 0.5}},
         {"curvature": {"directions": [[1, 0, 0], [0, 1, 0]], "axis_ratio": 2}}, {"budget": []}, {"budget": {}},
         {"budget": {"a b": [[1, 0], [0, 1]]}}, {"budget": {"noise": [1, 2]}}, {"covariance": [[1, 2], [0, 1]]},
+        {"axis_ratio": -5}, {"axis_ratio": 1e308}, {"look_px": [-500, 20]}, {"look_px": [1e300, 20]},
+        {"look_px": None, "look_ray": [5, 0, 1e-3]}, {"covariance": [[1e308, 0], [0, 1]]},
+        {"covariance": [[25.0, 0], [0, 25.0]]}, {"covariance": np.eye(2, dtype=bool)},
         {"isophotes": 3}, {"isophotes": [{"isovalue": 2, "cone": [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
                                           "sightline": [0, 0, 1]}]},
         {"isophotes": [{"isovalue": 0.5, "cone": [[0, 0, 0]] * 3, "sightline": [0, 0, 1]}]},
@@ -294,6 +318,14 @@ def test_fields_may_be_arrays():
         Message({"type": "estimate"}, {"normal": arrays["normal"][0], "look_px": np.ones(2)}), CAMERA, HELLO
     )
     assert isinstance(single, Estimate)
+
+
+def test_arrays_of_very_many_estimates_are_refused_before_a_list_is_made_of_them():
+    tracemalloc.start()
+    found = estimates_of(Message({"type": "estimates"}, {"normal": np.empty((60_000_000, 0))}), CAMERA, HELLO)
+    assert "60000000 estimates of a frame; at most 10000" in found.detail
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
 
 
 def test_one_malformed_estimate_refuses_those_of_a_frame():

@@ -10,7 +10,7 @@ import simtest
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.process.command import parse_core
-from simtest.estimators.process.naming import absolute_names, close_cores, short_names
+from simtest.estimators.process.naming import absolute_names, close_cores, core_hashes, short_names
 from tests.unit.core_helpers import BAD_CORE
 
 TABLE = """
@@ -101,6 +101,22 @@ def test_absolute_names_mean_the_same_elsewhere(folder, monkeypatch):
     assert absolute[2] == "cone_axis"
 
 
+@pytest.mark.parametrize("command", ["{python} script.py --config settings.toml", "launcher script.py settings.toml"])
+def test_an_absolute_name_is_that_of_the_same_core(folder, monkeypatch, command):
+    (folder / "settings.toml").write_text("[core]\n")
+    (folder / "bin").mkdir()
+    (folder / "bin" / "launcher").symlink_to(sys.executable)
+    monkeypatch.setenv("PATH", str(folder / "bin"))
+    name = f"command: {command.format(python=sys.executable)}"
+    before = parse_core(name)
+    (absolute,) = absolute_names([name])
+    monkeypatch.chdir("/")
+    after = parse_core(absolute)
+    assert after.arguments == before.arguments
+    assert after.name == before.name == "script"
+    assert absolute_names([absolute]) == (absolute,)
+
+
 def test_files_of_a_toml_file_are_looked_for_in_its_folder(folder):
     (folder / "inside" / "script.py").write_text(BAD_CORE.read_text())
     (folder / "inside" / "core.toml").write_text(TABLE.format(command=f"{sys.executable} script.py none"))
@@ -128,6 +144,21 @@ def test_a_malformed_toml_file_is_refused(folder, more, words):
     (folder / "core.toml").write_text(text)
     with pytest.raises(InputError, match=words):
         load_estimators(["core.toml"])
+
+
+def test_further_files_make_another_core(folder):
+    (folder / "helper.py").write_text("scale = 1")
+    table = folder / "core.toml"
+    table.write_text(
+        TABLE.format(command=f"{sys.executable} script.py --fast") + 'files = ["helper.py", "model.onnx"]\n'
+    )
+    ((_, first),) = core_hashes(["core.toml"]).items()
+    assert {str(folder / "helper.py"), str(folder / "model.onnx"), str(table)} <= set(first)
+    (folder / "helper.py").write_text("scale = 2")
+    assert core_hashes(["core.toml"]) != {"core.toml": first}
+    table.write_text(TABLE.format(command="./program") + 'files = ["lost.py"]\n')
+    with pytest.raises(InputError, match=r"core.files: lost.py is no file in .*; must be a file"):
+        parse_core("core.toml")
 
 
 def test_the_kind_and_the_environment_of_a_toml_file_hold(folder, monkeypatch):
@@ -161,6 +192,18 @@ def test_the_same_core_is_started_once_and_a_changed_one_anew(folder):
     (changed,) = load_estimators([core]).values()
     assert changed.core is not first.core
     assert first.core._child is None
+
+
+def test_a_closed_core_greets_anew_since_what_its_script_imports_may_have_changed(folder):
+    script = BAD_CORE.read_text().replace('"version": "0.1"', '"version": open(VERSION).read()')
+    (folder / "version").write_text("0.1")
+    (folder / "script.py").write_text(script.replace("HANG_S = 600", f"HANG_S, VERSION = 600, '{folder}/version'"))
+    core = f"command: {sys.executable} script.py none"
+    (first,) = load_estimators([core]).values()
+    close_cores()
+    (folder / "version").write_text("0.2")
+    (second,) = load_estimators([core]).values()
+    assert [each.core.hello.version for each in (first, second)] == ["0.1", "0.2"]
 
 
 def test_the_command_line_takes_a_core(folder, here):

@@ -14,12 +14,13 @@ import psutil
 import pytest
 
 import simtest
-from simtest.dataset.manifest import new_manifest
+from simtest.dataset.manifest import new_manifest, read_manifest
 from simtest.dataset.plan import Plan
+from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.estimators.process.naming import close_cores
 from simtest.runtime.provenance import file_hash
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.dataset_recipe import Dataset, load_dataset
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.gallery_item import reproduce_command
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
@@ -260,10 +261,11 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
     assert wait_until(lambda: not processes_with(mark))
 
 
-def test_a_run_closes_its_cores(tmp_path, published):
+@pytest.mark.parametrize("kind", ["published", "experiment"])
+def test_a_run_closes_its_cores(tmp_path, kind, request):
     mark = f"--mark={tmp_path.name}"
     core = command(BAD_CORE, "none", mark)
-    simtest.validate(published, tmp_path / "run", realisations=1, estimators=[core])
+    simtest.validate(request.getfixturevalue(kind), tmp_path / "run", realisations=1, estimators=[core])
     assert processes_with(mark) == []
     assert [child for child in psutil.Process().children() if "simtest-core" in " ".join(child.cmdline())] == []
 
@@ -304,13 +306,22 @@ def test_a_changed_program_is_another_run(tmp_path, published):
     arguments = {"realisations": 1, "estimators": [command(script, "none")]}
     simtest.validate(published, tmp_path / "run", **arguments)
     before = (tmp_path / "run" / "summary.json").read_text()
-    simtest.validate(published, tmp_path / "run", **arguments)
+    with pytest.warns(UserWarning, match="run: is kept, since the core's command and files are the same"):
+        simtest.validate(published, tmp_path / "run", **arguments)
     assert (tmp_path / "run" / "summary.json").read_text() == before
     script.write_text(BAD_CORE.read_text().replace('"0.1"', '"0.2"'))
     with pytest.warns(UserWarning, match="another"):
         simtest.validate(published, tmp_path / "run", **arguments)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
+
+
+def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, published):
+    # Every request breaks down: at the sixth in a row the core is not asked any more, in each part anew.
+    arguments = {"realisations": 3, "estimators": [command(BAD_CORE, "exit")]}
+    whole = simtest.validate(published, tmp_path / "run", **arguments).results
+    assert len(whole) == 6
+    assert not whole["flags"].str.contains("not asked").any()
 
 
 @pytest.mark.parametrize("extra", ["", "'$HOME' '\"!'"])
@@ -323,10 +334,38 @@ def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
     assert "Estimate(normal=(0, 0, -1)" in done.stdout
 
 
-def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores():
+def test_the_manifest_of_a_dataset_holds_the_hashes_of_its_cores(tmp_path):
     dataset = load_dataset("smooth").model_copy(update={"estimators": (command(BAD_CORE, "none"),)})
     inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
     assert inputs["core bad_core: bad_core.py"] == file_hash(BAD_CORE)
+    for number in "12":
+        (tmp_path / number).mkdir()
+        (tmp_path / number / "net.bin").write_text(number)
+    text = command(BAD_CORE, "none", str(tmp_path / "1" / "net.bin"), str(tmp_path / "2" / "net.bin"))
+    dataset = dataset.model_copy(update={"estimators": (text,)})
+    inputs = new_manifest(Plan(dataset), "llvm_ad_mono").origin["inputs"]
+    assert inputs["core bad_core: net.bin"] == file_hash(tmp_path / "1" / "net.bin")
+    assert inputs["core bad_core: net.bin (2)"] == file_hash(tmp_path / "2" / "net.bin")
+
+
+def test_a_worker_of_a_dataset_finds_its_core_in_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "core.py").write_text(BAD_CORE.read_text())
+    monkeypatch.chdir(tmp_path)
+    named = f"command: {sys.executable} core.py none"
+    dataset = load_dataset("smooth").model_copy(update={"estimators": (named,)})
+    tasks = []
+
+    class Stopping:
+        def run(self, _, given, __):
+            tasks.extend(given)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(dataset, tmp_path / "data", Stopping())
+    (estimator,) = Dataset.model_validate_json(tasks[0].dataset).estimators
+    assert str(tmp_path / "core.py") in estimator
+    # The manifest names it as the user did.
+    assert read_manifest(tmp_path / "data").dataset["estimators"] == [named]
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):

@@ -1,11 +1,14 @@
 """A dataset's frames without their truth, and answers to them; every shipped experiment can be exported."""
 
 import json
+import shutil
 
 import polars as pl
 import pytest
 
+from simtest.dataset.card import CARD
 from simtest.dataset.export import export_dataset
+from simtest.dataset.manifest import read_manifest
 from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.run import score_table
 from simtest.dataset.shard_writer import write_dataset
@@ -44,6 +47,21 @@ def test_a_dataset_has_a_frame_for_each_sample(made):
     for frame in scored:
         assert frame.swept == json.loads(drawn[frame.realisation])
         assert frame.view.highlights
+
+
+def test_frames_need_none_of_the_estimators_that_a_dataset_was_made_with(made, tmp_path):
+    # As on another machine, where a core or package of the dataset's maker is missing.
+    data = shutil.copytree(made[0], tmp_path / "data")
+    (data / "export.json").unlink()
+    manifest = read_manifest(data)
+    manifest.dataset["estimators"] = ["command: /opt/core_of_a_colleague --fast", "estimator_of_a_package"]
+    manifest.save(data)
+    # The card lists them.
+    assert {fault.file for fault in verify(data)} <= {CARD}
+    export_dataset(data, tmp_path / "frames", make_engine())
+    assert {path.name for path in (tmp_path / "frames" / "frames").iterdir()} == {
+        path.name for path in (made[1] / "frames").iterdir()
+    }
 
 
 def test_own_estimates_of_a_dataset_are_scored_as_they_were(made, tmp_path):

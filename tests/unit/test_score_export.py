@@ -194,6 +194,10 @@ class Stopping:
             yield number, task(argument, on_step)
 
 
+def test_the_times_of_files_tell_no_order(made):
+    assert len({path.stat().st_mtime_ns for path in made[1].rglob("*") if path.is_file()}) == 1
+
+
 def test_a_stopped_export_goes_on(made, tmp_path):
     run, frames = made
     record = (run / "export.json").read_bytes()
@@ -243,6 +247,24 @@ def test_a_folder_of_something_else_is_refused(made, tmp_path):
     assert (tmp_path / "frames" / "mine.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize("out", ["run", "run/frames", "."])
+def test_an_export_lies_apart_from_its_run(made, tmp_path, out):
+    # Before anything is rendered: a run that holds frames could not go on, nor be replaced.
+    with pytest.raises(InputError, match=r"--export .*: must be neither .*run nor inside or around it"):
+        simtest.validate(made[0].parent / "trial_of_mine.toml", tmp_path / "run", export=tmp_path / out)
+    assert list(tmp_path.glob("run/*")) == []
+    with pytest.raises(InputError, match="must be neither"):
+        export_run(made[0], load_experiment(made[0].parent / "trial_of_mine.toml"), made[0] / "frames", make_engine())
+
+
+def test_a_folder_for_the_export_is_checked_before_the_run(made, tmp_path):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"--export .*: holds notes.txt, which is no part of an export"):
+        simtest.validate(made[0].parent / "trial_of_mine.toml", tmp_path / "run", export=tmp_path / "frames")
+    assert list(tmp_path.glob("run/*")) == []
+
+
 def test_the_published_protocol_renders_nothing_to_export(tmp_path):
     with pytest.raises(InputError, match="paper: follows the published protocol, which renders no frames"):
         simtest.validate("paper", tmp_path / "run", realisations=1, export=tmp_path / "frames")
@@ -256,6 +278,6 @@ def test_the_readme_names_every_column(made):
         with (frames / name).open() as file:
             for column in file.readline().strip().split(","):
                 assert column in text or column.startswith("box"), column
-    from simtest.dataset.scoring.table import COLUMNS
+    from simtest.dataset.scoring.table_file import COLUMNS
 
     assert all(f"`{column}`" in text for column in COLUMNS if column != "cov_21")

@@ -1,4 +1,4 @@
-"""Answers made elsewhere: our own, scored again, give the rows of the run that made them; malformed ones, one line."""
+"""Answers made elsewhere: our own, scored again, give the rows of the run that made them."""
 
 import json
 import shutil
@@ -8,10 +8,8 @@ import polars as pl
 import pytest
 
 import simtest
-from simtest.dataset.scoring.record import read_record
 from simtest.dataset.scoring.run import score_table
-from simtest.dataset.scoring.table import read_answers
-from simtest.errors import InputError, Reason
+from simtest.errors import InputError
 from simtest.reconstruction.image_io import read_picture
 
 LENS = """
@@ -271,176 +269,6 @@ def test_a_refusal_is_counted_under_its_reason(sensor, base):
     assert scored.filter(status="no_estimate")["flags"][0] == "too dark for me: mean 3 counts"
 
 
-# Malformed tables ---------------------------------------------------------------------------------------------------
-
-FRAME = "f0123456789abcdef"
-GOOD = {"frame": FRAME, "x_px": "50", "y_px": "40", "normal_x": "0", "normal_y": "0.6", "normal_z": "-0.8"}
-
-
-@pytest.fixture(scope="module")
-def record(sensor):
-    """The record of an export with one frame of a known name, and a camera in front."""
-    made = read_record(sensor)
-    name = next(iter(made.frames))
-    return made.model_copy(update={"frames": {FRAME: made.frames[name], "f" + "1" * 16: made.frames[name]}})
-
-
-def write(path, *rows):
-    """Write rows as CSV; the first names the columns."""
-    columns = list(rows[0])
-    path.write_text("\n".join([",".join(columns), *(",".join(row.get(c, "") for c in columns) for row in rows)]) + "\n")
-    return path
-
-
-WRONG_ROWS = {
-    "not a number": ({"normal_x": "left"}, "row 1: normal_x = left: must be a finite number or empty"),
-    "NaN": ({"normal_x": "NaN"}, "row 1: normal_x = NaN: must be a finite number or empty"),
-    "infinite": ({"x_px": "inf"}, "row 1: x_px = inf: must be a finite number or empty"),
-    "no normal": ({"normal_y": ""}, "row 1: normal_y is empty; must be a number, or status must name why"),
-    "no pixel": ({"x_px": ""}, "row 1: x_px or y_px is empty; both must be given, or none and specularity"),
-    "unknown frame": ({"frame": "f1"}, "row 1: frame = f1: must be among the 2 names of frames.csv"),
-    "no frame": ({"frame": ""}, "row 1: frame = empty: must be among the 2 names of frames.csv"),
-    "long": ({"normal_z": "-0.9"}, "row 1: normal has length 1.08167; must be a unit vector"),
-    "zero": ({"normal_y": "0", "normal_z": "0"}, "row 1: normal has length 0; must be a unit vector"),
-    "away": ({"normal_z": "0.8"}, r"row 1: normal \(0 0.6 0.8\) faces away from the camera; z points forward"),
-    "target": ({"target": "rough"}, "row 1: target = rough: must be fine, base or empty"),
-    "number": ({"specularity": "7"}, "row 1: specularity = 7: must be a whole number from 0 to 0"),
-    "half a number": ({"specularity": "0.5"}, "row 1: specularity = 0.5: must be a whole number"),
-    "half a covariance": (
-        {"cov_11": "1e-4", "cov_12": "0", "cov_22": ""},
-        "row 1: cov_11, cov_12, cov_22: some are empty; all three must be given, or none",
-    ),
-    "negative variance": (
-        {"cov_11": "-1e-4", "cov_12": "0", "cov_22": "1e-4"},
-        "row 1: cov_11 = -0.0001: must be a variance in rad\\^2, 0 to 9.87",
-    ),
-    "degrees": (
-        {"cov_11": "25", "cov_12": "0", "cov_22": "25"},
-        "row 1: cov_11 = 25: must be a variance in rad\\^2",
-    ),
-    "too large a covariance": (
-        {"cov_11": "1e-4", "cov_12": "2e-4", "cov_22": "1e-4"},
-        r"row 1: cov_12 = 0.0002: must be at most sqrt\(cov_11 cov_22\) = 0.0001 in size",
-    ),
-    "asymmetric": (
-        {"cov_11": "1e-4", "cov_12": "1e-5", "cov_22": "1e-4", "cov_21": "-1e-5"},
-        "row 1: cov_21 = -1e-05: must equal cov_12 = 1e-05; a covariance is symmetric",
-    ),
-    "half a second": (
-        {"second_x": "0", "second_y": "", "second_z": "-1"},
-        "row 1: second_x, second_y or second_z is empty; all three must be given, or none",
-    ),
-    "second": (
-        {"second_x": "0", "second_y": "0", "second_z": "-2"},
-        "row 1: second has length 2; must be a unit vector",
-    ),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG_ROWS)
-def test_a_wrong_row_is_named(record, tmp_path, wrong):
-    change, message = WRONG_ROWS[wrong]
-    table = write(tmp_path / "t.csv", {**GOOD, **change})
-    with pytest.raises(InputError, match=message) as error:
-        read_answers(table, record, "mine")
-    assert str(table) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_the_row_is_the_one_that_is_wrong(record, tmp_path):
-    other = {**GOOD, "frame": "f" + "1" * 16, "normal_z": "-0.9"}
-    with pytest.raises(InputError, match="row 2: normal has length"):
-        read_answers(write(tmp_path / "t.csv", GOOD, other), record, "mine")
-
-
-@pytest.mark.parametrize("change", [{}, {"x_px": "50.0"}])
-def test_a_highlight_is_answered_once(record, tmp_path, change):
-    with pytest.raises(InputError, match=f"row 2: frame {FRAME}: answers the same highlight as row 1; must be one row"):
-        read_answers(write(tmp_path / "t.csv", GOOD, {**GOOD, **change}), record, "mine")
-
-
-@pytest.mark.parametrize("missing", ["frame", "normal_y", "x_px"])
-def test_a_missing_column_is_named(record, tmp_path, missing):
-    row = {key: value for key, value in GOOD.items() if key != missing}
-    with pytest.raises(InputError, match=f"column {missing} is missing; must have frame, x_px and y_px or specularity"):
-        read_answers(write(tmp_path / "t.csv", row), record, "mine")
-
-
-def test_unknown_columns_are_told(record, tmp_path):
-    with pytest.warns(UserWarning, match=r"columns that are not read: normal_xx \(is normal_x meant\?\)"):
-        read_answers(write(tmp_path / "t.csv", {**GOOD, "normal_xx": "1"}), record, "mine")
-
-
-@pytest.mark.parametrize(
-    ("content", "what"), [(b"", "no CSV table"), (b"\x00\xff\xfe\n\x80", "is missing|no CSV table")]
-)
-def test_what_is_no_table_is_refused(record, tmp_path, content, what):
-    (tmp_path / "t.csv").write_bytes(content)
-    with pytest.raises(InputError, match=what) as error:
-        read_answers(tmp_path / "t.csv", record, "mine")
-    assert "\n" not in str(error.value)
-
-
-def test_a_broken_parquet_file_is_refused(record, tmp_path):
-    (tmp_path / "t.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(InputError, match=r"t.parquet: no Parquet table"):
-        read_answers(tmp_path / "t.parquet", record, "mine")
-
-
-@pytest.mark.parametrize(
-    ("column", "values"),
-    [("normal_x", [[0.0]]), ("normal_x", [{"x": 0.0}]), ("frame", [[FRAME]]), ("normal_x", [b"0"])],
-)
-def test_columns_of_another_type_are_refused(record, tmp_path, column, values):
-    columns = {key: [value if key == "frame" else float(value)] for key, value in GOOD.items()}
-    pl.DataFrame({**columns, column: values}).write_parquet(tmp_path / "t.parquet")
-    with pytest.raises(InputError, match=f"column {column} is .*; must hold (numbers|text)|row 1: {column}") as error:
-        read_answers(tmp_path / "t.parquet", record, "mine")
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["", "a/b", "x" * 81, "two\nlines"])
-def test_a_name_that_cannot_stand_in_results_is_refused(sensor, tmp_path, name):
-    with pytest.raises(InputError, match=r"--name = .*: must be 1 to 80 printable characters without /"):
-        score_table(tmp_path / "t.csv", sensor, tmp_path / "out", name)
-
-
-def test_an_estimator_of_a_row_is_checked_too(record, tmp_path):
-    with pytest.raises(InputError, match="row 1: estimator = a/b: must be 1 to 80 printable characters"):
-        read_answers(write(tmp_path / "t.csv", {**GOOD, "estimator": "a/b"}), record, "mine")
-
-
-@pytest.mark.parametrize("path", ["nothing.csv", "."])
-def test_a_table_that_cannot_be_read_is_refused(record, tmp_path, path):
-    with pytest.raises(InputError, match=r"cannot be read .*; must be a CSV or Parquet table"):
-        read_answers(tmp_path / path, record, "mine")
-
-
-def test_a_table_without_answers_is_refused(record, tmp_path):
-    with pytest.raises(InputError, match="holds no answer; must have a row for each normal"):
-        read_answers(write(tmp_path / "t.csv", {**GOOD, "status": "missed"}), record, "mine")
-
-
-def test_rounded_normals_are_scaled_and_exact_ones_stay(record, tmp_path):
-    rounded = write(tmp_path / "r.csv", {**GOOD, "normal_y": "0.5999", "normal_z": "-0.8001"})
-    answer = read_answers(rounded, record, "mine")["mine"][FRAME][0]
-    assert np.linalg.norm(answer.result.normal) == pytest.approx(1, abs=1e-15)
-    exact = read_answers(write(tmp_path / "e.csv", GOOD), record, "mine")["mine"][FRAME][0].result.normal
-    assert exact.tolist() == [0.0, 0.6, -0.8]
-
-
-def test_a_detection_lends_its_pixel(record, tmp_path):
-    row = {**GOOD, "x_px": "", "y_px": "", "specularity": "0"}
-    answer = read_answers(write(tmp_path / "t.csv", row), record, "mine")["mine"][FRAME][0]
-    assert tuple(answer.point_px) == record.frames[FRAME].peaks[0]
-
-
-def test_a_reason_that_we_know_is_kept(record, tmp_path):
-    row = {**GOOD, "normal_x": "", "normal_y": "", "normal_z": "", "status": "not_converged", "reason": "20 steps"}
-    result = read_answers(write(tmp_path / "t.csv", row), record, "mine")["mine"][FRAME][0].result
-    assert (result.reason, result.detail) == (Reason.NOT_CONVERGED, "20 steps")
-
-
 # Runs that cannot be scored on --------------------------------------------------------------------------------------
 
 
@@ -499,8 +327,16 @@ def test_a_run_without_an_export_is_refused(sensor, tmp_path, table):
 
 
 def test_the_run_itself_is_not_replaced(sensor, table):
-    with pytest.raises(InputError, match="is the run that is scored on; must be another folder"):
-        score_table(table, sensor, sensor)
+    for out in (sensor, sensor / "scored", sensor.parent):
+        with pytest.raises(InputError, match="must be neither the run that is scored on nor inside or around it"):
+            score_table(table, sensor, out)
+
+
+def test_another_exported_run_is_not_replaced(sensor, table, tmp_path):
+    shutil.copytree(sensor, tmp_path / "other")
+    with pytest.raises(InputError, match="holds a run whose frames were exported; must be another folder"):
+        score_table(table, sensor, tmp_path / "other")
+    assert (tmp_path / "other" / "export.json").exists()
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
 
 from simtest.dataset.manifest import NAME as MANIFEST
 from simtest.dataset.reader import open_manifest
@@ -36,11 +36,18 @@ class _Model(BaseModel):
 
 
 class ExportedFrame(_Model):
-    """One frame: SHA-256 of its values, its camera's table, and the peaks of the detections in it, px."""
+    """One frame: SHA-256 of its values, its camera's table, and peaks and boxes of the detections in it, px."""
 
     sha256: str
     camera: str
     peaks: tuple[tuple[Coordinate, Coordinate], ...]
+    boxes: tuple[tuple[int, int, int, int], ...]
+
+    @model_validator(mode="after")
+    def _has_pairs(self) -> "ExportedFrame":
+        if len(self.peaks) != len(self.boxes):
+            raise ValueError(f"has {len(self.peaks)} peaks and {len(self.boxes)} boxes")
+        return self
 
 
 class Use(_Model):
@@ -89,6 +96,14 @@ class Record(_Model):
     cameras: dict[str, dict[str, JsonValue]]
     frames: dict[str, ExportedFrame]
     uses: tuple[Use, ...]
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> "Record":
+        if lost := {frame.camera for frame in self.frames.values()} - self.cameras.keys():
+            raise ValueError(f"has no camera {sorted(lost)[0]}")
+        if lost := {use.frame for use in self.uses} - self.frames.keys():
+            raise ValueError(f"has no frame {sorted(lost)[0]}")
+        return self
 
     def names(self) -> dict[tuple[int, int], str]:
         """Return the frame's name by case and realisation."""
@@ -143,7 +158,8 @@ def source_of_dataset(folder: Path) -> Source:
     """Return a dataset as a source of frames; raise `InputError` where there is none, or one of another version."""
     manifest = open_manifest(folder)
     plan, variant = manifest.plan(), str(manifest.origin["variant"])
-    views = [ShardViews(plan.dataset, number, variant) for number in range(len(plan.shards))]
+    bare = plan.dataset.model_copy(update={"estimators": ()})
+    views = [ShardViews(bare, number, len(shard.indices), variant) for number, shard in enumerate(plan.shards)]
     is_of = hashlib.sha256(plan.dataset.model_dump_json().encode()).hexdigest()
     version, source = provenance.version(), str(manifest.origin["source"])
     return Source(folder, views, "dataset", version, source, is_of, variant, dataset=plan.dataset)
@@ -177,7 +193,7 @@ def read_record(folder: Path) -> Record:
         return Record.model_validate_json(text)
     except ValidationError as error:
         what = error.errors()[0]
-        where = ".".join(map(str, what["loc"]))
+        where = ".".join(map(str, what["loc"])) or "whole"
         raise InputError(f"{shown(path)}: no record of an export ({where}: {what['msg']}); {again}") from error
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, OnStep, make_engine
-from simtest.runtime.files import Json
+from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
@@ -118,20 +118,7 @@ def score_table(
             remove_folder(out / "gallery")
             (out / "gallery").mkdir(parents=True)
             results = _results(source, record, answers, out, engine or make_engine(), progress)
-            inputs = {str(path): provenance.file_hash(path) for path in (table, on / EXPORT)}
-            digest = hashlib.sha256(f"{record.fingerprint} {sorted(inputs.values())}".encode()).hexdigest()
-            made = RunRecord(
-                variant=source.variant,
-                llvm=backend.library_in_use(),
-                fingerprint=digest,
-                seed=_seed(source),
-                realisations=_realisations(source),
-                started=started.isoformat(timespec="seconds"),
-                duration_s=round(time.monotonic() - clock, 1),
-                command=command,
-                inputs={**inputs, **input_hashes(list(source.cases))},
-                cores={},
-            )
+            made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
             described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
             write_results(out, made, results, _summary(source, results, described))
         except OSError as error:
@@ -140,9 +127,30 @@ def score_table(
 
 
 def _check_apart(on: Path, out: Path) -> None:
-    """Raise `InputError` where the scored run would replace the run it is scored on."""
-    if on.resolve() == out.resolve():
-        raise InputError(f"--out {shown(out)}: is the run that is scored on; must be another folder")
+    """Raise `InputError` where the scored run would replace, or lie in, a run whose frames were exported."""
+    if are_nested(on, out):
+        raise InputError(f"--out {shown(out)}: must be neither the run that is scored on nor inside or around it")
+    if (out / EXPORT).exists():
+        raise InputError(f"--out {shown(out)}: holds a run whose frames were exported; must be another folder")
+
+
+def _run_record(
+    source: Source, fingerprint: str, files: Sequence[Path], command: str, started: datetime, clock: float
+) -> RunRecord:
+    """Return how a scored run was made: of the run of this fingerprint, and of a table and a record of an export."""
+    inputs = {str(path): provenance.file_hash(path) for path in files}
+    return RunRecord(
+        variant=source.variant,
+        llvm=backend.library_in_use(),
+        fingerprint=hashlib.sha256(f"{fingerprint} {sorted(inputs.values())}".encode()).hexdigest(),
+        seed=_seed(source),
+        realisations=_realisations(source),
+        started=started.isoformat(timespec="seconds"),
+        duration_s=round(time.monotonic() - clock, 1),
+        command=command,
+        inputs={**inputs, **input_hashes(list(source.cases))},
+        cores={},
+    )
 
 
 def _seed(source: Source) -> int:

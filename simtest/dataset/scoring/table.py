@@ -2,33 +2,23 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
-import polars as pl
 
 from simtest.dataset.scoring.answers import Answer
 from simtest.dataset.scoring.record import Record
+from simtest.dataset.scoring.table_file import COVARIANCE, NORMAL, PIXEL, SECOND, Table, read_table
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.protocol import Target
+from simtest.estimators.dispatch import is_singular
+from simtest.estimators.protocol import LARGEST_VARIANCE, NEAR_PX, Target
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.files import require_plain
-from simtest.runtime.resources import close_names, shown
+from simtest.runtime.resources import shown
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.spec_model import validate
 from simtest.validation.metrics import MISSED
-
-NORMAL = ("normal_x", "normal_y", "normal_z")
-SECOND = ("second_x", "second_y", "second_z")
-COVARIANCE = ("cov_11", "cov_12", "cov_22")
-PIXEL = ("x_px", "y_px")
-NUMBERS = (*PIXEL, *NORMAL, *SECOND, *COVARIANCE, "cov_21", "axis_ratio", "choice_margin")
-TEXTS = ("frame", "estimator", "target", "flags", "status", "reason")
-COLUMNS = (*TEXTS, "specularity", *NUMBERS)
 
 UNIT_TOLERANCE = 1e-3
 """A normal whose length differs from 1 by more is refused: it is no rounding."""
@@ -39,34 +29,8 @@ ROUNDING = 1e-9
 LONGEST_NAME = 80
 """Characters of a method's name."""
 
-LARGEST_VARIANCE = np.pi**2
-"""rad^2; no direction is less certain."""
-
 Answers = Mapping[str, Mapping[str, Sequence[Answer]]]
 """Answers by estimator and frame."""
-
-
-@dataclass(frozen=True)
-class _Table:
-    """A table as it was read: columns by name, the number of rows, and the file for messages."""
-
-    path: Path
-    numbers: Mapping[str, Array]
-    texts: Mapping[str, list[str]]
-    rows: int
-
-    def refuse(self, row: int, what: str) -> InputError:
-        """Return the error of a row, counted from 1 without the header."""
-        return InputError(f"{shown(self.path)}: row {row + 1}: {what}")
-
-    def first(self, wrong: npt.ArrayLike) -> int | None:
-        """Return the first row of which something is true, shape (rows,); None where it is true of none."""
-        found = np.flatnonzero(wrong)
-        return int(found[0]) if len(found) else None
-
-    def stack(self, names: Sequence[str]) -> Array:
-        """Return columns side by side, shape (rows, len(names))."""
-        return np.stack([self.numbers[name] for name in names], axis=1)
 
 
 def read_answers(path: Path, record: Record, name: str) -> Answers:
@@ -92,7 +56,7 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
         If the table cannot be read, lacks a column, or a row is malformed: the message names it, counted from 1 without
         the header.
     """
-    table = _read(path)
+    table = read_table(path)
     is_answer = _answered(table)
     _check_frames(table, record)
     numbers = _specularities(table, record)
@@ -100,6 +64,7 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     normals = _normals(table, is_answer)
     seconds = _seconds(table, is_answer)
     covariances = _covariances(table, is_answer)
+    _check_ratios(table, is_answer)
     _check_facing(table, record, is_answer, points, normals)
     made: dict[str, dict[str, list[Answer]]] = {}
     seen: dict[tuple[object, ...], int] = {}
@@ -122,86 +87,22 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
 
 def check_name(name: str, what: str) -> None:
     """Raise `InputError` where a method's name cannot stand in results, pages and names of folders."""
-    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name:
-        raise InputError(f"{what} = {shown(name, 40)}: must be 1 to {LONGEST_NAME} printable characters without /")
-
-
-# Reading ------------------------------------------------------------------------------------------------------------
-
-
-def _read(path: Path) -> _Table:
-    """Read a table; numbers that are not given are NaN, texts that are not given empty."""
-    try:
-        require_plain(path)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror}); must be a CSV or Parquet table") from error
-    is_parquet = path.suffix.lower() in (".parquet", ".pq")
-    try:
-        # As text: whether a value is a number is judged below, where the row is known.
-        frame = pl.read_parquet(path, hive_partitioning=False) if is_parquet else pl.read_csv(path, infer_schema=False)
-    except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
-        kind = "Parquet" if is_parquet else "CSV"
-        raise InputError(f"{shown(path)}: no {kind} table ({str(error).splitlines()[0][:120]})") from error
-    _check_columns(path, frame.columns)
-    numbers = {name: np.full(frame.height, np.nan) for name in (*NUMBERS, "specularity")}
-    texts = {name: [""] * frame.height for name in TEXTS}
-    for name in frame.columns:
-        try:
-            if name in texts:
-                texts[name] = frame[name].cast(pl.String).fill_null("").str.strip_chars().to_list()
-            elif name in numbers:
-                numbers[name] = _number_column(path, frame[name])
-        except pl.exceptions.PolarsError as error:
-            kind = "text" if name in texts else "numbers"
-            raise InputError(f"{shown(path)}: column {name} is {frame[name].dtype}; must hold {kind}") from error
-    return _Table(path, numbers, texts, frame.height)
-
-
-def _check_columns(path: Path, columns: Sequence[str]) -> None:
-    """Raise `InputError` for missing columns; warn of those that nobody reads."""
-    needed = ["frame"] if {"status", "reason"} & set(columns) else ["frame", *NORMAL]
-    missing = [name for name in needed if name not in columns]
-    if not missing and not set(PIXEL) <= set(columns) and "specularity" not in columns:
-        missing = [name for name in PIXEL if name not in columns]
-    groups = (NORMAL, SECOND, COVARIANCE, PIXEL)
-    missing += [n for g in groups if set(g) & set(columns) for n in g if n not in columns and n not in missing]
-    if missing:
-        raise InputError(
-            f"{shown(path)}: column {missing[0]} is missing; must have frame, x_px and y_px or specularity, "
-            f"{', '.join(NORMAL)}, and all of a group such as {', '.join(COVARIANCE)} or none"
-        )
-    unknown = [name for name in columns if name not in COLUMNS]
-    if unknown:
-        near = close_names(unknown[0], COLUMNS)
-        meant = f" (is {near[0]} meant?)" if near else ""
-        listed = ", ".join(shown(name, 40) for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
-        warnings.warn(f"{shown(path)}: columns that are not read: {listed}{meant}", stacklevel=5)
-
-
-def _number_column(path: Path, column: pl.Series) -> Array:
-    """Return a column as numbers, NaN where it is empty; raise `InputError` where it holds text, NaN or infinity."""
-    if column.dtype == pl.String:
-        column = column.str.strip_chars()
-        column = column.set(column == "", None)
-    made = column.cast(pl.Float64, strict=False)
-    bad = (made.is_null() & column.is_not_null()) | (made.is_not_null() & ~made.is_finite().fill_null(False))
-    rows = bad.arg_true()
-    if len(rows):
-        row = int(rows[0])
-        raise InputError(
-            f"{shown(path)}: row {row + 1}: {column.name} = {shown(column[row], 40)}: must be a finite number or empty"
-        )
-    return made.fill_null(np.nan).to_numpy().astype(float)
+    if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name or name.strip() in ("", ".", ".."):
+        allowed = f"1 to {LONGEST_NAME} printable characters without /, and neither . nor .."
+        raise InputError(f"{what} = {shown(name, 40)}: must be {allowed}")
 
 
 # Checks of all rows --------------------------------------------------------------------------------------------------
 
 
-def _answered(table: _Table) -> Mask:
+def _answered(table: Table) -> Mask:
     """Return which rows hold a normal: those whose status is empty or ok, shape (rows,)."""
     given = np.isfinite(table.stack(NORMAL))
     status, reason = np.array(table.texts["status"]), np.array(table.texts["reason"])
     ok = (status == "ok") | ((status == "") & ((reason == "") | given.any(axis=1)))
+    is_known = np.isin(status, ["", MISSED, *map(str, Reason)])
+    if (row := table.first(~ok & ~is_known & given.all(axis=1))) is not None:
+        raise table.refuse(row, f"status = {shown(status[row], 40)}: must be ok or empty where a normal is given")
     if (row := table.first(ok & ~given.all(axis=1))) is not None:
         name = NORMAL[int(np.flatnonzero(~given[row])[0])]
         raise table.refuse(row, f"{name} is empty; must be a number, or status must name why there is no normal")
@@ -211,7 +112,7 @@ def _answered(table: _Table) -> Mask:
     return np.asarray(ok)
 
 
-def _check_frames(table: _Table, record: Record) -> None:
+def _check_frames(table: Table, record: Record) -> None:
     """Raise `InputError` for a frame that was not exported; warn where frames have no row."""
     for row, frame in enumerate(table.texts["frame"]):
         if frame not in record.frames:
@@ -223,7 +124,7 @@ def _check_frames(table: _Table, record: Record) -> None:
                       stacklevel=4)  # fmt: skip
 
 
-def _specularities(table: _Table, record: Record) -> list[int | None]:
+def _specularities(table: Table, record: Record) -> list[int | None]:
     """Return the numbers of the detections, None where none is given; raise `InputError` for one that is not there."""
     made: list[int | None] = []
     for row, value in enumerate(table.numbers["specularity"].tolist()):
@@ -238,7 +139,7 @@ def _specularities(table: _Table, record: Record) -> list[int | None]:
     return made
 
 
-def _points(table: _Table, record: Record, numbers: Sequence[int | None]) -> Array:
+def _points(table: Table, record: Record, numbers: Sequence[int | None]) -> Array:
     """Return the pixel of each row, shape (rows, 2): as given, or the peak of the detection."""
     points = table.stack(PIXEL)
     for row in np.flatnonzero(~np.isfinite(points).all(axis=1)).tolist():
@@ -248,16 +149,44 @@ def _points(table: _Table, record: Record, numbers: Sequence[int | None]) -> Arr
                 continue
             raise table.refuse(row, "x_px or y_px is empty; both must be given, or none and specularity")
         points[row] = record.frames[table.texts["frame"][row]].peaks[number]
+    _check_in_frame(table, record, points)
+    _check_at_detections(table, record, numbers, points)
     return points
 
 
-def _normals(table: _Table, is_answer: Mask) -> Array:
+def _check_in_frame(table: Table, record: Record, points: Array) -> None:
+    """Raise `InputError` for a pixel outside its frame."""
+    for name, rows in _rows_by([record.frames[frame].camera for frame in table.texts["frame"]]):
+        camera = _camera(record, name)
+        size = np.array([camera.width, camera.height])
+        outside = np.zeros(table.rows, dtype=bool)
+        # A row without a pixel is none outside.
+        outside[rows] = ((points[rows] < -NEAR_PX) | (points[rows] > size + NEAR_PX)).any(axis=1)
+        if (row := table.first(outside)) is not None:
+            x, y = points[row]
+            within = f"the frame of {camera.width} x {camera.height} px"
+            raise table.refuse(row, f"x_px = {x:g}, y_px = {y:g}: must lie in {within}")
+
+
+def _check_at_detections(table: Table, record: Record, numbers: Sequence[int | None], points: Array) -> None:
+    """Raise `InputError` for a pixel that is farther from the detection which its row names than the box is wide."""
+    for row, (number, point) in enumerate(zip(numbers, points.tolist(), strict=True)):
+        if number is None:
+            continue
+        *corner, width, height = record.frames[table.texts["frame"][row]].boxes[number]
+        gaps = [max(low - at, at - low - size) for low, at, size in zip(corner, point, (width, height), strict=True)]
+        if max(gaps) > max(width, height):
+            where = f"detection {number}, whose box is {width} x {height} px at ({corner[0]}, {corner[1]})"
+            raise table.refuse(row, f"x_px = {point[0]:g}, y_px = {point[1]:g}: must lie at {where} (highlights.csv)")
+
+
+def _normals(table: Table, is_answer: Mask) -> Array:
     """Return the unit normals, shape (rows, 3); raise `InputError` where a length is not 1."""
     normals = table.stack(NORMAL)
     return _unit(table, normals, is_answer, "normal")
 
 
-def _seconds(table: _Table, is_answer: Mask) -> Array:
+def _seconds(table: Table, is_answer: Mask) -> Array:
     """Return the second candidates, shape (rows, 3), NaN where there is none."""
     seconds = table.stack(SECOND)
     given = np.isfinite(seconds)
@@ -266,7 +195,7 @@ def _seconds(table: _Table, is_answer: Mask) -> Array:
     return _unit(table, seconds, is_answer & given.all(axis=1), "second")
 
 
-def _unit(table: _Table, vectors: Array, wanted: Mask, what: str) -> Array:
+def _unit(table: Table, vectors: Array, wanted: Mask, what: str) -> Array:
     lengths = np.sqrt((vectors**2).sum(axis=1))
     if (row := table.first(wanted & ~(np.abs(lengths - 1) <= UNIT_TOLERANCE))) is not None:
         raise table.refuse(row, f"{what} has length {lengths[row]:.6g}; must be a unit vector")
@@ -276,7 +205,7 @@ def _unit(table: _Table, vectors: Array, wanted: Mask, what: str) -> Array:
     return vectors
 
 
-def _covariances(table: _Table, is_answer: Mask) -> Array:
+def _covariances(table: Table, is_answer: Mask) -> Array:
     """Return cov_11, cov_12 and cov_22, shape (rows, 3), NaN where there is none."""
     made = table.stack(COVARIANCE)
     given = np.isfinite(made)
@@ -292,6 +221,9 @@ def _covariances(table: _Table, is_answer: Mask) -> Array:
     if (row := table.first(is_answer & (np.abs(mixed) > largest * (1 + 1e-6) + 1e-15))) is not None:
         bound = f"at most sqrt(cov_11 cov_22) = {largest[row]:g} in size"
         raise table.refuse(row, f"cov_12 = {mixed[row]:g}: must be {bound}")
+    singular = [row and is_singular(*stated) for row, stated in zip(is_answer.tolist(), made.tolist(), strict=True)]
+    if (row := table.first(singular)) is not None:
+        raise table.refuse(row, f"{', '.join(COVARIANCE)}: singular; must have a variance in each direction")
     other = table.numbers["cov_21"]
     if (row := table.first(is_answer & (np.abs(other - mixed) > 1e-6 * largest + 1e-15))) is not None:
         raise table.refuse(
@@ -300,7 +232,14 @@ def _covariances(table: _Table, is_answer: Mask) -> Array:
     return made
 
 
-def _check_facing(table: _Table, record: Record, is_answer: Mask, points: Array, normals: Array) -> None:
+def _check_ratios(table: Table, is_answer: Mask) -> None:
+    """Raise `InputError` for an axis ratio that is none."""
+    ratio = table.numbers["axis_ratio"]
+    if (row := table.first(is_answer & ((ratio <= 0) | (ratio > 1)))) is not None:
+        raise table.refuse(row, f"axis_ratio = {ratio[row]:g}: must be in (0, 1]")
+
+
+def _check_facing(table: Table, record: Record, is_answer: Mask, points: Array, normals: Array) -> None:
     """Raise `InputError` for a normal that faces away from the camera at its pixel."""
     cameras = [record.frames[frame].camera for frame in table.texts["frame"]]
     for name, rows in _rows_by(cameras):
@@ -330,7 +269,7 @@ def _camera(record: Record, name: str) -> Camera:
 # Answers -------------------------------------------------------------------------------------------------------------
 
 
-def _estimate(table: _Table, row: int, point: Array, normal: Array, second: Array, covariance: Array) -> Estimate:
+def _estimate(table: Table, row: int, point: Array, normal: Array, second: Array, covariance: Array) -> Estimate:
     """Return the estimate of a row."""
     candidates = np.stack([normal, second]) if np.isfinite(second).all() else normal[None]
     stated = None
@@ -349,16 +288,16 @@ def _estimate(table: _Table, row: int, point: Array, normal: Array, second: Arra
     )
 
 
-def _optional(table: _Table, name: str, row: int) -> float | None:
+def _optional(table: Table, name: str, row: int) -> float | None:
     value = float(table.numbers[name][row])
     return value if np.isfinite(value) else None
 
 
-def _flags(table: _Table, row: int) -> tuple[str, ...]:
+def _flags(table: Table, row: int) -> tuple[str, ...]:
     return tuple(flag for part in table.texts["flags"][row].split(",") if (flag := part.strip()))
 
 
-def _failure(table: _Table, row: int) -> Failure:
+def _failure(table: Table, row: int) -> Failure:
     """Return the refusal of a row: with the reason that it names, or as text."""
     status = table.texts["status"][row]
     detail = table.texts["reason"][row] or table.texts["flags"][row]

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from simtest.dataset.plan import Plan
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.reconstruction.pipeline import Specularity, reconstruct
@@ -97,14 +96,18 @@ class CaseViews:
 
 @dataclass(frozen=True)
 class ShardViews:
-    """The frames of one shard of a dataset; `variant` is Mitsuba's."""
+    """The frames of one shard of a dataset, of which there are `count`; `variant` is Mitsuba's.
+
+    The dataset's own estimators are not needed, and may not even be installed.
+    """
 
     dataset: Dataset
     key: int
+    count: int
     variant: str
 
     def __len__(self) -> int:
-        return len(Plan(self.dataset).shards[self.key].indices)
+        return self.count
 
     def __iter__(self) -> Iterator[Shown]:
         maker = maker_of(self.dataset.model_dump_json(), self.variant)

@@ -10,7 +10,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.process.core import MAX_ISOPHOTES, Hello
 from simtest.estimators.process.wire import Message, excerpt
-from simtest.estimators.protocol import Estimate, EstimatedCurvature, Target
+from simtest.estimators.protocol import LARGEST_VARIANCE, NEAR_PX, Estimate, EstimatedCurvature, Target
 from simtest.geometry import Array, Camera
 from simtest.geometry.vectors import basis_across
 
@@ -62,11 +62,12 @@ def estimates_of(answer: Message, camera: Camera, hello: Hello) -> list[Estimate
 def _listed(answer: Message) -> list[dict[str, Any]]:
     """Return the fields of each estimate: those of the list, and an element of each array."""
     lengths = {len(array) if array.ndim else -1 for array in answer.arrays.values()}
-    listed = answer.header.get("estimates", [{}] * max(lengths, default=0))
+    count = max(lengths, default=0)
+    listed = answer.header.get("estimates", [{}] * min(count, MAX_ESTIMATES))
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
         raise _Refused(Reason.ESTIMATOR_ERROR, f"estimates: {_told(listed)}; must be a list of objects")
-    if len(listed) > MAX_ESTIMATES:
-        raise _Refused(Reason.ESTIMATOR_ERROR, f"{len(listed)} estimates of a frame; at most {MAX_ESTIMATES}")
+    if (most := max(count, len(listed))) > MAX_ESTIMATES:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{most} estimates of a frame; at most {MAX_ESTIMATES}")
     if lengths - {len(listed)}:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"arrays of lengths {sorted(lengths)} for {len(listed)} estimates")
     return [each | {name: array[i] for name, array in answer.arrays.items()} for i, each in enumerate(listed)]
@@ -103,7 +104,7 @@ def _estimate(fields: Mapping[str, Any], camera: Camera, target: Target) -> Esti
         normal,
         candidates,
         _look(fields, camera),
-        axis_ratio=_number(fields, "axis_ratio"),
+        axis_ratio=_ratio(fields, "axis_ratio"),
         isophotes=_isophotes(fields.get("isophotes")),
         choice_margin=_number(fields, "choice_margin"),
         flags=_flags(fields.get("flags")),
@@ -116,12 +117,22 @@ def _estimate(fields: Mapping[str, Any], camera: Camera, target: Target) -> Esti
 def _look(fields: Mapping[str, Any], camera: Camera) -> Array:
     """Return the pixel at which an estimate is stated."""
     if fields.get("look_px") is not None:
-        return _numbers(fields, "look_px", (2,))
+        return _in_frame(_numbers(fields, "look_px", (2,)), camera)
     if fields.get("look_ray") is None:
         raise _Refused(Reason.ESTIMATOR_ERROR, "look_px or look_ray: missing; an estimate must say where it looks")
     look = camera.project(_numbers(fields, "look_ray", (3,)))
     if not np.isfinite(look).all():
         raise _Refused(Reason.ESTIMATOR_ERROR, "look_ray: the camera images no such direction")
+    return _in_frame(look, camera)
+
+
+def _in_frame(look: Array, camera: Camera) -> Array:
+    """Return a pixel that lies in the frame, or next to it; raise `_Refused` for another."""
+    (x, y), (width, height) = look.tolist(), (camera.width, camera.height)
+    if not (-NEAR_PX <= x <= width + NEAR_PX and -NEAR_PX <= y <= height + NEAR_PX):
+        raise _Refused(
+            Reason.ESTIMATOR_ERROR, f"looks at the pixel ({x:g}, {y:g}); must lie in the frame of {width} x {height} px"
+        )
     return look
 
 
@@ -157,7 +168,10 @@ def _covariance(fields: Mapping[str, Any], name: str, turn: Array) -> Array:
     size = float(np.abs(given).max())
     if abs(given[0, 1] - given[1, 0]) > ROUNDED * size or np.linalg.eigvalsh(given).min() < -ROUNDED * size:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: must be symmetric and have no negative eigenvalue")
-    return np.asarray(turn @ given @ turn.T)
+    if size > LARGEST_VARIANCE:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: holds {size:g}; must be at most {LARGEST_VARIANCE:.4g} rad^2")
+    # Few digits may leave it not quite symmetric.
+    return np.asarray(turn @ ((given + given.T) / 2) @ turn.T)
 
 
 def _isophotes(given: object) -> tuple[FittedIsophote, ...]:
@@ -185,9 +199,8 @@ def _curvature(given: object) -> EstimatedCurvature | None:
     if not isinstance(given, Mapping):
         raise _Refused(Reason.ESTIMATOR_ERROR, f"curvature: {_told(given)}; must be an object")
     directions = np.array([_unit(each, "direction") for each in _numbers(given, "directions", (2, 3))])
-    ratio = _number(given, "axis_ratio")
-    if ratio is None or not 0 < ratio <= 1:
-        raise _Refused(Reason.ESTIMATOR_ERROR, f"curvature axis_ratio: {_told(ratio)}; must be in (0, 1]")
+    if (ratio := _ratio(given, "axis_ratio")) is None:
+        raise _Refused(Reason.ESTIMATOR_ERROR, "curvature axis_ratio: missing")
     hypotheses = None if given.get("hypotheses") is None else _numbers(given, "hypotheses", (None, 2))
     if hypotheses is not None and not 1 <= len(hypotheses) <= MAX_CANDIDATES:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"curvature hypotheses: must be 1 to {MAX_CANDIDATES} pairs")
@@ -218,6 +231,13 @@ def _number(fields: Mapping[str, Any], name: str) -> float | None:
     return None if fields.get(name) is None else float(_numbers(fields, name, ()))
 
 
+def _ratio(fields: Mapping[str, Any], name: str) -> float | None:
+    ratio = _number(fields, name)
+    if ratio is not None and not 0 < ratio <= 1:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: {ratio:g}; must be in (0, 1]")
+    return ratio
+
+
 def _numbers(fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Array:
     """Return a field as an array of this shape, None standing for any length; raise `_Refused` if it is another."""
     given = fields.get(name)
@@ -228,6 +248,8 @@ def _numbers(fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...]
         values = given if isinstance(given, np.ndarray | np.generic) else np.array(_only_numbers(given), dtype=float)
     except (TypeError, ValueError, OverflowError, RecursionError):
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: {_told(given)}; must be {wanted}") from None
+    if values.dtype.kind == "b":
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: holds true or false; must be {wanted}")
     fits = len(values.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
     if not fits:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: {_told(given)}; must be {wanted}")

@@ -127,7 +127,8 @@ class Child:
         _, stdout, _ = self._pipes
         with contextlib.suppress(BlockingIOError):
             data = os.read(stdout, CHUNK_BYTES)
-            raise broken(f"an answer that nobody asked for: {excerpt(data)}") if data else self._ended()
+            told = excerpt(data) or "an empty line"
+            raise broken(f"an answer that nobody asked for: {told}") if data else self._ended()
 
     def exchange(self, parts: Sequence[memoryview], limit_s: float) -> Message:
         """Write a request and read its answer, the two at once, so that neither side can block the other.
@@ -162,13 +163,13 @@ class Child:
             if stdout in ready:
                 data = self._read(stdout)
                 if answer is not None:
-                    raise broken(f"more than one answer to a request: {excerpt(data)}")
+                    raise broken(f"more than one answer to a request: {excerpt(data) or 'an empty line'}")
                 answer = reader.feed(data)
             elif now - looked > LOOK_S:
                 # Its own children may hold the pipes open, so the end of the process may not show there.
                 looked = now
                 # ... and it may have answered just before its end.
-                if self.has_ended() and not select.select([stdout], [], [], 0)[0]:
+                if self.has_ended() and not _is_readable(stdout):
                     raise self._ended()
         return answer
 
@@ -253,11 +254,18 @@ class Child:
     def said(self) -> str:
         """Return the last of what the core wrote to standard error, as the end of a sentence."""
         for _ in range(16):
-            if not self._stderr_open or not select.select([self._pipes[2]], [], [], 0)[0]:
+            if not self._stderr_open or not _is_readable(self._pipes[2]):
                 break
             self._drain()
         text = self._stderr.replace(self.folder.encode(), b".")[-SHOWN_STDERR:]
         return f"; its last words: {excerpt(text, SHOWN_STDERR)}" if text.strip() else ""
+
+
+def _is_readable(pipe: int) -> bool:
+    """Return whether a pipe holds something or has closed; unlike `select`, poll takes descriptors above 1023."""
+    poll = select.poll()
+    poll.register(pipe, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def _discard(pipes: Sequence[int], wait_s: float) -> None:

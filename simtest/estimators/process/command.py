@@ -40,6 +40,7 @@ class CoreTable(Spec):
     start_limit_s: float = Field(START_LIMIT_S, ge=0.01, le=3600, description="from the start to the greeting, s")
     environment: tuple[str, ...] = Field((), description="names of further environment variables that it sees")
     kind: Literal["patch", "frame"] | None = Field(None, description="what its greeting must say that it takes")
+    files: tuple[str, ...] = Field((), max_length=1000, description="further files it reads: modules, weights")
 
 
 class CoreFile(Spec):
@@ -61,7 +62,7 @@ class CoreCommand:
     arguments : tuple of str
         Program and arguments; those that name files are absolute.
     files : tuple of Path
-        The program and the files that arguments name, and the TOML file, if any.
+        The program and the files that arguments name, and those of the TOML file and itself, if any.
     time_limit_s, start_limit_s : float
         For a request, and for the start.
     environment : tuple of str
@@ -82,8 +83,11 @@ class CoreCommand:
     @property
     def absolute(self) -> str:
         """The same core under a name that means the same in every folder."""
-        toml = [file for file in self.files if self.text.endswith(".toml") and file.suffix == ".toml"]
-        return str(toml[-1]) if toml else f"{PREFIX} {shlex.join(self.arguments)}"
+        if not self.text.startswith(PREFIX):
+            return str(self.files[-1])
+        # A program that is found on PATH stays one, since the core's name depends on it.
+        program = shlex.split(self.text.removeprefix(PREFIX))[0]
+        return f"{PREFIX} {shlex.join((program if '/' not in program else self.arguments[0], *self.arguments[1:]))}"
 
     def hashes(self) -> dict[str, str]:
         """Return the SHA-256 of each of the files, by path."""
@@ -119,11 +123,21 @@ def parse_core(text: str) -> CoreCommand:
         return CoreCommand(text, name, arguments, files)
     path = Path(text)
     table = validate(CoreFile, read_toml(path), str(path)).core
-    arguments, files, _ = _resolved(f"{shown(text)}: core.command", table.command, path.absolute().parent)
+    folder = path.absolute().parent
+    arguments, files, _ = _resolved(f"{shown(text)}: core.command", table.command, folder)
+    further = tuple(_further(text, folder, name) for name in table.files)
     return CoreCommand(
-        text, table.name, arguments, (*files, path.absolute()), table.time_limit_s, table.start_limit_s,
-        table.environment, table.kind,
+        text, table.name, arguments, (*dict.fromkeys((*files, *further)), path.absolute()), table.time_limit_s,
+        table.start_limit_s, table.environment, table.kind,
     )  # fmt: skip
+
+
+def _further(text: str, folder: Path, name: str) -> Path:
+    """Return the absolute path of a file that a TOML file lists; raise `InputError` where it is none."""
+    file = Path(os.path.normpath(folder / name))
+    if not _exists(file) or not file.is_file():
+        raise InputError(f"{shown(text)}: core.files: {shown(name)} is no file in {shown(folder)}; must be a file")
+    return file
 
 
 def _resolved(text: str, command: str, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...], str]:

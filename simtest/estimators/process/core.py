@@ -97,6 +97,10 @@ def _levels(given: object, kind: str) -> tuple[float, ...]:
     if not good or len(listed) > MAX_ISOPHOTES or (listed and kind == "frame"):
         allowed = "none, since a frame has no peak" if kind == "frame" else f"at most {MAX_ISOPHOTES} numbers in (0, 1)"
         raise broken(f"hello: isophotes {_told(given)}; must be {allowed}")
+    if len({outline_names(level) for level in listed}) < len(set(listed)):
+        raise broken(
+            f"hello: isophotes {_told(given)}; must differ in their first six digits, by which arrays are named"
+        )
     return tuple(float(t) for t in listed)
 
 
@@ -136,6 +140,7 @@ class Core:
         self._child: Child | None = None
         self._faults = 0
         self._last: CoreFault | None = None
+        self.is_closed = False
         self._numbers = itertools.count(1)
         self._lock = threading.RLock()
 
@@ -162,7 +167,7 @@ class Core:
             except BaseException:
                 self._end()
                 raise
-            self.hello = hello
+            self.hello, self.is_closed = hello, False
             _started.add(self)
             return hello
 
@@ -190,6 +195,11 @@ class Core:
             self._faults = 0
             return answer
 
+    def forgive(self) -> None:
+        """Count the faults from 0 again."""
+        with self._lock:
+            self._faults, self._last = 0, None
+
     def record(self) -> dict[str, object]:
         """Return what a run's record says of the core."""
         hello = self.start() if self.hello is None else self.hello
@@ -200,9 +210,10 @@ class Core:
         }  # fmt: skip
 
     def close(self) -> None:
-        """End the core; the next request starts it again."""
+        """End the core; the next request starts it again, whatever its faults were."""
         with self._lock:
             child, self._child = self._child, None
+            self._faults, self._last, self.is_closed = 0, None, True
             if child is not None:
                 child.close()
 
@@ -253,6 +264,9 @@ _kept: dict[str, tuple[tuple[object, ...], Core]] = {}
 def kept_core(text: str) -> Core:
     """Return the core of a name, which was started once at least; the same one, as long as its files are the same.
 
+    One that was closed, as the cores of a run are at its end, greets anew: a module that its script imports may have
+    changed.
+
     Raises
     ------
     InputError
@@ -261,7 +275,7 @@ def kept_core(text: str) -> Core:
     command = parse_core(text)
     signature = (os.getpid(), *command.signature())
     before, core = _kept.pop(text, ((), None))
-    if core is None or before != signature:
+    if core is None or before != signature or core.is_closed:
         if core is not None:
             core.close()
         core = Core(command)
@@ -281,3 +295,9 @@ def close_cores() -> None:
     """End all cores of this process; those that are asked again are started again."""
     for core in list(_started):
         core.close()
+
+
+def forgive_cores() -> None:
+    """Count the faults of all cores of this process from 0 again."""
+    for core in list(_started):
+        core.forgive()

@@ -43,6 +43,8 @@ def exchange(
     folder = Path(child.folder) / f"request-{number}"
     try:
         _write(folder, request, arrays)
+    except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise broken(f"changed the folder that it runs in: no folder for a request ({error.strerror})") from None
     except OSError as error:
         raise SimtestError(f"{folder}: cannot be written ({error.strerror or error})") from error
     try:
@@ -51,6 +53,10 @@ def exchange(
         # An answer that fits on the line needs no file.
         if said.header.get("type") != "done":
             return said
+        if said.header.get("id") != number:
+            raise broken(
+                f"a line of type done with id {excerpt(repr(said.header.get('id')).encode(), 60)} to request {number}"
+            )
         told = _read(folder)
         return Message({"id": said.header.get("id"), **told.header}, told.arrays)
     finally:
@@ -106,8 +112,11 @@ def _content(folder: Path, name: str, most: int) -> bytes:
         opened = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise broken(f"{name} cannot be read ({error.strerror})") from None
-    with open(opened, "rb") as file:
+    try:
         found = os.fstat(opened)
         if not stat.S_ISREG(found.st_mode) or found.st_size > most:
             raise broken(f"{name}: must be a plain file of at most {most} bytes")
-        return file.read(most)
+        with open(opened, "rb", closefd=False) as file:
+            return file.read(most)
+    finally:
+        os.close(opened)

@@ -59,6 +59,12 @@ def close_cores() -> None:
         loaded.close_cores()
 
 
+def forgive_cores() -> None:
+    """Count the faults of all cores from 0 again, so that no part of a run depends on those before it."""
+    if loaded := sys.modules.get("simtest.estimators.process.core"):
+        loaded.forgive_cores()
+
+
 def _parsed(name: str) -> "CoreCommand":
     """Return the command of a core; what reads it is imported at need, since few runs name one."""
     from simtest.estimators.process.command import parse_core

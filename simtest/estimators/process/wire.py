@@ -154,7 +154,7 @@ class MessageReader:
             return None
         if len(self._buffer) > self._needed:
             extra = bytes(self._buffer[self._needed : self._needed + 400])
-            raise broken(f"more than one answer to a request: {excerpt(extra)}")
+            raise broken(f"more than one answer to a request: {excerpt(extra) or 'an empty line'}")
         message = Message(self._header, dict(self._cut()))
         self._buffer, self._header = bytearray(), None
         return message

@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -80,6 +81,8 @@ class _Pool:
         process = context.Process(target=_work, args=(there, self._task, threads), daemon=True)
         # Masks are inherited: a Ctrl-C must not break into the child's imports. Here it comes once that is started.
         stops = {signal.SIGINT, signal.SIGTERM}
+        # Where it is not running yet, the start of a process starts it, and that lifts the mask before the process.
+        resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, stops)
         try:
             process.start()
