@@ -27,8 +27,9 @@ RULES = (
     "Median error: the angle between the estimated and the true normal, of the answers. Its 95 % interval resamples "
     f"the frames of each setting; none is given where a setting has fewer than {LEAST_FRAMES} distinct frames.",
     "Answered: of the true highlights that the method had to answer for. Missed ones were not detected; refused ones "
-    "were, and the method gave a reason instead of a normal.",
-    "Best method: the lowest mean error, where a highlight that was missed or refused counts as "
+    "were, and the method gave a reason instead of a normal; failed ones were, and its code or process stopped with an "
+    "error.",
+    "Best method: the lowest mean error, where a highlight without an answer counts as "
     f"{PENALTY_DEG:g}°. A method is tied with it where their mean difference is below {MATTERS_DEG:g}° or "
     f"{100 * MATTERS_SHARE:g} % of the better one's mean error, or where the 95 % interval of that difference on the "
     "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it.",
@@ -161,7 +162,7 @@ def _share(figures: MethodFigures) -> str:
 
 
 def _unanswered(figures: MethodFigures) -> str:
-    parts = ((figures.missed, "missed"), (figures.refused, "refused"))
+    parts = ((figures.missed, "missed"), (figures.refused, "refused"), (figures.failed, "failed"))
     return ", ".join(f"{count} {word}" for count, word in parts if count)
 
 

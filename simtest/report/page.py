@@ -129,7 +129,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
         {
             **sections,
             "run": run, "title": summary.title or run.experiment, "description": summary.description,
-            "realism": summary.realism, "meshes": summary.meshes,
+            "realism": summary.realism, "meshes": summary.meshes, "faults": summary.faults,
             "gallery": [card.result() for card in cards], "still": still.result() if still else "",
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
             "columns": HEADINGS, **_guide(guide_json(run)),

@@ -54,6 +54,14 @@ class RunResults:
         read: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
         return read
 
+    def warn_of_faults(self) -> None:
+        """Warn of each error inside an estimator or a core, with its text and the number of rows that it cost."""
+        from simtest.validation.faults import fault_sentences
+
+        for held in self.summary["experiments"].values():
+            for sentence in fault_sentences(held.get("faults") or ()):
+                warnings.warn(sentence, RuntimeWarning, stacklevel=3)
+
     def __getattr__(self, name: str) -> Any:
         """Return what a `Path` of the page has by a public name: `simtest.validate` returned one in 0.1."""
         # A notebook asks for many names that start with an underscore; a copy asks before there is a page.

@@ -17,6 +17,7 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION
+from simtest.errors import FAULTS
 from simtest.runtime.arrays import Array
 from simtest.validation.paired import (
     Distinct,
@@ -50,7 +51,8 @@ class MethodFigures:
     estimator: str
     n: int  # highlights
     answered: int
-    missed: int  # that no detection found; the others without an answer were refused
+    missed: int  # that no detection found
+    failed: int  # where the method stopped with an error; the others without an answer were refused
     median_deg: float | None  # of the answers, as `interval_deg` and `mean_deg`
     interval_deg: Interval  # 95 % interval of the median
     mean_deg: float | None
@@ -59,7 +61,7 @@ class MethodFigures:
     @property
     def refused(self) -> int:
         """Highlights that were found, and that the method gave a reason for instead of a normal."""
-        return self.n - self.answered - self.missed
+        return self.n - self.answered - self.missed - self.failed
 
     @property
     def errs(self) -> bool:
@@ -167,10 +169,11 @@ def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:
     answers = answered[f"of {name}"].to_numpy()
     mean = float(np.mean(answers)) if len(answers) else None
     missed = int((own[f"status {name}"] == "missed").sum())
+    failed = int(own[f"status {name}"].is_in(list(map(str, FAULTS))).sum())
     penalised = float(np.mean(_penalised(own, name))) if own.height else PENALTY_DEG
     median = float(np.median(answers)) if len(answers) else None
     interval = median_interval(answers, *units(answered))
-    return MethodFigures(name, own.height, len(answers), missed, median, interval, mean, penalised)
+    return MethodFigures(name, own.height, len(answers), missed, failed, median, interval, mean, penalised)
 
 
 def _penalised(wide: pl.DataFrame, name: str) -> Array:
