@@ -99,7 +99,7 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
 
 def guide_json(run: Run) -> dict[str, Any]:
     """Return the content of guide.json: which method to use, and where each breaks."""
-    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators)
+    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators, run.summary.frames)
 
 
 def _guide(content: Mapping[str, Any]) -> dict[str, Any]:

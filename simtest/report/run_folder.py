@@ -193,6 +193,7 @@ class ExperimentSummary(BaseModel):
     description: Text = ""
     meshes: Annotated[tuple[JudgedMesh, ...], BeforeValidator(_listed)] = ()
     realism: Annotated[tuple[SceneRealism, ...], BeforeValidator(_listed)] = ()
+    frames: int | None = None  # of all settings, with or without a highlight
     faults: Annotated[tuple[Fault, ...], BeforeValidator(_listed)] = ()
     estimators: Annotated[dict[str, Text], BeforeValidator(_table)] = {}  # what each does, in one line
     conditions: Annotated[dict[str, dict[str, Any]], BeforeValidator(_table)] = {}  # by setting

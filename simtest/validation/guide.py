@@ -8,6 +8,8 @@ normals, and of other highlights.
 The best method of a situation has the lowest mean error, a highlight without an answer counting `PENALTY_DEG`. A
 method ties with it where the two differ by less than `MATTERS_DEG` or `MATTERS_SHARE`, or where the 95 % interval of
 their mean difference over the same highlights holds 0 (`simtest.validation.paired`).
+A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie: what they
+cannot tell apart is not ranked. `bisector` is not ranked where the light is at the camera: it then has nothing to correct.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,10 @@ import polars as pl
 from simtest.conventions import MOTION
 from simtest.errors import FAULTS
 from simtest.runtime.arrays import Array
+from simtest.runtime.entry_points import OWN
 from simtest.validation.paired import (
+    FRAME,
+    LEAST_FRAMES,
     Distinct,
     distinct_frames,
     is_above_zero,
@@ -28,7 +33,7 @@ from simtest.validation.paired import (
     targets_of,
     units,
 )
-from simtest.validation.situations import Situation, situations_of
+from simtest.validation.situations import Situation, is_co_located, situations_of
 from simtest.validation.statistics import PENALTY_DEG, Interval
 
 BREAK_DEG = 5.0
@@ -90,6 +95,8 @@ class Advice:
     best: str | None  # None where no method answered
     ties: tuple[str, ...]  # other methods that cannot be told from the best, the better first
     by_setting: Mapping[str, MethodFigures]  # of the best method
+    few: bool = False  # whether its frames are too few for an interval
+    unranked: tuple[str, ...] = ()  # methods that so few frames cannot tell from the best
 
     @property
     def broken(self) -> dict[str, MethodFigures]:
@@ -109,6 +116,8 @@ class Guide:
     shared: tuple[str, ...]  # conditions that hold in every situation
     advice: tuple[Advice, ...]
     left_out: tuple[str, ...]  # settings without a true highlight
+    highlights: int = 0  # true ones
+    frames: int = 0  # that show one
 
     @property
     def estimators(self) -> list[str]:
@@ -131,7 +140,9 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
-    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left))
+    seen = true.filter(pl.col("target").fill_null("fine") == "fine") if "target" in true.columns else true
+    counts = (seen.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
+    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left), *counts)
 
 
 def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
@@ -142,25 +153,41 @@ def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
     for target in sorted(set(targets.values()), reverse=True):
         names = [name for name, own in targets.items() if own == target]
         wide = side_by_side(rows, dict.fromkeys(names, target))
-        made.append(_ranked(situation, target, distinct_frames(wide), names))
+        made.append(_ranked(situation, target, distinct_frames(wide), names, is_co_located(rows)))
     return made
 
 
-def _ranked(situation: Situation, target: str, distinct: Distinct, names: Sequence[str]) -> Advice:
+def _ranked(
+    situation: Situation, target: str, distinct: Distinct, names: Sequence[str], at_camera: bool
+) -> Advice:  # fmt: skip
     wide = distinct.wide
     methods = {name: _figures(name, wide) for name in names}
     ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
     if not any(each.answered for each in ranked):
         return Advice(situation, target, wide.height, methods, None, (), {})
-    best = ranked[0].estimator
-    ties = [
-        each.estimator for each in ranked[1:] if each.answered and not _is_worse(each.estimator, best, distinct)
-    ]  # fmt: skip
+    # Without an offset the bisector is the cone's axis under another name.
+    ranked = [each for each in ranked if each.answered and not (at_camera and _is_bisector(each.estimator))] or ranked
+    first = ranked[0]
+    alike = [each for each in ranked[1:] if each.answered and not _is_worse(each.estimator, first.estimator, distinct)]
+    ties = tuple(each.estimator for each in alike if first.breaks or not each.breaks)
+    few, best = _is_few(distinct), first.estimator
     by_setting = {
         str(setting): _figures(best, part)
         for (setting,), part in wide.drop_nulls(f"status {best}").group_by("setting", maintain_order=True)
     }
-    return Advice(situation, target, wide.height, methods, best, tuple(ties), by_setting)
+    return Advice(
+        situation, target, wide.height, methods, best, () if few else ties, by_setting, few, ties if few else ()
+    )
+
+
+def _is_bisector(name: str) -> bool:
+    return name.removeprefix(f"{OWN}:") == "bisector"
+
+
+def _is_few(distinct: Distinct) -> bool:
+    """Whether the frames whose errors have a spread are too few for an interval; without noise one frame suffices."""
+    spread = distinct.wide.filter(~pl.col("setting").is_in(list(distinct.copied)))
+    return 0 < spread.select(FRAME).n_unique() < LEAST_FRAMES
 
 
 def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:

@@ -33,6 +33,7 @@ def run_summary(
         "realism": realism_of(cases),
         "estimators": {**(describe_estimators(experiment.estimators) if estimators is None else estimators)},
         "conditions": {setting: found.to_json() for setting, found in conditions_of(cases).items()},
+        "frames": sum(case.realisations for case in cases),
         "faults": faults_of(results),
         "settings": settings_summary(results),
     }
