@@ -32,8 +32,8 @@ RULES = (
     "Best method: the lowest mean error, where a highlight without an answer counts as "
     f"{PENALTY_DEG:g}°. A method is tied with it where their mean difference is below {MATTERS_DEG:g}° or "
     f"{100 * MATTERS_SHARE:g} % of the better one's mean error, or where the 95 % interval of that difference on the "
-    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it. A method "
-    "that breaks is not tied with one that does not.",
+    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it. A "
+    "method that breaks is not tied with one that does not.",
     f"Fewer than {LEAST_FRAMES} distinct frames are too few to rank by: methods whose difference they leave open are "
     "not called tied.",
     "bisector corrects for a light beside the camera. Where the light is at the camera it is the cone's axis, and is "
@@ -115,7 +115,8 @@ def guide_content(guide: Guide, about: Mapping[str, str], frames: int | None = N
         for row, advice in zip(guide_rows(guide), guide.advice, strict=True)
     ]
     return {
-        "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "seen": seen_sentence(guide, frames), "left_out": guide.left_out,
+        "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "seen": seen_sentence(guide, frames),
+        "left_out": guide.left_out,
         "methods": [vars(row) for row in method_rows(guide, about)], "rules": RULES, "words": WORDS,
     }  # fmt: skip
 
@@ -139,8 +140,8 @@ def _row(advice: Advice) -> GuideRow:
         return GuideRow(*where, None, (), "", "–", f"0 of {advice.n}", "", "no method answered", True, guests)
     best = advice.methods[advice.best]
     return GuideRow(
-        *where, advice.best, advice.ties, _unranked(advice), _error(best), _share(best), _unanswered(best), _breaks(advice),
-        bool(advice.broken), guests,
+        *where, advice.best, advice.ties, _unranked(advice), _error(best), _share(best), _unanswered(best),
+        _breaks(advice), bool(advice.broken), guests,
     )  # fmt: skip
 
 
@@ -189,12 +190,10 @@ def _breaks(advice: Advice) -> str:
     settings = advice.by_setting
     if not advice.broken:
         where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
-        held = (
-            "not in " + ("this highlight" if advice.n == 1 else f"these {advice.n} highlights")
-            if advice.few
-            else "nowhere here"
+        seen = "this highlight" if advice.n == 1 else f"these {advice.n} highlights"
+        nowhere = (
+            f"{f'not in {seen}' if advice.few else 'nowhere here'} (worst: {_mean(settings[advice.worst])}{where})"
         )
-        nowhere = f"{held} (worst: {_mean(settings[advice.worst])}{where})"
         best = advice.methods[advice.best or ""]
         silent_share = 1 - best.answered / best.n
         if silent_share <= NOTABLE_SHARE:

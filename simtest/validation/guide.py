@@ -9,7 +9,8 @@ The best method of a situation has the lowest mean error, a highlight without an
 method ties with it where the two differ by less than `MATTERS_DEG` or `MATTERS_SHARE`, or where the 95 % interval of
 their mean difference over the same highlights holds 0 (`simtest.validation.paired`).
 A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie: what they
-cannot tell apart is not ranked. `bisector` is not ranked where the light is at the camera: it then has nothing to correct.
+cannot tell apart is not ranked. `bisector` is not ranked where the light is at the camera: it then has nothing to
+correct.
 """
 
 from collections.abc import Mapping, Sequence
