@@ -1,7 +1,7 @@
 """The guide to a run's methods in words, for its page, for guide.json and for the terminal."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from simtest.estimators.descriptions import is_own
@@ -147,10 +147,12 @@ def _row(advice: Advice) -> GuideRow:
 
 def _guest(advice: Advice, name: str) -> GuestRow:
     figures = advice.methods[name]
-    why = f"here: {_why(figures)}" if figures.breaks else f"not as a whole (mean {_mean(figures)})"
+    # Worded as if it were the best: where it breaks, or its worst setting.
+    alone = replace(advice, best=name, by_setting=advice.guests.get(name, {}))
+    why = _breaks(alone) if alone.by_setting else "–"
     return GuestRow(
         name, _standing(advice, name), _error(figures) if figures.answered else "–",
-        _share(figures), _unanswered(figures), why, figures.breaks,
+        _share(figures), _unanswered(figures), why, bool(alone.broken),
     )  # fmt: skip
 
 

@@ -14,13 +14,14 @@ correct.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION
 from simtest.errors import FAULTS
+from simtest.estimators.descriptions import is_own
 from simtest.runtime.arrays import Array
 from simtest.runtime.entry_points import OWN
 from simtest.validation.paired import (
@@ -98,6 +99,7 @@ class Advice:
     by_setting: Mapping[str, MethodFigures]  # of the best method
     few: bool = False  # whether its frames are too few for an interval
     unranked: tuple[str, ...] = ()  # methods that so few frames cannot tell from the best
+    guests: Mapping[str, Mapping[str, MethodFigures]] = field(default_factory=dict)  # by setting, of methods elsewhere
 
     @property
     def broken(self) -> dict[str, MethodFigures]:
@@ -163,22 +165,27 @@ def _ranked(
 ) -> Advice:  # fmt: skip
     wide = distinct.wide
     methods = {name: _figures(name, wide) for name in names}
+    guests = {name: _by_setting(name, wide) for name in names if not is_own(name)}
     ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
     if not any(each.answered for each in ranked):
-        return Advice(situation, target, wide.height, methods, None, (), {})
+        return Advice(situation, target, wide.height, methods, None, (), {}, guests=guests)
     # Without an offset the bisector is the cone's axis under another name.
     ranked = [each for each in ranked if each.answered and not (at_camera and _is_bisector(each.estimator))] or ranked
     first = ranked[0]
     alike = [each for each in ranked[1:] if each.answered and not _is_worse(each.estimator, first.estimator, distinct)]
     ties = tuple(each.estimator for each in alike if first.breaks or not each.breaks)
     few, best = _is_few(distinct), first.estimator
-    by_setting = {
-        str(setting): _figures(best, part)
-        for (setting,), part in wide.drop_nulls(f"status {best}").group_by("setting", maintain_order=True)
-    }
     return Advice(
-        situation, target, wide.height, methods, best, () if few else ties, by_setting, few, ties if few else ()
-    )
+        situation, target, wide.height, methods, best, () if few else ties, _by_setting(best, wide), few,
+        ties if few else (), guests,
+    )  # fmt: skip
+
+
+def _by_setting(name: str, wide: pl.DataFrame) -> dict[str, MethodFigures]:
+    return {
+        str(setting): _figures(name, part)
+        for (setting,), part in wide.drop_nulls(f"status {name}").group_by("setting", maintain_order=True)
+    }
 
 
 def _is_bisector(name: str) -> bool:

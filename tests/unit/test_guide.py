@@ -435,6 +435,8 @@ def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_te
     assert (worse.unanswered, worse.is_broken) == ("1 missed, 1 refused", True)
     assert worse.breaks.startswith("here: mean 7")
     assert (tied.estimator, tied.standing, tied.is_broken) == ("mine", "tied", False)
+    # Where it does not break, its worst setting is named, as the best method's is.
+    assert tied.breaks.startswith("nowhere here (worst: 0.")
     # The best one has the situation's own line.
     assert (saddle.best, saddle.guests) == ("mine", ())
     text = printed(run, 80, terminal=False)
@@ -442,6 +444,10 @@ def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_te
     assert "(not best)" in text
     page = (run / "index.html").read_text(encoding="utf-8")
     assert page.count('class="guest"') == 2
+    # A phone shows each line as a card: it names its situation, and no method "best" that is not.
+    begin = '<tr class="guest"><th scope="row" class="text soft">flat</th><td class="text" data-label="method">'
+    assert page.count(begin) == 1
+    assert ">the same<" not in page
 
 
 def test_a_run_without_true_highlights_says_so(tmp_path):
