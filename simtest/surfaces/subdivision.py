@@ -72,8 +72,8 @@ def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
         # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
         fewer = MAX_SUBDIVIDED_FACES // 4 ** (allowed + 1)
         warnings.warn(
-            f"{path}: {wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {allowed}. "
-            f"Decimated to {fewer} faces it would take {allowed + 1} and end finer",
+            f"{path}: {wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {allowed}"
+            f". Decimated to {fewer} faces it would take {allowed + 1} and end finer",
             stacklevel=5,
         )
     if allowed and (bad := int((edge_uses(faces)[1] > 2).sum())) > 0:
