@@ -56,10 +56,12 @@ class RunResults:
 
     def warn_of_faults(self) -> None:
         """Warn of each error inside an estimator or a core, with its text and the number of rows that it cost."""
-        from simtest.validation.faults import fault_sentences
+        faults = [fault for held in self.summary["experiments"].values() for fault in held.get("faults") or ()]
+        if faults:
+            # Loaded where there is one: a finished run that is asked for again should answer at once.
+            from simtest.validation.faults import fault_sentences
 
-        for held in self.summary["experiments"].values():
-            for sentence in fault_sentences(held.get("faults") or ()):
+            for sentence in fault_sentences(faults):
                 warnings.warn(sentence, RuntimeWarning, stacklevel=3)
 
     def __getattr__(self, name: str) -> Any:
