@@ -244,6 +244,11 @@ def validate(
     BackendError
         If the rendering backend cannot be used.
 
+    Warns
+    -----
+    RuntimeWarning
+        Of each error inside an estimator or a core, once, with its text and the number of highlights that it cost.
+
     Examples
     --------
     >>> import simtest, tempfile
@@ -273,7 +278,9 @@ def validate(
             page = write_report(run.folder, progress)
             if export is not None:
                 export_run(run.folder, described, Path(export), chosen, progress)
-            return RunResults(page)
+            made = RunResults(page)
+            made.warn_of_faults()
+            return made
         except OSError as error:
             if disk_problem(error) is None:
                 raise

@@ -104,6 +104,9 @@ _MEANINGS = {
     Reason.CORE_PROTOCOL: "the core wrote what the process protocol does not allow",
 }
 
+FAULTS = (Reason.ESTIMATOR_ERROR, Reason.CORE_DIED, Reason.CORE_TIMEOUT, Reason.CORE_PROTOCOL)
+"""Reasons that tell of a mistake in an estimator or of the end of its process, not of the data."""
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:

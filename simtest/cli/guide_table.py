@@ -59,15 +59,15 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
         part = table(False)
         for row in group:
             tied = f"tied: {', '.join(row['ties'])}" if row["ties"] else ""
-            best = "\n".join(text for text in (row["best"] or "none", tied) if text)
+            best = "\n".join(text for text in (row["best"] or "none", tied, row.get("unranked")) if text)
             part.add_row(*map(escape, (row["surface"], best, *_figures(row))))
             for guest in row.get("guests", ()):
                 own = f"{guest['estimator']}\n({guest['standing']})"
                 part.add_row(*map(escape, ("", own, *_figures(guest))))
         console.print(part)
     print_rest(len(rows) - len(kept), "as the page shows them", console.print)
-    if guide["shared"]:
-        console.print(escape(guide["shared"]))
+    for sentence in filter(None, (guide["shared"], guide.get("seen"))):
+        console.print(escape(sentence))
 
 
 def _figures(row: "dict[str, Any]") -> tuple[str, str, str]:

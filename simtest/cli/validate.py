@@ -25,6 +25,8 @@ from simtest.cli.options import (
 )
 
 DEFAULT_OUT = Path("reports/runs")
+MESHES = (".ply", ".obj", ".stl", ".vtk")
+"""Suffixes of files that may be taken for an experiment by mistake."""
 
 
 def validate(
@@ -62,11 +64,14 @@ def validate(
     from simtest.cli.guide_table import print_guide
     from simtest.cli.printing import print_run
     from simtest.cli.progress import progress_bar
+    from simtest.errors import InputError
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_experiment, parse_settings
     from simtest.validation.mesh_verdicts import mesh_verdicts
 
+    if Path(experiment).suffix.lower() in MESHES:
+        raise InputError(f"{experiment}: is a mesh; use simtest validate mesh --set surface.path={experiment}")
     values = parse_settings(settings or [])
     own = {"realisations": realisations, "seed": seed, "estimators": estimators, "views": views}
     values |= {key: value for key, value in own.items() if value is not None}

@@ -1,6 +1,7 @@
 """What each estimator does, in one line for a reader who chooses one."""
 
 import inspect
+import sys
 from collections.abc import Sequence
 
 from simtest.runtime.entry_points import OWN
@@ -47,8 +48,10 @@ def _described(estimator: object) -> str:
 
 
 def _first_line(estimator: object) -> str:
-    """Return the first line of an estimator's own docstring; of a wrapped function, that function's."""
+    """Return the first line of an estimator's own docstring, of a wrapped function that function's, or the module's."""
     given = getattr(estimator, "function", estimator)
     # An instance without a docstring of its own has its class's; `inspect.getdoc` would go on to object's.
     own = given.__doc__ if inspect.isroutine(given) else type(given).__doc__
+    # Without either, the module's, as `simtest list` prints it.
+    own = own or getattr(sys.modules.get(getattr(given, "__module__", "")), "__doc__", None)
     return (inspect.cleandoc(own).splitlines() or [""])[0] if own else ""

@@ -2,9 +2,11 @@
 
 import contextlib
 import math
+import traceback
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +31,8 @@ LEAST_VARIANCE = 1e-24
 
 LEAST_SHARE = 1e-12
 """Of the largest variance squared: a determinant below it is rounding."""
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,20 @@ def _holds(patch: Patch, point: Array) -> bool:
 
 
 def _estimator_error(error: Exception) -> Failure:
-    return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}")
+    return Failure(Reason.ESTIMATOR_ERROR, f"{type(error).__name__}: {error}{_place(error)}")
+
+
+def _place(error: Exception) -> str:
+    """Return the innermost line of the estimator's own file that the exception came through: `` (my_core.py:11)``.
+
+    What was raised before the estimator's first line, such as a wrong number of arguments, has no place.
+    """
+    # The first entry is the call in this file. Between it and a plain function stands a wrapper of this package.
+    steps = traceback.extract_tb(error.__traceback__)[1:]
+    foreign = [step.filename for step in steps if not Path(step.filename).is_relative_to(_PACKAGE)]
+    file = foreign[0] if foreign else steps[0].filename if steps else None
+    own = [step for step in steps if step.filename == file]
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
 def _checked(result: object, camera: Camera, peak_px: Array | None = None) -> Estimate | Failure:

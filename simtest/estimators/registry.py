@@ -60,6 +60,9 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
     for name in estimators:
+        if "," in name and not is_core(name):
+            each = " ".join(f"--estimator {part.strip()}" for part in name.split(","))
+            raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
         # Raises where the name is not clear.
         short, given = _core(name) if is_core(name) else (name, ESTIMATORS.load(name))
         if short in loaded:

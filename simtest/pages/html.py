@@ -34,6 +34,7 @@ def environment() -> "Environment":
         "number": style.number,
         "breakable": breakable,
         "capitalize_first": capitalize_first,
+        "code_spans": code_spans,
     }
     # The templates' own marks take the palette's colours: these stand out on both grounds.
     made.globals |= {"neutral": palette.NEUTRAL, "accents": palette.ESTIMATOR_COLOURS}
@@ -52,6 +53,18 @@ def write_page(path: Path, template: str, data: Any, **values: Any) -> None:
 def capitalize_first(text: str) -> str:
     """Return a text with a capital at its start, and else as it is."""
     return text[:1].upper() + text[1:]
+
+
+def code_spans(text: str) -> "Markup":
+    """Return a text whose parts between backticks are set as code."""
+    from markupsafe import Markup, escape
+
+    parts = text.split("`")
+    # An odd backtick at the end opens nothing.
+    if len(parts) % 2 == 0:
+        parts[-2:] = ["`".join(parts[-2:])]
+    spans = [Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)]
+    return Markup("").join(spans)
 
 
 def breakable(name: str) -> "Markup":

@@ -58,13 +58,19 @@ def symbols(labels: Iterable[str]) -> dict[str, Symbol]:
     return {label: _SYMBOLS[i % len(_SYMBOLS)] for i, label in enumerate(dict.fromkeys(labels))}
 
 
+ROUNDING = 1e-12
+
+
 def number(value: Any, digits: int = 3) -> str:
     """Write a number with a few significant digits; what is null or not finite becomes a dash."""
     if value is None or isinstance(value, str | bool) or not np.isfinite(value):
         return "–"
     if isinstance(value, int):
         return str(value)
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
+    # Below what double precision resolves of a number near 1 stands rounding, not a figure.
+    if abs(value) < ROUNDING:
+        return "0"
+    if 1e-3 <= abs(value) < 1e4:
         text = f"{value:.{digits}g}"
         return f"{value:.0f}" if "e" in text else text
     return f"{value:.{digits - 1}e}"

@@ -1,7 +1,7 @@
 """The guide to a run's methods in words, for its page, for guide.json and for the terminal."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from simtest.estimators.descriptions import is_own
@@ -27,11 +27,17 @@ RULES = (
     "Median error: the angle between the estimated and the true normal, of the answers. Its 95 % interval resamples "
     f"the frames of each setting; none is given where a setting has fewer than {LEAST_FRAMES} distinct frames.",
     "Answered: of the true highlights that the method had to answer for. Missed ones were not detected; refused ones "
-    "were, and the method gave a reason instead of a normal.",
-    "Best method: the lowest mean error, where a highlight that was missed or refused counts as "
+    "were, and the method gave a reason instead of a normal; failed ones were, and its code or process stopped with an "
+    "error.",
+    "Best method: the lowest mean error, where a highlight without an answer counts as "
     f"{PENALTY_DEG:g}°. A method is tied with it where their mean difference is below {MATTERS_DEG:g}° or "
     f"{100 * MATTERS_SHARE:g} % of the better one's mean error, or where the 95 % interval of that difference on the "
-    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it.",
+    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it. A "
+    "method that breaks is not tied with one that does not.",
+    f"Fewer than {LEAST_FRAMES} distinct frames are too few to rank by: methods whose difference they leave open are "
+    "not called tied.",
+    "bisector corrects for a light beside the camera. Where the light is at the camera it is the cone's axis, and is "
+    "not ranked.",
     "Frames whose errors are the same to the last bit, as without noise, count as one frame.",
     "Methods that state the normal of the base, the surface without its relief, are ranked in rows of their own.",
     f"A method breaks where the mean error of its answers exceeds {BREAK_DEG:g}°, or where it answers fewer than "
@@ -60,6 +66,7 @@ class GuideRow:
     circumstances: str
     best: str | None
     ties: tuple[str, ...]
+    unranked: str  # that the frames are too few to rank by, where they are
     error: str
     answered: str
     unanswered: str  # why, where there are any
@@ -73,7 +80,7 @@ class GuestRow:
     """A line of a situation on a method that is not this package's; texts but for the name."""
 
     estimator: str
-    standing: str  # "tied" or "not best"
+    standing: str  # "tied", "not ranked" or "not best"
     error: str
     answered: str
     unanswered: str
@@ -91,10 +98,10 @@ class MethodRow:
     breaks: str
 
 
-def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Any]:
+def guide_content(guide: Guide, about: Mapping[str, str], frames: int | None = None) -> dict[str, Any]:
     """Return the content of guide.json: the rows in words, and the figures that they are made of.
 
-    `about` describes the methods by name.
+    `about` describes the methods by name; `frames` is the number of the run's frames, where it is known.
     """
     rows = [
         vars(row)
@@ -108,7 +115,8 @@ def guide_content(guide: Guide, about: Mapping[str, str]) -> dict[str, Any]:
         for row, advice in zip(guide_rows(guide), guide.advice, strict=True)
     ]
     return {
-        "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "left_out": guide.left_out,
+        "heads": HEADS, "rows": rows, "shared": shared_sentence(guide), "seen": seen_sentence(guide, frames),
+        "left_out": guide.left_out,
         "methods": [vars(row) for row in method_rows(guide, about)], "rules": RULES, "words": WORDS,
     }  # fmt: skip
 
@@ -129,21 +137,31 @@ def _row(advice: Advice) -> GuideRow:
     where = (_surface(advice), advice.situation.circumstances)
     guests = tuple(_guest(advice, name) for name in advice.methods if not is_own(name) and name != advice.best)
     if advice.best is None:
-        return GuideRow(*where, None, (), "–", f"0 of {advice.n}", "", "no method answered", True, guests)
+        return GuideRow(*where, None, (), "", "–", f"0 of {advice.n}", "", "no method answered", True, guests)
     best = advice.methods[advice.best]
     return GuideRow(
-        *where, advice.best, advice.ties, _error(best), _share(best), _unanswered(best), _breaks(advice),
-        bool(advice.broken), guests,
+        *where, advice.best, advice.ties, _unranked(advice), _error(best), _share(best), _unanswered(best),
+        _breaks(advice), bool(advice.broken), guests,
     )  # fmt: skip
 
 
 def _guest(advice: Advice, name: str) -> GuestRow:
     figures = advice.methods[name]
-    why = f"here: {_why(figures)}" if figures.breaks else f"not as a whole (mean {_mean(figures)})"
+    # Worded as if it were the best: where it breaks, or its worst setting.
+    alone = replace(advice, best=name, by_setting=advice.guests.get(name, {}))
+    why = _breaks(alone) if alone.by_setting else "–"
     return GuestRow(
-        name, "tied" if name in advice.ties else "not best", _error(figures) if figures.answered else "–",
-        _share(figures), _unanswered(figures), why, figures.breaks,
+        name, _standing(advice, name), _error(figures) if figures.answered else "–",
+        _share(figures), _unanswered(figures), why, bool(alone.broken),
     )  # fmt: skip
+
+
+def _standing(advice: Advice, name: str) -> str:
+    return "tied" if name in advice.ties else "not ranked" if name in advice.unranked else "not best"
+
+
+def _unranked(advice: Advice) -> str:
+    return "too few highlights to rank" if advice.unranked else ""
 
 
 def _surface(advice: Advice) -> str:
@@ -161,7 +179,7 @@ def _share(figures: MethodFigures) -> str:
 
 
 def _unanswered(figures: MethodFigures) -> str:
-    parts = ((figures.missed, "missed"), (figures.refused, "refused"))
+    parts = ((figures.missed, "missed"), (figures.refused, "refused"), (figures.failed, "failed"))
     return ", ".join(f"{count} {word}" for count, word in parts if count)
 
 
@@ -174,7 +192,10 @@ def _breaks(advice: Advice) -> str:
     settings = advice.by_setting
     if not advice.broken:
         where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
-        nowhere = f"nowhere here (worst: {_mean(settings[advice.worst])}{where})"
+        seen = "this highlight" if advice.n == 1 else f"these {advice.n} highlights"
+        nowhere = (
+            f"{f'not in {seen}' if advice.few else 'nowhere here'} (worst: {_mean(settings[advice.worst])}{where})"
+        )
         best = advice.methods[advice.best or ""]
         silent_share = 1 - best.answered / best.n
         if silent_share <= NOTABLE_SHARE:
@@ -244,6 +265,18 @@ def _broken(name: str, own: Sequence[Advice]) -> str:
     if len(ranked) == 1:
         return f"1 of {len(own)}: {texts[0]}"
     return f"{len(ranked)} of {len(own)}; least in {texts[0]}, most in {texts[1]}"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def seen_sentence(guide: Guide, frames: int | None) -> str:
+    """Return how many true highlights were seen in how many frames; empty where every frame shows one."""
+    if frames is None or frames <= guide.frames:
+        return ""
+    seen = f"{_counted(guide.highlights, 'true highlight')} in {_counted(frames, 'frame')}"
+    return f"{seen}; {_counted(frames - guide.frames, 'frame')} without one."
 
 
 def shared_sentence(guide: Guide) -> str:

@@ -99,7 +99,7 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
 
 def guide_json(run: Run) -> dict[str, Any]:
     """Return the content of guide.json: which method to use, and where each breaks."""
-    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators)
+    return guide_content(run.guide, DESCRIPTIONS | run.summary.estimators, run.summary.frames)
 
 
 def _guide(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
         {
             **sections,
             "run": run, "title": summary.title or run.experiment, "description": summary.description,
-            "realism": summary.realism, "meshes": summary.meshes,
+            "realism": summary.realism, "meshes": summary.meshes, "faults": summary.faults,
             "gallery": [card.result() for card in cards], "still": still.result() if still else "",
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
             "columns": HEADINGS, **_guide(guide_json(run)),

@@ -17,6 +17,7 @@ from simtest.pages.style import degrees
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.paper import PaperSetting
+from simtest.validation.faults import fault_sentence
 from simtest.validation.guide import Guide, guide_of
 
 MAX_GALLERY = 24  # gallery items that a page shows; of a longer gallery, evenly spaced ones
@@ -173,6 +174,18 @@ class JudgedMesh(BaseModel):
     verdict: Text = ""
 
 
+class Fault(BaseModel):
+    """An error of an estimator or a core, with the number of its rows (`simtest.validation.faults`)."""
+
+    estimator: Text = ""
+    reason: Text = ""
+    text: Text = ""
+    count: int = 1
+
+    def __str__(self) -> str:
+        return fault_sentence(self.estimator, self.reason, self.text, self.count)
+
+
 class ExperimentSummary(BaseModel):
     """An experiment of summary.json: figures by setting and estimator."""
 
@@ -180,6 +193,8 @@ class ExperimentSummary(BaseModel):
     description: Text = ""
     meshes: Annotated[tuple[JudgedMesh, ...], BeforeValidator(_listed)] = ()
     realism: Annotated[tuple[SceneRealism, ...], BeforeValidator(_listed)] = ()
+    frames: int | None = None  # of all settings, with or without a highlight
+    faults: Annotated[tuple[Fault, ...], BeforeValidator(_listed)] = ()
     estimators: Annotated[dict[str, Text], BeforeValidator(_table)] = {}  # what each does, in one line
     conditions: Annotated[dict[str, dict[str, Any]], BeforeValidator(_table)] = {}  # by setting
     settings: dict[str, dict[str, EstimatorFigures | None] | None] | None = None

@@ -54,6 +54,16 @@ class RunResults:
         read: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
         return read
 
+    def warn_of_faults(self) -> None:
+        """Warn of each error inside an estimator or a core, with its text and the number of rows that it cost."""
+        faults = [fault for held in self.summary["experiments"].values() for fault in held.get("faults") or ()]
+        if faults:
+            # Loaded where there is one: a finished run that is asked for again should answer at once.
+            from simtest.validation.faults import fault_sentences
+
+            for sentence in fault_sentences(faults):
+                warnings.warn(sentence, RuntimeWarning, stacklevel=3)
+
     def __getattr__(self, name: str) -> Any:
         """Return what a `Path` of the page has by a public name: `simtest.validate` returned one in 0.1."""
         # A notebook asks for many names that start with an underscore; a copy asks before there is a page.

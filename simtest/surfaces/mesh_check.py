@@ -17,6 +17,12 @@ from simtest.surfaces.model import principal_curvatures
 from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, examine
 from simtest.surfaces.subdivision import shape_operators
 
+TUBE_RIMS = 2
+"""A mesh with as many wide rims may be a tube that is cut open at both ends; ..."""
+
+WIDE_RIM = 0.5
+"""... a rim that extends over this share of the mesh's smallest extent is wide. A hole of a scan is not."""
+
 FINE_SHARE = 0.95
 """A mesh is fine enough if this share of its surface is."""
 
@@ -51,6 +57,10 @@ class Verdict:
         Share of the surface that is fine enough as it is.
     other_unit : str
         Guess at another unit than mm, or empty.
+    rims : int
+        Wide rims: rows of open edges.
+    guessed : bool
+        Whether the side is a guess by the shape.
     """
 
     file: str
@@ -69,11 +79,28 @@ class Verdict:
     needed_edge_mm: float | None
     fine_share: float | None
     other_unit: str
+    rims: int = 0
+    guessed: bool = False
 
     @property
     def fine(self) -> bool:
         """Whether the mesh is fine enough as it is."""
         return self.fine_share is not None and self.fine_share >= FINE_SHARE
+
+    @property
+    def side(self) -> str:
+        """What the mesh is taken for, and where the camera is."""
+        return "a lumen, camera inside" if self.lumen else "an organ, camera outside"
+
+    @property
+    def doubt(self) -> str:
+        """Why the mesh may be the inside of a tube though it is taken for an organ by its shape; empty where not.
+
+        A tube that is cut open at both ends has two rims or more. A stated kind is not doubted.
+        """
+        if self.lumen or not self.guessed or self.rims < TUBE_RIMS:
+            return ""
+        return f"open at {self.rims} rims, as a tube is: if it is seen from inside, its kind is lumen"
 
     @property
     def problems(self) -> list[str]:
@@ -107,7 +134,9 @@ class Verdict:
         found, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
         yield f"file        {self.file}"
         yield f"size        {self.vertices} vertices, {self.faces} faces, {size} mm"
-        yield f"taken for   {'a lumen, camera inside' if self.lumen else 'an organ, camera outside'}"
+        yield f"taken for   {self.side}"
+        if self.doubt:
+            yield f"doubt       {self.doubt}"
         yield f"pieces      {found.pieces}"
         if found.watertight:
             yield "surface     watertight"
@@ -194,7 +223,28 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
         needed_edge_mm=needed,
         fine_share=share,
         other_unit=other_unit(float(extents.max())),
+        rims=_wide_rims(vertices, faces),
+        guessed=kind == "auto",
     )
+
+
+def _wide_rims(vertices: Array, faces: IntArray) -> int:
+    """Count the connected rows of open edges that are wide beside the mesh."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges, uses = edge_uses(faces)
+    if not (uses == 1).any():
+        return 0
+    start, end = edges[uses == 1].T
+    on_rim, joined = np.unique([start, end], return_inverse=True)
+    first, second = joined.reshape(2, -1)
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(len(on_rim), len(on_rim)))
+    count, rim = connected_components(links, directed=False)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, rim, vertices[on_rim])
+    np.maximum.at(high, rim, vertices[on_rim])
+    return int(((high - low).max(axis=1) > WIDE_RIM * np.ptp(vertices, axis=0).min()).sum())
 
 
 def _fine_share(wanted: Array, vertices: Array, faces: IntArray) -> float:

@@ -8,17 +8,25 @@ normals, and of other highlights.
 The best method of a situation has the lowest mean error, a highlight without an answer counting `PENALTY_DEG`. A
 method ties with it where the two differ by less than `MATTERS_DEG` or `MATTERS_SHARE`, or where the 95 % interval of
 their mean difference over the same highlights holds 0 (`simtest.validation.paired`).
+A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie: what they
+cannot tell apart is not ranked. `bisector` is not ranked where the light is at the camera: it then has nothing to
+correct.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION
+from simtest.errors import FAULTS
+from simtest.estimators.descriptions import is_own
 from simtest.runtime.arrays import Array
+from simtest.runtime.entry_points import OWN
 from simtest.validation.paired import (
+    FRAME,
+    LEAST_FRAMES,
     Distinct,
     distinct_frames,
     is_above_zero,
@@ -27,7 +35,7 @@ from simtest.validation.paired import (
     targets_of,
     units,
 )
-from simtest.validation.situations import Situation, situations_of
+from simtest.validation.situations import Situation, is_co_located, situations_of
 from simtest.validation.statistics import PENALTY_DEG, Interval
 
 BREAK_DEG = 5.0
@@ -50,7 +58,8 @@ class MethodFigures:
     estimator: str
     n: int  # highlights
     answered: int
-    missed: int  # that no detection found; the others without an answer were refused
+    missed: int  # that no detection found
+    failed: int  # where the method stopped with an error; the others without an answer were refused
     median_deg: float | None  # of the answers, as `interval_deg` and `mean_deg`
     interval_deg: Interval  # 95 % interval of the median
     mean_deg: float | None
@@ -59,7 +68,7 @@ class MethodFigures:
     @property
     def refused(self) -> int:
         """Highlights that were found, and that the method gave a reason for instead of a normal."""
-        return self.n - self.answered - self.missed
+        return self.n - self.answered - self.missed - self.failed
 
     @property
     def errs(self) -> bool:
@@ -88,6 +97,9 @@ class Advice:
     best: str | None  # None where no method answered
     ties: tuple[str, ...]  # other methods that cannot be told from the best, the better first
     by_setting: Mapping[str, MethodFigures]  # of the best method
+    few: bool = False  # whether its frames are too few for an interval
+    unranked: tuple[str, ...] = ()  # methods that so few frames cannot tell from the best
+    guests: Mapping[str, Mapping[str, MethodFigures]] = field(default_factory=dict)  # by setting, of methods elsewhere
 
     @property
     def broken(self) -> dict[str, MethodFigures]:
@@ -107,6 +119,8 @@ class Guide:
     shared: tuple[str, ...]  # conditions that hold in every situation
     advice: tuple[Advice, ...]
     left_out: tuple[str, ...]  # settings without a true highlight
+    highlights: int = 0  # true ones
+    frames: int = 0  # that show one
 
     @property
     def estimators(self) -> list[str]:
@@ -129,7 +143,9 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
-    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left))
+    seen = true.filter(pl.col("target").fill_null("fine") == "fine") if "target" in true.columns else true
+    counts = (seen.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
+    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left), *counts)
 
 
 def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
@@ -140,25 +156,46 @@ def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
     for target in sorted(set(targets.values()), reverse=True):
         names = [name for name, own in targets.items() if own == target]
         wide = side_by_side(rows, dict.fromkeys(names, target))
-        made.append(_ranked(situation, target, distinct_frames(wide), names))
+        made.append(_ranked(situation, target, distinct_frames(wide), names, is_co_located(rows)))
     return made
 
 
-def _ranked(situation: Situation, target: str, distinct: Distinct, names: Sequence[str]) -> Advice:
+def _ranked(
+    situation: Situation, target: str, distinct: Distinct, names: Sequence[str], at_camera: bool
+) -> Advice:  # fmt: skip
     wide = distinct.wide
     methods = {name: _figures(name, wide) for name in names}
+    guests = {name: _by_setting(name, wide) for name in names if not is_own(name)}
     ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
     if not any(each.answered for each in ranked):
-        return Advice(situation, target, wide.height, methods, None, (), {})
-    best = ranked[0].estimator
-    ties = [
-        each.estimator for each in ranked[1:] if each.answered and not _is_worse(each.estimator, best, distinct)
-    ]  # fmt: skip
-    by_setting = {
-        str(setting): _figures(best, part)
-        for (setting,), part in wide.drop_nulls(f"status {best}").group_by("setting", maintain_order=True)
+        return Advice(situation, target, wide.height, methods, None, (), {}, guests=guests)
+    # Without an offset the bisector is the cone's axis under another name.
+    ranked = [each for each in ranked if each.answered and not (at_camera and _is_bisector(each.estimator))] or ranked
+    first = ranked[0]
+    alike = [each for each in ranked[1:] if each.answered and not _is_worse(each.estimator, first.estimator, distinct)]
+    ties = tuple(each.estimator for each in alike if first.breaks or not each.breaks)
+    few, best = _is_few(distinct), first.estimator
+    return Advice(
+        situation, target, wide.height, methods, best, () if few else ties, _by_setting(best, wide), few,
+        ties if few else (), guests,
+    )  # fmt: skip
+
+
+def _by_setting(name: str, wide: pl.DataFrame) -> dict[str, MethodFigures]:
+    return {
+        str(setting): _figures(name, part)
+        for (setting,), part in wide.drop_nulls(f"status {name}").group_by("setting", maintain_order=True)
     }
-    return Advice(situation, target, wide.height, methods, best, tuple(ties), by_setting)
+
+
+def _is_bisector(name: str) -> bool:
+    return name.removeprefix(f"{OWN}:") == "bisector"
+
+
+def _is_few(distinct: Distinct) -> bool:
+    """Whether the frames whose errors have a spread are too few for an interval; without noise one frame suffices."""
+    spread = distinct.wide.filter(~pl.col("setting").is_in(list(distinct.copied)))
+    return 0 < spread.select(FRAME).n_unique() < LEAST_FRAMES
 
 
 def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:
@@ -167,10 +204,11 @@ def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:
     answers = answered[f"of {name}"].to_numpy()
     mean = float(np.mean(answers)) if len(answers) else None
     missed = int((own[f"status {name}"] == "missed").sum())
+    failed = int(own[f"status {name}"].is_in(list(map(str, FAULTS))).sum())
     penalised = float(np.mean(_penalised(own, name))) if own.height else PENALTY_DEG
     median = float(np.median(answers)) if len(answers) else None
     interval = median_interval(answers, *units(answered))
-    return MethodFigures(name, own.height, len(answers), missed, median, interval, mean, penalised)
+    return MethodFigures(name, own.height, len(answers), missed, failed, median, interval, mean, penalised)
 
 
 def _penalised(wide: pl.DataFrame, name: str) -> Array:

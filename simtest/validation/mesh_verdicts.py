@@ -86,14 +86,17 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     elif needed is None:
         text = "too large to be judged"
     elif surface.edge_mm is None:
-        text = f"too coarse: edges of {needed:.2g} mm are needed (surface.edge_mm)"
+        text = f"too coarse: edges of {needed:.2g} mm are needed at {DISTANCE_MM:g} mm (surface.edge_mm)"
     else:
         reached = _refined_edge(found, needed if surface.edge_mm == "auto" else surface.edge_mm)
-        fine = reached <= needed
+        fine, at = reached <= needed, f" at {DISTANCE_MM:g} mm"
         text = f"refined to edges of {reached:.2g} mm by surface.edge_mm = {surface.edge_mm}"
-        text += f", at most {needed:.2g} mm are needed" if fine else f": too coarse, {needed:.2g} mm are needed"
-    text += "".join(f"; {problem}" for problem in found.problems)
-    return MeshVerdict(str(surface.path), fine and not found.problems, text)
+        text += f", at most {needed:.2g} mm are needed{at}" if fine else f": too coarse, {needed:.2g} mm are needed{at}"
+    text += f"; taken for {found.side}"
+    # A lumen that is judged from outside yields plausible figures of the wrong surface.
+    doubt = f"; {found.doubt} (surface.kind=lumen)" if found.doubt else ""
+    text += doubt + "".join(f"; {problem}" for problem in found.problems)
+    return MeshVerdict(str(surface.path), fine and not found.problems and not doubt, text)
 
 
 def _refined_edge(found: "Verdict", target_mm: float) -> float:

@@ -12,6 +12,7 @@ from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.conditions import conditions_of
+from simtest.validation.faults import faults_of
 from simtest.validation.mesh_verdicts import mesh_verdicts
 from simtest.validation.realism import realism_of
 from simtest.validation.runner import RESULTS, RunRecord
@@ -32,6 +33,8 @@ def run_summary(
         "realism": realism_of(cases),
         "estimators": {**(describe_estimators(experiment.estimators) if estimators is None else estimators)},
         "conditions": {setting: found.to_json() for setting, found in conditions_of(cases).items()},
+        "frames": sum(case.realisations for case in cases),
+        "faults": faults_of(results),
         "settings": settings_summary(results),
     }
     return {"experiments": {experiment.name: content}}

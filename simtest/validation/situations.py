@@ -132,6 +132,12 @@ def _sign(values: np.ndarray) -> int | None:
     return found.pop() if len(found) == 1 else None
 
 
+def is_co_located(rows: pl.DataFrame) -> bool:
+    """Whether every light of some highlights counts as at the camera; False where their frames were computed."""
+    largest = rows["eps_over_d"].abs().max() if "eps_over_d" in rows.columns else None
+    return largest is not None and float(largest) <= CO_LOCATED  # type: ignore[arg-type]
+
+
 def _light(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
     lights = rows["n_lights"].drop_nulls() if "n_lights" in rows.columns else pl.Series([1])
     count = int(lights[0]) if lights.len() else 1

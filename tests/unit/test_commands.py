@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+import types
 import warnings
 from types import SimpleNamespace
 
@@ -12,9 +13,12 @@ import pytest
 from simtest.cli import commands, manners, printing, progress
 from simtest.cli.listing import HEADINGS, names_of
 from simtest.cli.options import gather_settings
+from simtest.cli.validate import validate
 from simtest.dataset import verify as verifying
+from simtest.errors import InputError
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.registry import load_estimators
 from simtest.rendering import backend_check
 from simtest.rendering.backend import BackendReport
 from simtest.runtime.entry_points import OWN
@@ -70,6 +74,24 @@ def test_estimators_have_one_description():
     assert names_of("estimators").items() >= lines.items()
     assert f"{OWN}:cone_axis" not in names_of("estimators")
     assert describe_estimators([f"{OWN}:cone_axis"]) == {f"{OWN}:cone_axis": DESCRIPTIONS["cone_axis"]}
+
+
+def test_an_estimator_without_a_docstring_has_its_modules_line(monkeypatch):
+    module = types.ModuleType("own_core", "Centroid of the highlight.\n\nMore of it.")
+    exec("class Own:\n    def estimate(self, patch, camera, priors): ...\nown = Own()", vars(module))
+    monkeypatch.setitem(sys.modules, "own_core", module)
+    monkeypatch.setattr("simtest.estimators.registry.load_estimators", lambda names: {names[0]: module.own})
+    assert describe_estimators(["own"]) == {"own": "Centroid of the highlight."}
+
+
+def test_a_mesh_in_place_of_an_experiment_is_told_its_command(tmp_path):
+    with pytest.raises(InputError, match=r"simtest validate mesh --set surface\.path=.*tube\.ply"):
+        validate(str(tmp_path / "tube.ply"))
+
+
+def test_several_estimators_in_one_word_are_told_apart():
+    with pytest.raises(InputError, match="--estimator cone_axis --estimator curved"):
+        load_estimators(["cone_axis,curved"])
 
 
 def test_estimators_are_described_without_being_imported():

@@ -11,7 +11,7 @@ from test_report import make_run
 
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.report import write_report
-from simtest.report.guide_text import guide_rows, method_rows
+from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
 from simtest.report.pairs import pairs
 from simtest.report.run_folder import read_run
 from simtest.spec import load_experiment, load_scene
@@ -73,11 +73,42 @@ def test_highlights_of_one_frame_count_once():
             one += [row | {"true_id": true_id} for row in rows_of("cone_axis", [1.0], first=realisation)]
             other += [row | {"true_id": true_id} for row in rows_of("curved", [1.0 + delta], first=realisation)]
     (advice,) = guide_from(one, other).advice
-    assert (advice.best, advice.ties, advice.n) == ("cone_axis", ("curved",), 20)
+    assert (advice.best, advice.ties, advice.unranked, advice.n) == ("cone_axis", (), ("curved",), 20)
     # As frames of their own, the same 20 differences decide.
     apart = [[row | {"realisation": 10 * row["realisation"] + row["true_id"]} for row in rows] for rows in (one, other)]
     (advice,) = guide_from(*apart).advice
     assert (advice.best, advice.ties) == ("cone_axis", ())
+
+
+def test_few_highlights_make_no_tie_and_no_claim():
+    guide = guide_from(*(rows_of(name, own) for name, own in {"cone_axis": [2.0, 2.4], "curved": [1.0, 4.0]}.items()),
+                       rows_of("cone_axis", [1.0], "b", **TUBE))  # fmt: skip
+    rows = guide_rows(guide)
+    assert [(row.best, row.ties, row.unranked, row.breaks) for row in rows] == [
+        ("cone_axis", (), "too few highlights to rank", "not in these 2 highlights (worst: 2.2°)"),
+        ("cone_axis", (), "", "not in this highlight (worst: 1°)"),
+    ]
+    assert seen_sentence(guide, 8) == "3 true highlights in 8 frames; 5 frames without one."
+    assert seen_sentence(guide, 3) == seen_sentence(guide, None) == ""
+
+
+def test_a_method_that_breaks_is_not_tied_with_one_that_does_not():
+    """Chance may have made the difference, but not the claim that both serve."""
+    wild = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 60.0]
+    parts = (rows_of("curved", noisy(2.0, 7)), rows_of("circle_pose", wild))
+    (advice,) = guide_from(*parts).advice
+    assert advice.methods["circle_pose"].breaks
+    assert (advice.best, advice.ties) == ("curved", ())
+
+
+def test_the_bisector_is_not_ranked_where_the_light_is_at_the_camera():
+    parts = (rows_of("curved", noisy(1.0)), rows_of("bisector", noisy(0.98)))
+    (advice,) = guide_from(*parts).advice
+    assert (advice.best, advice.ties, list(advice.methods)) == ("curved", (), ["curved", "bisector"])
+    beside = [[row | {"eps_over_d": 0.05} for row in rows] for rows in parts]
+    assert guide_from(*beside).advice[0].best == "bisector"
+    # Alone it has nobody to give way to.
+    assert guide_from(parts[1]).advice[0].best == "bisector"
 
 
 def test_settings_that_differ_in_kind_never_share_a_situation():
@@ -252,18 +283,18 @@ def test_spread_between_settings_does_not_hide_a_worse_method():
 def test_one_frame_a_setting_leaves_the_spread_between_settings():
     one = [row for k in range(5) for row in rows_of("cone_axis", [1.0 + k / 100], f"r={k}")]
     far, near = (
-        [row for k, delta in enumerate(deltas) for row in rows_of("bisector", [1.0 + k / 100 + delta], f"r={k}")]
+        [row for k, delta in enumerate(deltas) for row in rows_of("curved", [1.0 + k / 100 + delta], f"r={k}")]
         for deltas in ([0.5, 0.6, 0.7, 0.5, 0.6], [0.0, 0.0, 0.02, 0.5, 3.0])
     )
     (advice,) = guide_from(one, far).advice
     assert advice.ties == ()
     (advice,) = guide_from(one, near).advice
-    assert advice.ties == ("bisector",)
+    assert advice.ties == ("curved",)
 
 
 def test_frames_that_are_copies_count_once():
     """Without noise, realisations repeat each other: no interval, and what matters decides."""
-    errors = {"cone_axis": 1.0, "centroid": 1.04, "bisector": 1.06, "brightest_point": 3.0}
+    errors = {"cone_axis": 1.0, "centroid": 1.04, "curved": 1.06, "brightest_point": 3.0}
     (advice,) = guide_from(*(rows_of(name, [error] * 20) for name, error in errors.items())).advice
     assert advice.n == 1
     assert advice.methods["cone_axis"].interval_deg == (None, None)
@@ -271,7 +302,7 @@ def test_frames_that_are_copies_count_once():
     assert (advice.best, advice.ties) == ("cone_axis", ("centroid",))
     # A single frame may owe its order to noise: nothing says that another would be the same.
     (advice,) = guide_from(*(rows_of(name, [error]) for name, error in errors.items())).advice
-    assert advice.ties == ("centroid", "bisector", "brightest_point")
+    assert (advice.ties, advice.unranked) == ((), ("centroid", "curved", "brightest_point"))
 
 
 def test_frames_without_an_answer_are_no_copies():
@@ -404,6 +435,8 @@ def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_te
     assert (worse.unanswered, worse.is_broken) == ("1 missed, 1 refused", True)
     assert worse.breaks.startswith("here: mean 7")
     assert (tied.estimator, tied.standing, tied.is_broken) == ("mine", "tied", False)
+    # Where it does not break, its worst setting is named, as the best method's is.
+    assert tied.breaks.startswith("nowhere here (worst: 0.")
     # The best one has the situation's own line.
     assert (saddle.best, saddle.guests) == ("mine", ())
     text = printed(run, 80, terminal=False)
@@ -411,6 +444,10 @@ def test_an_estimator_from_elsewhere_has_a_line_in_each_situation_on_page_and_te
     assert "(not best)" in text
     page = (run / "index.html").read_text(encoding="utf-8")
     assert page.count('class="guest"') == 2
+    # A phone shows each line as a card: it names its situation, and no method "best" that is not.
+    begin = '<tr class="guest"><th scope="row" class="text soft">flat</th><td class="text" data-label="method">'
+    assert page.count(begin) == 1
+    assert ">the same<" not in page
 
 
 def test_a_run_without_true_highlights_says_so(tmp_path):

@@ -118,12 +118,14 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     (coarse,) = mesh_verdicts(experiment(**{"surface.path": str(path)}))
     assert not coarse.usable
     assert str(coarse).startswith(f"mesh {path}: too coarse: edges of 0.")
-    assert str(coarse).endswith(" mm are needed (surface.edge_mm)")
+    assert str(coarse).endswith(" mm are needed at 30 mm (surface.edge_mm); taken for an organ, camera outside")
     assert coarse.to_json() == {"file": str(path), "usable": False, "verdict": coarse.text}
     (refined,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
     assert refined.usable
     assert re.fullmatch(
-        r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed", refined.text
+        r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed at 30 mm; "
+        "taken for an organ, camera outside",
+        refined.text,
     )
     # One that would need more faces than are allowed is not fine enough, and says so.
     monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SUBDIVIDED_FACES", 1500)
@@ -135,13 +137,43 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     # A wide lobe needs no fine mesh.
     trimesh.creation.icosphere(subdivisions=5, radius=20).export(path)
     (fine,) = mesh_verdicts(experiment(**{"surface.path": str(path), "reflectance.exponent": 2.0}))
-    assert (fine.usable, fine.text) == (True, "fine enough")
+    assert (fine.usable, fine.text) == (True, "fine enough; taken for an organ, camera outside")
     # Two lobes of one verdict are told once, and two verdicts of one file both.
     values = {"surface.path": str(path)}
     groups = [Group(scene="anatomy", set={**values, "reflectance.exponent": n}) for n in (2.0, 3.0, 9e4)]
     assert mesh_verdicts(Experiment(name="x", groups=groups[:2])) == [fine]
     both = mesh_verdicts(Experiment(name="x", groups=groups))
     assert [each.usable for each in both] == [True, False]
+
+
+def test_an_open_tube_that_is_taken_for_an_organ_is_warned_of(tmp_path):
+    """Seen from outside it yields fine figures, of the wrong side."""
+    path = tmp_path / "tube.ply"
+    # Two thirds of a ring, so that its shape is not slender.
+    around, along = 40, 60
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, 4, along))
+    across = 25 + 12 * np.cos(u)
+    points = np.stack([across * np.cos(v), across * np.sin(v), 12 * np.sin(u)], axis=-1).reshape(-1, 3)
+    k, ring = np.meshgrid(np.arange(along - 1) * around, np.arange(around), indexing="ij")
+    a, b = (k + ring).ravel(), (k + (ring + 1) % around).ravel()
+    quads = np.stack([a, b, b + around, a + around], axis=1)
+    tube = trimesh.Trimesh(points, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]), process=False)
+    tube.export(path)
+    values = {"surface.path": str(path), "reflectance.exponent": 2.0}
+    (guessed,) = mesh_verdicts(experiment(**values))
+    assert not guessed.usable
+    assert "taken for an organ, camera outside; open at 2 rims, as a tube is" in guessed.text
+    assert "surface.kind=lumen" in guessed.text
+    for kind, side in (("lumen", "a lumen, camera inside"), ("organ", "an organ, camera outside")):
+        (stated,) = mesh_verdicts(experiment(**values, **{"surface.kind": kind}))
+        assert "rims" not in stated.text
+        assert f"taken for {side}" in stated.text
+    # A hole of a scan is no end of a tube.
+    holed = ball()
+    holed.update_faces((holed.vertices[holed.faces].mean(axis=1)[:, :2] ** 2).sum(axis=1) > 4)
+    holed.export(path)
+    (organ,) = mesh_verdicts(experiment(**values))
+    assert "rims" not in organ.text
 
 
 @pytest.mark.parametrize("quiet", [False, True])

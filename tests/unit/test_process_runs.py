@@ -369,9 +369,24 @@ def test_a_worker_of_a_dataset_finds_its_core_in_any_folder(tmp_path, monkeypatc
 
 
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
-    run = simtest.validate(published, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "exit")])
+    def validate():
+        return simtest.validate(published, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "exit")])
+
+    with pytest.warns(RuntimeWarning, match="bad_core: core_died: .*no licence for this highlight.*, 2 times") as told:
+        run = validate()
+    assert len(told) == 1
     assert set(run.results["status"]) == {"core_died"}
     assert "no licence for this highlight" in run.results["flags"][0]
+    # Its text stands in summary.json and on the page, and the guide calls it failed.
+    (fault,) = run.summary["experiments"]["published-few"]["faults"]
+    assert (fault["estimator"], fault["reason"], fault["count"]) == ("bad_core", "core_died", 2)
+    assert "no licence for this highlight" in run.page.read_text()
+    guide = json.loads((run.folder / "guide.json").read_text())
+    figures = [row["methods"]["bad_core"] for row in guide["rows"]]
+    assert (sum(each["failed"] for each in figures), sum(each["refused"] for each in figures)) == (2, 0)
+    # A finished run that is asked for again tells it again.
+    with pytest.warns(RuntimeWarning, match="no licence for this highlight"):
+        validate()
 
 
 def test_a_frame_core_does_not_fit_the_published_protocol(tmp_path, published):

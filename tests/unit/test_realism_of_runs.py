@@ -121,5 +121,5 @@ def test_page_repeats_what_is_wrong_with_a_mesh(tmp_path):
     summary["experiments"]["overview"]["meshes"] = meshes
     (run / "summary.json").write_text(json.dumps(summary))
     html = write_report(run).read_text(encoding="utf-8")
-    assert "<code>a.ply</code>: too &lt;coarse&gt;. Errors below may be those of its triangles." in html
+    assert "<code>a.ply</code>: too &lt;coarse&gt;. Errors below may come from the mesh, not from the methods." in html
     assert "<code>b.ply</code>: fine enough</p>" in html
