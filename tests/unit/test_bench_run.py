@@ -12,12 +12,13 @@ import polars as pl
 import pytest
 
 from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
+from simtest.bench.compare import compare
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
 from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
 from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, frames_of, load_suite, read_suite, resolved_tables
-from simtest.bench.verify import check_quick, check_seeds, compare, verify_run
+from simtest.bench.verify import check_quick, check_seeds, verify_run
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
@@ -25,6 +26,8 @@ from simtest.runtime.files import write_json
 from simtest.runtime.provenance import file_hash
 from simtest.spec import load_scene
 from simtest.spec.toml_files import toml_tables
+
+COMMITMENT = "5" * 64
 
 SUITE_TEXT = """
 name = "tiny"
@@ -133,11 +136,11 @@ def test_a_certificate_is_verified_by_running_again(suite: Suite, made: BenchRun
 
 @pytest.mark.render
 def test_other_seeds_are_other_frames(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
-    sealed = run_bench(suite, "cone_axis", tmp_path, Seeds("secret", "its commitment"))
-    assert sealed.content["seeds"] == {"kind": "sealed", "commitment": "its commitment"}
+    sealed = run_bench(suite, "cone_axis", tmp_path, Seeds("secret", COMMITMENT))
+    assert sealed.content["seeds"] == {"kind": "sealed", "commitment": COMMITMENT}
     assert sealed.content["parts"]["smooth"]["results"] != made.content["parts"]["smooth"]["results"]
     told = read_certificate(sealed.certificate)
-    check_seeds(told, suite, Seeds("secret", "its commitment"))
+    check_seeds(told, suite, Seeds("secret", COMMITMENT))
     for seeds, words in (
         (public_seeds(suite), "--sealed must name"),
         (Seeds("x", "other"), "was run with other seeds"),
@@ -162,29 +165,54 @@ def test_a_certificate_runs_no_command(suite: Suite, made: BenchRun, tmp_path: P
 
 
 @pytest.mark.render
-def test_medians_that_differ_are_told(made: BenchRun) -> None:
+@pytest.mark.parametrize("results", ["same", "other"])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("penalised_deg", 1e-5), ("mean_deg", 1e-5), ("p95_deg", 1e-5), ("median_deg", 1e-5),
+        ("median_interval", [0.0, 1e-5]), ("penalised_interval", [0.0, 1e-5]), ("answered", 3), ("n", 9),
+        ("refused", {"core_died": 3}), ("uncertainty.verdict", "calibrated"), ("uncertainty.coverage", 0.5),
+        ("uncertainty.n", 500), ("uncertainty.interval", [0.0, 0.1]), ("uncertainty.semi_axis_deg", 1e-5),
+        ("uncertainty.inflation", 9.0), ("uncertainty.energy_deg", 1e-5), ("more", 1), ("refused", 5),
+        ("p95_deg", None),
+    ],
+)  # fmt: skip
+def test_no_figure_is_taken_on_trust(made: BenchRun, results: str, key: str, value: Any) -> None:
+    """A stated figure that the run again does not have speaks against the certificate, whatever its rows' hash."""
+    told = copy.deepcopy(made.content)
+    part = told["parts"]["smooth"]
+    if results == "other":
+        part["results"] = "0" * 64
+    assert compare(told, made.content).holds
+    *above, last = key.split(".")
+    (part[above[0]] if above else part)[last] = value
+    (problem,) = compare(told, made.content).problems[:1]
+    assert problem.startswith("smooth")
+    assert key.split(".")[0] in problem
+
+
+@pytest.mark.render
+def test_what_processors_differ_by_is_allowed(made: BenchRun) -> None:
+    """Highlights that one processor refuses change means by 90 deg over their number; figures else by 5 %."""
     found = copy.deepcopy(made.content)
     part = found["parts"]["smooth"]
-    part["results"], part["median_deg"] = "other", part["median_deg"] + 5e-4
-    assert compare(made.content, found).holds
-    part["median_deg"] += 1e-3
-    assert "medians differ by 0.0015 deg" in compare(made.content, found).problems[0]
-    part["median_deg"], part["penalised_deg"] = (
-        made.content["parts"]["smooth"]["median_deg"],
-        part["penalised_deg"] + 16,
-    )
-    # one highlight of six may be answered otherwise, by up to 90 deg
-    assert "penalised errors differ by 16 deg; at most 15 is allowed" in compare(made.content, found).problems[0]
-    part["penalised_deg"] -= 16
-    told = copy.deepcopy(made.content)
-    for content, coverage in ((told, 0.9), (found, 0.4)):
-        content["parts"]["smooth"]["uncertainty"].update(coverage=coverage, n=6)
-    assert "coverages differ by 0.5; at most 0.167" in compare(told, found).problems[0]
-    found["parts"]["smooth"]["uncertainty"]["coverage"] = 0.8
+    part.update(n=600, answered=600, mean_deg=0.4, penalised_deg=0.4, p95_deg=1.0, results="0" * 64)
+    told = copy.deepcopy(found)
+    stated = told["parts"]["smooth"]
+    stated["results"] = "1" * 64
+    stated["median_deg"] += 9e-4
+    stated.update(penalised_deg=0.415, mean_deg=0.385, p95_deg=1.04)
     assert compare(told, found).holds
-    part["uncertainty"] = made.content["parts"]["smooth"]["uncertainty"]
-    part["answered"] = 4
-    assert compare(made.content, found).problems == ("smooth: answered 6, here 4; at most 1 may differ",)
+    stated["penalised_deg"] = 0.43
+    (problem,) = compare(told, found).problems
+    assert problem == "smooth.penalised_deg: differs by 0.03 deg; at most 0.021 is allowed"
+    # two of 600 refused: 0.3 deg
+    stated.update(answered=598, refused={"not_converged": 2}, penalised_deg=0.7)
+    compared = compare(told, found)
+    assert compared.holds
+    assert "smooth.answered: 598, here 600: contours changed their topology" in compared.notes
+    stated["median_deg"] += 2e-4
+    assert "smooth.median_deg: differs by 0.0011 deg; at most 0.001" in compare(told, found).problems[0]
 
 
 @pytest.mark.render
@@ -267,7 +295,7 @@ def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) 
     named("tied", 1.5, 2.5)
     named("middle", 2.2, 3.0)
     named("<worst>", 4.0, 5.0)
-    named("sealed one", 1.0, 2.0, {"kind": "sealed", "commitment": "abc"})
+    named("sealed one", 1.0, 2.0, {"kind": "sealed", "commitment": COMMITMENT})
     boards = read_entries(tmp_path / "all", suite)
     ranks = [(row.certificate.core["name"], row.rank) for row in boards[0].overall]
     assert ranks == [("best", "1–2"), ("tied", "1–3"), ("middle", "2–3"), ("<worst>", "4")]
