@@ -85,7 +85,7 @@ def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore
     n, limit = int(stated.sum()), chi_squared.quantile(LEVEL, 2)
     if n == 0:
         return UncertaintyScore(0, None, None, UNTESTED, None, None, None)
-    inside: Array = squared[stated] <= limit
+    inside = (squared[stated] <= limit).astype(float)
     error = coverage_error(inside, scenes[stated])
     share = float(np.mean(inside))
     # Wilson's interval for as many independent rows as would have this error.

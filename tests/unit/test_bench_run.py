@@ -278,6 +278,58 @@ def test_the_table_refuses_what_is_not_right(
     assert "\n" not in str(raised.value)
 
 
+_REMOVED = object()
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("parts.smooth", None), ("parts.smooth.refused", _REMOVED), ("parts.smooth.uncertainty", _REMOVED),
+        ("parts.smooth.penalised_deg", -5.0), ("parts.smooth.penalised_deg", 10**400), ("parts.smooth.p95_deg", 181.0),
+        ("parts.smooth.penalised_interval", [90.0, 0.0]), ("parts.smooth.median_interval", [0.1]),
+        ("parts.smooth.median_deg", 179.0), ("parts.smooth.refused", {"core_died": -1}), ("parts.smooth.more", 1),
+        ("parts.smooth.uncertainty.n", 500), ("parts.smooth.uncertainty.verdict", "calibrated"),
+        ("parts.smooth.uncertainty.interval", [0.3, 0.2]), ("parts", {}), ("parts.smooth.zones", {"all": {}}),
+        ("cases", []), ("suite", "v1"), ("core", "x"), ("core", {}), ("core.sha256", 5), ("core.name", "\ud800"),
+        ("core.version", 1), ("seeds", [1]), ("seeds", {}), ("seeds.commitment", [1]), ("seeds.kind", "sealed"),
+        ("seeds.commitment", "5" * 64), ("seeds.seed", True), ("environment", {}), ("environment.processor", _REMOVED),
+        ("environment.versions", {"numpy": 1}), ("timing.request", _REMOVED), ("timing.parts_s", {"smooth": -1.0}),
+        ("overall", "x"), ("extra", 1),
+    ],
+)  # fmt: skip
+def test_what_has_not_the_form_of_a_certificate_is_refused(
+    made: BenchRun, tmp_path: Path, path: str, value: Any
+) -> None:
+    """A stranger wrote it, and gave it the hash that fits."""
+
+    def change(content: Any) -> None:
+        *above, last = path.split(".")
+        for key in above:
+            content = content[key]
+        if value is _REMOVED:
+            del content[last]
+        else:
+            content[last] = value
+
+    with pytest.raises(InputError) as raised:
+        read_certificate(_copied(made, tmp_path, change))
+    assert "\n" not in str(raised.value)
+    assert str(raised.value).isprintable()
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    "number", ["NaN", "1e999", "-Infinity", "1" * 5000, "[" * 900 + "]" * 900, "[" * 10**6, '1, "kind": 2']
+)
+def test_what_has_no_hash_is_refused(made: BenchRun, tmp_path: Path, number: str) -> None:
+    text = made.certificate.read_text()
+    (tmp_path / CERTIFICATE).write_text(text.rstrip().removesuffix("}") + f', "x": {number}}}')
+    with pytest.raises(InputError, match=r"cannot be read as a certificate|was altered") as raised:
+        read_certificate(tmp_path)
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.render
 def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
     def named(name: str, low: float, high: float, seeds: Any = None) -> None:
