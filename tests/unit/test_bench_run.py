@@ -12,12 +12,13 @@ import polars as pl
 import pytest
 
 from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
-from simtest.bench.compare import compare
+from simtest.bench.compare import Verified, compare
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
 from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
 from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, frames_of, load_suite, read_suite, resolved_tables
+from simtest.bench.verified import keep_verified, read_verified
 from simtest.bench.verify import check_quick, check_seeds, verify_run
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
@@ -356,6 +357,33 @@ def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) 
     assert "&lt;worst&gt;" in page
     assert "<worst>" not in page
     assert page.count("<h1>") == 1
+    assert page.count("as stated</td>") == 5
+    # the first headline is of the seeds in text order, and each part's name is that of the command
+    assert "best has the smallest error over all parts" in page
+    assert "(<code>smooth</code>)" in page
+
+
+@pytest.mark.render
+def test_the_table_marks_what_was_run_again(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
+    """The list of verified certificates is the organiser's, and is of the certificates' hashes."""
+    other = _copied(made, tmp_path / "all" / "other", lambda content: content["core"].update(name="other"))
+    third = _copied(made, tmp_path / "all" / "third", lambda content: content["core"].update(name="third"))
+    _copied(made, tmp_path / "all" / "held")
+    listed = tmp_path / "mine" / "verified.jsonl"
+    keep_verified(listed, read_certificate(made.certificate), Verified((), ()))
+    keep_verified(listed, read_certificate(other), Verified((), ()))
+    keep_verified(listed, read_certificate(other), Verified(("smooth: other rows",), ()))
+    board = read_entries(tmp_path / "all", suite, read_verified(listed))[0]
+    marks = {name.split()[0]: mark for name, mark in board.to_json()["verified"].items()}
+    assert marks == {"cone_axis": "run again", "other": "does not hold", "third": "as stated"}
+    assert read_certificate(third).digest not in read_verified(listed)
+    for text in ("no JSON", "[]", '{"holds": true}'):
+        listed.write_text(text)
+        with pytest.raises(InputError, match="cannot be read as a list of verified certificates"):
+            read_verified(listed)
+    assert read_verified(tmp_path / "missing") == {}
+    with pytest.raises(InputError, match="No such file"):
+        read_verified(tmp_path / "missing", required=True)
 
 
 def test_a_core_without_a_figure_has_no_rank(tmp_path: Path) -> None:
