@@ -1,8 +1,10 @@
 """A run of the benchmark on a tiny suite: its certificate, its verification and its place in the table."""
 
 import copy
+import io
 import json
 import platform
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,13 +15,16 @@ import pytest
 
 from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
 from simtest.bench.compare import Verified, compare
+from simtest.bench.cores import core_record
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
 from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
+from simtest.bench.seal import SEALED, seal
 from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, frames_of, load_suite, read_suite, resolved_tables
 from simtest.bench.verified import keep_verified, read_verified
 from simtest.bench.verify import check_quick, check_seeds, verify_run
+from simtest.cli import bench
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
@@ -471,13 +476,11 @@ def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
     """A core that answers with the sightline of the peak, in a process of its own."""
     core = tmp_path / "core.py"
     core.write_text(CORE)
-    import sys
-
     made = run_bench(suite, f"command: {sys.executable} {core}", tmp_path / "run", public_seeds(suite))
     told = made.content["core"]
     assert (told["kind"], told["name"], told["version"]) == ("command", "core", "1.5")
     # The hash is of the script: another machine has another interpreter.
-    assert told["sha256"] == digest_of([["core.py", file_hash(core)]])
+    assert told["sha256"] == digest_of({"files": [["core.py", file_hash(core)]], "words": ["core.py"]})
     assert told["program"] == {"name": Path(sys.executable).name, "sha256": file_hash(Path(sys.executable))}
     found = copy.deepcopy(made.content)
     found["core"]["program"]["sha256"] = "0" * 64
@@ -489,6 +492,26 @@ def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
     assert rows["estimator"].unique().to_list() == ["core"]
     with pytest.raises(InputError, match="--core must say"):
         verify_run(read_certificate(made.certificate), suite, tmp_path / "again", public_seeds(suite))
+
+
+@pytest.mark.render
+def test_a_core_s_hash_is_of_its_words_and_files(tmp_path: Path) -> None:
+    """Another option, another file or another content is another core; another folder is not."""
+
+    def sha256(folder: Path, words: str) -> Any:
+        return core_record(f"command: {sys.executable} {folder / 'core.py'} {words}")["sha256"]
+
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        (folder / "core.py").write_text(CORE)
+        (folder / "weights.bin").write_bytes(b"1")
+    plain = sha256(tmp_path / "a", "--fast")
+    assert plain == sha256(tmp_path / "b", "--fast")
+    weights = sha256(tmp_path / "a", f"--weights={tmp_path / 'a' / 'weights.bin'}")
+    assert weights == sha256(tmp_path / "b", f"--weights={tmp_path / 'b' / 'weights.bin'}")
+    (tmp_path / "b" / "weights.bin").write_bytes(b"2")
+    others = {sha256(tmp_path / "b", f"--weights={tmp_path / 'b' / 'weights.bin'}"), sha256(tmp_path / "a", "--slow")}
+    assert len({plain, weights, *others}) == 4
 
 
 CORE = """
@@ -518,3 +541,30 @@ for line in source:
 
 def test_the_suite_of_the_tests_is_checked(suite: Suite, made: BenchRun) -> None:
     check_suite(read_certificate(made.certificate), suite)
+
+
+@pytest.mark.render
+def test_the_commands_say_what_they_have_checked(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A sealed run warns of its folders; --quick runs nothing and says so; a run again is listed and marked."""
+    monkeypatch.setattr("simtest.bench.suite.load_suite", lambda *_: suite)
+    seal(suite, tmp_path)
+    file = tmp_path / SEALED
+    bench.run(out=tmp_path / "run", core="brightest_point", sealed=file)
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"tell what the seeds draw; publish {CERTIFICATE} alone" in told
+    secret = json.loads(file.read_text())["secret"]
+    part_seed = Seeds(secret).of_part(suite, "smooth")
+    text = (tmp_path / "run" / CERTIFICATE).read_text()
+    assert secret not in text
+    assert str(part_seed) not in text
+    monkeypatch.setattr("sys.stdin", io.StringIO(file.read_text()))
+    assert bench.verify(tmp_path / "run", sealed=Path("-"), verified=tmp_path / "list") == 0
+    assert "the certificate holds: it was run again" in capsys.readouterr().out
+    assert bench.verify(tmp_path / "run", quick=True) == 0
+    assert "the certificate is consistent; nothing was run" in capsys.readouterr().out
+    with pytest.raises(InputError, match="leave out --quick"):
+        bench.verify(tmp_path / "run", quick=True, verified=tmp_path / "list")
+    bench.table(tmp_path / "run", out=tmp_path / "table", verified=tmp_path / "list")
+    assert "run again</td>" in (tmp_path / "table" / "index.html").read_text()
