@@ -45,6 +45,8 @@ class CameraPrior:
     distortion_sd : float
         Standard deviation of a radial distortion k1 that is left out: it moves a point at r focal lengths from the
         principal point by k1 r^3 focal lengths.
+    guessed : bool
+        Whether these are guesses, because nobody stated them. It changes no estimate and does not count in comparisons.
 
     Raises
     ------
@@ -55,10 +57,16 @@ class CameraPrior:
     focal_sd: float = 0.0
     centre_sd_px: float = 0.0
     distortion_sd: float = 0.0
+    guessed: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("focal_sd", "centre_sd_px", "distortion_sd"):
-            check_number(name, getattr(self, name), least=0)
+        for name, deviation in self.deviations.items():
+            check_number(name, deviation, least=0)
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """The standard deviations by name."""
+        return {name: getattr(self, name) for name in ("focal_sd", "centre_sd_px", "distortion_sd")}
 
     @property
     def is_exact(self) -> bool:

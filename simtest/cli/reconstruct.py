@@ -31,13 +31,14 @@ Calibrated = Annotated[
 ]
 FieldOfView = Annotated[
     float | None,
-    Parameter(
-        help="Field of view in deg across the whole picture, where there is no calibration; crop black borders first."
-    ),
+    Parameter(help="Field of view in deg across the whole picture, where there is no calibration; see --fov-of."),
 ]
 FieldOfViewOf = Annotated[
-    Literal["width", "height", "diagonal"],
-    Parameter(help="What --fov spans. Makers of endoscopes mostly state the diagonal."),
+    Literal["width", "height", "diagonal", "view"],
+    Parameter(
+        help="What --fov spans: a side or the diagonal of the whole picture, or the round view found in it. "
+        "Makers of endoscopes mostly state the diagonal."
+    ),
 ]
 Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
 Encoding = Annotated[
@@ -135,6 +136,7 @@ def reconstruct(
     if record.stated is not None:
         print(f"stated: {record.stated}")
         print(MEANING)
+    _print_silent(record.specularities)
     _print_assumed(record.assumed)
     _print_counts(record, image)
     print_files(files, as_json)
@@ -202,23 +204,36 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     print(f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them")
 
 
+def _print_silent(spots: "Sequence[SpecularityRecord]") -> None:
+    """Print why best normals have no ±, and how many."""
+    from collections import Counter
+
+    from simtest.reconstruction.explanations import why_no_error
+
+    reasons = Counter(why_no_error(s.best, s.best_estimate) for s in spots if s.best and s.best_estimate)
+    for reason, count in reasons.items():
+        if reason:
+            print(f"no ± at {counted(count, 'best normal')}: {reason}")
+
+
 def _print_assumed(assumed: "Sequence[Assumption]") -> None:
-    """Print what the normals are without the light's position; what nobody told, how it is taken, how to narrow it."""
+    """Print what the normals are without the light's position; what is given with a spread; what is assumed."""
     from simtest.reconstruction.assumptions import light_note
 
     if note := light_note(assumed):
         print(f"note: {note}")
-    for each in assumed:
-        print(f"assumed: {each}")
+    for each in sorted(assumed, key=lambda each: not each.given):
+        print(f"given: {each.what}: {each.distribution}" if each.given else f"assumed: {each}")
 
 
 def _print_counts(record: "PictureRecord", image: Path) -> None:
     """Print how many highlights were found, how many have a normal, and what the others are."""
+    from simtest.reconstruction.borders import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
-    from simtest.reconstruction.picture import BORDERED
 
-    if BORDERED in record.warnings:
-        print(f"note: {BORDERED}")
+    for warning in record.warnings:
+        if warning.startswith(BORDERED):
+            print(f"note: {warning}")
 
     spots, others = record.specularities, record.other_highlights
     answered = sum(spot.best is not None for spot in spots)

@@ -1,4 +1,4 @@
-"""What is assumed where nobody told: as priors of a picture known by its field of view, and as text for people."""
+"""What is not known exactly of a picture: priors in place of what nobody told, and texts about them for people."""
 
 import math
 from collections.abc import Iterable
@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
+from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.geometry import Camera
+from simtest.geometry import Camera, ViewMask
 
 FOCAL_SD = 0.1
 """Standard deviation of a focal length that follows from a stated field of view, as a share of it: makers state it
@@ -23,18 +24,23 @@ DISTORTION_SD = 0.1
 
 @dataclass(frozen=True)
 class Assumption:
-    """One thing that nobody told: what it is, how it is taken, and how to narrow it."""
+    """One thing that is not known exactly: what it is, how it is taken, and how to narrow it.
+
+    `given` is whether the calibration states it; else nobody did, and a prior stands in its place.
+    """
 
     what: str
     distribution: str
     how_to_narrow: str
+    given: bool = False
 
     def __str__(self) -> str:
-        return f"{self.what}: {self.distribution} (to narrow: {self.how_to_narrow})"
+        told = "given by the calibration" if self.given else f"to narrow: {self.how_to_narrow}"
+        return f"{self.what}: {self.distribution} ({told})"
 
 
-Extent = Literal["width", "height", "diagonal"]
-"""Extents of a picture that a stated field of view may span."""
+Extent = Literal["width", "height", "diagonal", "view"]
+"""Extents of a picture that a stated field of view may span; the last is the round view in it."""
 
 LIGHT = "light"
 
@@ -48,7 +54,7 @@ NEAR_MISSES = Assumption(
     "highlights",
     "each holds a point whose normal bisects light and camera; where an organ folds about one in five only comes near: "
     "its normal is then off by 2 to 3 deg along its longer axis, which no budget holds",
-    "compare neighbours; Priors(plane=True) for a plane",
+    "compare the normals of neighbouring highlights; in Python Priors(plane=True), if the surface is a plane",
 )
 """Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""
 
@@ -56,21 +62,32 @@ NEAR_MISSES = Assumption(
 def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent = "width") -> Calibration:
     """Return the calibration of a camera of which the field of view alone is known, deg, across the whole picture.
 
-    `across` names the extent that the angle spans: the picture's width, height or diagonal. Raises `InputError` if the
+    `across` names the extent that the angle spans: the picture's width, height or diagonal; for its round view see
+    `calibration_of_round_view`. Raises `InputError` if the
     angle or the extent is none of those allowed.
     """
-    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD)
     extents = {"width": width, "height": height, "diagonal": math.hypot(width, height)}
     if across not in extents:
         raise InputError(f"--fov-of {across}: must be one of {', '.join(extents)}")
-    focal = Camera.from_fov(fov_deg, width, height).fx * extents[across] / width
-    return Calibration(Camera(width, height, focal, focal, width / 2, height / 2), priors=Priors(camera=prior))
+    return _guessed(fov_deg, width, height, extents[across], (width / 2, height / 2))
+
+
+def calibration_of_round_view(fov_deg: float, width: int, height: int, view: ViewMask) -> Calibration:
+    """Return the same where the angle, deg, spans the round view in the picture; the lens is centred on that view."""
+    return _guessed(fov_deg, width, height, 2 * view.radius, (view.cx, view.cy))
+
+
+def _guessed(fov_deg: float, width: int, height: int, extent_px: float, centre: tuple[float, float]) -> Calibration:
+    """Return a pinhole's calibration whose angle spans `extent_px`, with the priors of a guess."""
+    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD, guessed=True)
+    focal = Camera.from_fov(fov_deg, width, height).fx * extent_px / width
+    return Calibration(Camera(width, height, focal, focal, *centre), priors=Priors(camera=prior))
 
 
 def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
-    """List what is assumed of a picture, since neither its calibration nor the options tell it.
+    """List what is not known exactly of a picture: what its calibration gives with a spread, and what nobody told.
 
-    `encoding` is the one that was told beside the calibration, if any.
+    `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
     """
     priors = calibration.priors
     made = []
@@ -79,13 +96,14 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
             Assumption(
                 LIGHT, f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
                 "[rig] lights_mm or light_offset_mm in a calibration file",
+                priors.light_offset_mm != UNTOLD_OFFSET_MM,
             )
         )  # fmt: skip
-    if priors.distance_mm is None:
+    if priors.distance.sd > 0:
         made.append(
             Assumption(
                 "distance of the tissue", f"{priors.distance} mm along the sightline",
-                "[rig] distance_mm or distance_range_mm in a calibration file",
+                "[rig] distance_mm or distance_range_mm in a calibration file", priors.distance_mm is not None,
             )
         )  # fmt: skip
     made += _of_camera(calibration.camera, priors.camera)
@@ -96,11 +114,13 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
             Assumption(
                 "falloff towards the border", f"cos^k over the angle from the optical axis, k {priors.falloff_power}",
                 "[vignetting] and [emission] in a calibration file, or [uncertainty] falloff_power",
+                priors.falloff_power != UNTOLD_FALLOFF_POWER,
             )
         )  # fmt: skip
     if target == "base":
         slope = "[surface] relief_slope_deg in a calibration file"
-        made.append(Assumption("slope of the relief", f"{_in_degrees(priors.relief_slope)} deg an axis", slope))
+        told = priors.relief_slope != UNTOLD_SLOPE_RAD
+        made.append(Assumption("slope of the relief", f"{_in_degrees(priors.relief_slope)} deg an axis", slope, told))
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
@@ -112,19 +132,24 @@ def light_note(assumed: Iterable[Assumption]) -> str:
 
 
 def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
-    """List what is assumed of the camera's geometry."""
+    """List what is not known exactly of the camera's geometry."""
+    told = not prior.guessed
     key = "in a calibration file"
     made = []
     if prior.focal_sd > 0:
         deviation = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
-        made.append(Assumption("focal length", deviation, f"[camera] fx, fy and [uncertainty] focal_sd {key}"))
+        made.append(Assumption("focal length", deviation, f"[camera] fx, fy and [uncertainty] focal_sd {key}", told))
     if prior.centre_sd_px > 0:
         deviation = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
-        made.append(Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}"))
+        made.append(
+            Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}", told)
+        )
     if prior.distortion_sd > 0:
         lens = "none" if camera.distortion is None else "as stated"
         deviation = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
-        made.append(Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}"))
+        made.append(
+            Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
+        )
     return made
 
 

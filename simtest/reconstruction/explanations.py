@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from simtest.errors import Reason
+from simtest.estimators.protocol import Estimate
 
 FLAGS = {
     "ambiguous": "the two candidates of the circle pose are hardly told apart: a margin below 2 standard deviations",
@@ -68,6 +69,14 @@ PARTS = {
 }
 """By part of the budget of an uncertainty (docs/concepts/uncertainty.md)."""
 
+UNTOLD_ERROR = {
+    "light_offset": "a known light is not at the camera, which this method ignores, so it cannot tell its error",
+    "circle_pose": "circle_pose states an error on surfaces that are known to be planes alone",
+    "no_isophote": "no whole isophote is left around the peak, and the error follows from the isophotes",
+    "other": "the noise of the picture could not be estimated, or the estimator states no error",
+}
+"""Why an estimate has no ±."""
+
 TERMS = {
     "best": "The best normal of a highlight has the smallest stated error. Normals that state none come last.",
     "tilt": "Tilt is the angle between the normal and the camera's optical axis: 0° faces the camera.",
@@ -79,6 +88,18 @@ TERMS = {
     "smooth base surface; each glint alone carries the normal of the relief.",
 }
 """Terms that the page of a picture uses."""
+
+
+def why_no_error(name: str, result: Estimate) -> str:
+    """Return why the estimate of the named estimator states no error; an empty text where it states one."""
+    if result.covariance is not None:
+        return ""
+    if "light_offset" in result.flags:
+        return UNTOLD_ERROR["light_offset"]
+    if name == "circle_pose":
+        return UNTOLD_ERROR["circle_pose"]
+    own = name in ("brightest_point", "cone_axis", "curved", "bisector")
+    return UNTOLD_ERROR["no_isophote" if own and not result.isophotes and "partial_arc" in result.flags else "other"]
 
 
 def kind_name(kind: str | None) -> str:

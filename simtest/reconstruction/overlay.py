@@ -26,6 +26,8 @@ ISOPHOTE: Colour = (0, 235, 255)
 NUMBER: Colour = (0, 255, 255)
 RAY: Colour = (235, 235, 235)
 RAY_SHARE = 0.35
+PLATE_SHARE = 0.25
+"""Share of the picture's light that is left behind a number."""
 EDGE: Colour = (0, 0, 0)
 HALF = 0.5
 """Isovalue of the isophote that is drawn."""
@@ -126,7 +128,14 @@ def _draw_numbers(canvas: Picture, spots: Sequence[SpecularityRecord], scale: in
         if ((area[:2] < taken[:, 2:]) & (taken[:, :2] < area[2:])).all(axis=1).any():
             continue
         taken = np.vstack([taken, area])
+        _plate(canvas, area)
         _text(canvas, text, (left, low), NUMBER, 0.42)
+
+
+def _plate(canvas: Picture, area: Array) -> None:
+    """Darken the ground of a number, which is yellow and often stands on a white highlight."""
+    left, top, right, low = np.clip(area.astype(int) + np.array([-2, -2, 2, 2]), 0, np.tile(canvas.shape[1::-1], 2))
+    canvas[top:low, left:right] = (PLATE_SHARE * canvas[top:low, left:right]).astype(np.uint8)
 
 
 def _at(points: npt.ArrayLike, scale: int) -> npt.NDArray[np.int32]:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 from simtest.calibration import Calibration
 from simtest.detection.detector import load_detector
+from simtest.detection.view_mask import find_view
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.reconstruction.assumptions import Extent, calibration_of_view
+from simtest.reconstruction.assumptions import Extent, calibration_of_round_view, calibration_of_view
+from simtest.reconstruction.borders import border_note
 from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.pipeline import run_picture
@@ -18,11 +20,6 @@ from simtest.runtime.resources import shown
 TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
-
-BORDERED = (
-    "the picture has dark borders, and the field of view is taken across the whole picture: where it is that of the "
-    "visible part, crop the borders off by the same width on opposite sides"
-)
 
 
 @dataclass(frozen=True)
@@ -52,8 +49,8 @@ class Options:
     target : {"fine", "base"}
         Which surface's normals are stated: those of the fine one, or of the base without its relief, whose slope is
         then in the uncertainty.
-    fov_of : {"width", "height", "diagonal"}
-        What the field of view spans.
+    fov_of : {"width", "height", "diagonal", "view"}
+        What the field of view spans; "view": the round view in the picture, whose centre is then the principal point.
     poses : Path, optional
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
 
@@ -110,12 +107,24 @@ def read_calibration(options: Options, picture: Image) -> tuple[Calibration, lis
         calibration, cautions = load_calibration(options.camera), []
     else:
         assert options.fov_deg is not None
-        calibration = calibration_of_view(options.fov_deg, picture.shape[1], picture.shape[0], options.fov_of)
-        told = f"the field of view of {options.fov_deg:g} deg across the picture's {options.fov_of}"
+        calibration = _calibration_of_view(options, options.fov_deg, picture)
+        extent = "round view" if options.fov_of == "view" else options.fov_of
+        told = f"the field of view of {options.fov_deg:g} deg across the picture's {extent}"
         cautions = [f"no calibration: all angles depend on {told} being right"]
     if calibration.response is not None and options.encoding is not None:
         raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
     return calibration, cautions
+
+
+def _calibration_of_view(options: Options, fov_deg: float, picture: Image) -> Calibration:
+    """Return the calibration that follows from the stated field of view."""
+    height, width = picture.shape[:2]
+    if options.fov_of != "view":
+        return calibration_of_view(fov_deg, width, height, options.fov_of)
+    circle = find_view(picture).circle
+    if circle is None:
+        raise InputError("--fov-of view: no round view was found in the picture; give width, height or diagonal")
+    return calibration_of_round_view(fov_deg, width, height, circle)
 
 
 def reconstruct_values(
@@ -132,7 +141,9 @@ def reconstruct_values(
         not options.every, options.target,
     )  # fmt: skip
     view = made.detection.view
-    bordered = options.fov_deg is not None and view.seen is not None and not bool(view.seen.all())
+    # Any other extent is that of the whole picture, borders included.
+    across_all = options.fov_deg is not None and options.fov_of != "view"
+    bordered = border_note(picture, view) if across_all else ""
     # describe
     return PictureRecord(
         image=name,
@@ -140,7 +151,7 @@ def reconstruct_values(
         encoding=choices.encoding,
         detector=choices.detector,
         view=view,
-        warnings=[*cautions, BORDERED] if bordered else list(cautions),
+        warnings=[*cautions, bordered] if bordered else list(cautions),
         specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
         assumed=choices.assumed,

@@ -16,12 +16,15 @@ from simtest.errors import InputError
 from simtest.estimators.two_views import PoseError
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import close_names, shown
 
 UNITS_MM = {"mm": 1.0, "m": 1000.0}
 
 UNTOLD_ERROR = PoseError(0.01, float(np.radians(0.2)))
 """Error of a motion from frame to frame where the file states none."""
+
+MOST_MM = 1e6
+"""Farthest position from the origin, mm."""
 
 ROUNDED = 1e-3
 """How far a matrix may be from a rotation: files hold rounded numbers."""
@@ -47,7 +50,7 @@ class Poses:
     error : PoseError
         Of the motion between two frames.
     error_told : bool
-        Whether the file states the error.
+        Whether the file states both errors; one that it does not state is that of `UNTOLD_ERROR`.
     """
 
     path: Path
@@ -109,15 +112,20 @@ def read_poses(path: Path) -> Poses:
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise InputError(f"{where}: names {shown(twice, 60)} twice; must give each frame one pose")
     unit = settings.pop("unit", "mm" if is_json else "m")
-    if unit not in UNITS_MM:
+    if not isinstance(unit, str) or unit not in UNITS_MM:
         raise InputError(f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}")
     made = np.array(poses)
     made[:, :3, 3] *= UNITS_MM[unit]
+    if (farthest := float(np.abs(made[:, :3, 3]).max())) > MOST_MM:
+        raise InputError(f"{where}: a position of {farthest:.3g} mm; must be at most {MOST_MM:g} mm from the origin")
     translation = _share(settings, "translation_error", 1.0, where)
     rotation = _share(settings, "rotation_error_deg", 90.0, where)
-    told = translation is not None or rotation is not None
-    stated = PoseError(translation or 0.0, float(np.radians(rotation or 0.0))) if told else UNTOLD_ERROR
-    return Poses(path, made, tuple(names), stated, told)
+    # What is not stated is assumed, never taken for exact.
+    stated = PoseError(
+        UNTOLD_ERROR.translation if translation is None else translation,
+        UNTOLD_ERROR.rotation if rotation is None else float(np.radians(rotation)),
+    )
+    return Poses(path, made, tuple(names), stated, translation is not None and rotation is not None)
 
 
 Read = tuple[list[Array], list[str], dict[str, Any]]
@@ -129,8 +137,8 @@ def _share(settings: dict[str, Any], key: str, most: float, where: str) -> float
     if value is None:
         return None
     try:
-        number = float(value)
-    except (TypeError, ValueError):
+        number = np.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not 0 <= number <= most:
         raise InputError(f"{where}: {key} = {shown(str(value), 40)}; must be a number in [0, {most:g}]")
@@ -143,7 +151,12 @@ def _from_json(text: str, where: str) -> Read:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: no JSON ({str(error)[:80]})") from error
     table = data if isinstance(data, dict) else {}
-    entries = next((table[key] for key in LISTS if key in table), data)
+    for key in table:
+        _check_setting(key, where)
+    lists = [key for key in LISTS if key in table]
+    if len(lists) > 1:
+        raise InputError(f"{where}: holds {' and '.join(lists)}; must hold one list of poses")
+    entries = table[lists[0]] if lists else data
     if not isinstance(entries, list):
         raise InputError(f"{where}: no list of poses; must be a list, or hold one under {', '.join(LISTS)}")
     poses, names = [], []
@@ -152,7 +165,9 @@ def _from_json(text: str, where: str) -> Read:
         matrix = entry
         if isinstance(entry, dict):
             matrix = next((entry[key] for key in MATRICES if key in entry), None)
-            named = next((entry[key] for key in NAMES if isinstance(entry.get(key), str)), None)
+            named = next((entry[key] for key in NAMES if entry.get(key) is not None), None)
+            if named is not None and not isinstance(named, str):
+                raise InputError(f"{at}: names its frame {shown(str(named), 40)}; must be the name of a file")
             names += [] if named is None else [Path(named).name]
         poses.append(_matrix(matrix, at))
     if names and len(names) < len(poses):
@@ -160,8 +175,14 @@ def _from_json(text: str, where: str) -> Read:
     return (
         poses,
         names,
-        {key: table[key] for key in ("unit", "translation_error", "rotation_error_deg") if key in table},
+        {key: table[key] for key in SETTINGS if key in table},
     )
+
+
+def _check_setting(key: str, where: str) -> None:
+    """Raise `InputError` for a key that is nearly a setting: what it says would be passed over."""
+    if key not in SETTINGS and (meant := close_names(key.lower(), SETTINGS)):
+        raise InputError(f"{where}: {shown(key, 40)}: unknown; did you mean {meant[0]}?")
 
 
 def _matrix(value: object, at: str) -> Array:
@@ -169,8 +190,11 @@ def _matrix(value: object, at: str) -> Array:
     if value is None:
         raise InputError(f"{at}: no {' or '.join(MATRICES)}; must hold one, 4 x 4")
     try:
-        T = np.array(value, dtype=float)
-    except (TypeError, ValueError):
+        # Text and truth values are no numbers, though they can be made into some.
+        rows = value if isinstance(value, list) else []
+        sound = all(type(each) in (int, float) for row in rows for each in (row if isinstance(row, list) else [None]))
+        T = np.array(value, dtype=float) if sound else np.empty(0)
+    except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(f"{at}: {shown(str(value), 40)}; must be a 4 x 4 matrix of numbers")
@@ -191,8 +215,11 @@ def _from_tum(text: str, where: str) -> Read:
     """Read lines of timestamp tx ty tz qx qy qz qw; comments begin with # and may state a setting as key: value."""
     poses, settings = [], {}
     for number, line in enumerate(text.splitlines(), 1):
-        if setting := re.match(r"#\s*(unit|translation_error|rotation_error_deg)\s*[:=]\s*(\S+)\s*$", line):
-            settings[setting[1]] = setting[2]
+        if setting := re.match(r"#\s*([A-Za-z_]+)\s*[:=]\s*(\S+)\s*$", line):
+            key = setting[1].lower()
+            _check_setting(key, f"{where}: line {number}")
+            if key in SETTINGS:
+                settings[key] = setting[2]
         if not (words := line.partition("#")[0].replace(",", " ").split()):
             continue
         at = f"{where}: line {number}"

@@ -30,6 +30,9 @@ MAX_ADDRESS = 1_600_000
 LEAST_FRAMES = 3
 """Shorter tracks are counted, not listed."""
 
+OUTLINE = "#5cd0ff"
+"""Colour of the outlines of highlights without a single normal: neither that of isophotes nor of any estimator."""
+
 HALF = 0.5
 """Isovalue of the isophote that is drawn of every highlight."""
 
@@ -43,8 +46,11 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
         "others": [
             {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
-             "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score}
-            for h in (*record.other_highlights, *(s.highlight for s in spots if s.highlight and s.peak_px is None))
+             "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score, "id": number}
+            for number, h in [
+                *((None, h) for h in record.other_highlights),
+                *((s.id, s.highlight) for s in spots if s.highlight and s.peak_px is None),
+            ]
         ],
         "colours": palette,
         "words": {name: getattr(explanations, name.upper()) for name in ("flags", "reasons", "parts")}
@@ -60,7 +66,8 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
         others=len(data["others"]), left_out=len(record.other_highlights),
         left_out_kinds=explanations.kinds_counted(h.kind for h in record.other_highlights),
-        light_note=light_note(record.assumed), parts=explanations.PARTS, chi95=chi_squared.quantile(0.95, 2),
+        light_note=light_note(record.assumed), parts=explanations.PARTS, outline=OUTLINE,
+        chi95=chi_squared.quantile(0.95, 2),
     )  # fmt: skip
 
 
@@ -143,6 +150,7 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
         "isophotes": [lines.index(points) for _, points in traced],
         "curves": [lines.index(curve) for curve in drawing.curves],
         "deviation": deviation_deg(result),
+        "silent": explanations.why_no_error(name, result),
         "across": _across(result),
         "target": result.target,
         "parts": {name: round(float(np.degrees(v)), 4) for name, v in deviations(result.budget or {}).items()},

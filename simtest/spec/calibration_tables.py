@@ -95,7 +95,7 @@ def _surface(priors: Priors) -> dict[str, Any]:
 def _uncertainty(priors: Priors) -> dict[str, Any]:
     power = priors.falloff_power
     return {
-        **{item.name: getattr(priors.camera, item.name) or None for item in fields(priors.camera)},
+        **{name: deviation or None for name, deviation in priors.camera.deviations.items()},
         "falloff_power": None if power in (None, UNTOLD_FALLOFF_POWER) else _interval(power),
     }
 

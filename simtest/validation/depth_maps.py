@@ -112,6 +112,11 @@ def _read_npy(path: Path, wanted: str) -> npt.NDArray[np.generic]:
         if "pickle" in told or "Python objects" in told:
             told = "it holds Python objects, which are never loaded"
         raise InputError(f"{shown(path)}: no NPY file, or a damaged one ({told})") from None
+    if not isinstance(values, np.ndarray):
+        values.close()
+        raise InputError(f"{shown(path)}: holds several arrays, as NPZ files do; must be one, NPY")
+    if values.ndim not in (2, 3) or not values.size:
+        raise InputError(f"{shown(path)}: has shape {values.shape}; must be (H, W) or (H, W, C)")
     if values.dtype.kind not in "iuf":
         raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be numbers")
     check_limit("picture_pixels", values.size, path, "values")

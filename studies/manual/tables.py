@@ -9,7 +9,7 @@ NORMALS = {
     "inferred": "which of encoding, saturation_level, detector, smoothing_px and estimators were not given, but chosen",
     "view": "`circle` (cx, cy, radius, px) of a round view and `outline` of what is seen; null: the whole picture",
     "warnings": "one line each",
-    "assumed": "what was not given: `what`, `distribution`, `how_to_narrow`",
+    "assumed": "what is not known exactly: `what`, `distribution`, `how_to_narrow`, `given` (by the calibration)",
     "stated": "what the best estimates state: medians of the parts of their budgets; null where none states anything",
     "frame": "the frame of all vectors, in words",
     "specularities": "a list, the brightest first: the next table",

@@ -24,8 +24,10 @@ from simtest.calibration import (
 )  # fmt: skip
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
+from simtest.estimators.process.requests import priors_message
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
 from simtest.geometry.angular_profile import AngularProfile
+from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.simulation.frame_files import picture_calibration
 from simtest.spec import load_scene, scene_from_dict
 from simtest.spec.calibration_tables import degrees_of
@@ -213,3 +215,11 @@ def test_the_example_of_the_manual_reads_back(tmp_path):
     # Each key of the example is one that counts.
     assert len(stated.priors.lights_mm) == 2
     assert stated.priors.camera == CameraPrior(0.01, 5.0, 0.02)
+
+
+def test_a_guessed_camera_is_written_with_its_deviations_alone(tmp_path):
+    stated = calibration_of_view(70.0, 200, 160)
+    again = written(stated, tmp_path)
+    same(again, stated)
+    assert (stated.priors.camera.guessed, again.priors.camera.guessed) == (True, False)
+    assert set(priors_message(stated.priors)["camera"]) == {"focal_sd", "centre_sd_px", "distortion_sd"}

@@ -1,6 +1,7 @@
 """The best estimate and why; what is assumed where nobody told, and the keys that narrow it."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,8 @@ from simtest.calibration import CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.reconstruction.assumptions import FOCAL_SD, NEAR_MISSES, assumptions, calibration_of_view
-from simtest.reconstruction.picture import BORDERED, Options, read_calibration, reconstruct_values
+from simtest.reconstruction.borders import BORDERED
+from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.ranking import best_of, stated_errors
 from simtest.runtime.files import write_json
 from simtest.spec import load_calibration
@@ -107,16 +109,50 @@ def test_a_field_of_view_is_told_with_its_extent(tmp_path):
     assert "70 deg across the picture's diagonal" in told
 
 
-def test_dark_borders_are_told_where_the_field_of_view_alone_is_known():
-    y, x = np.mgrid[:160, :200]
-    inside = np.hypot(x - 100, y - 80) < 70
+def tissue(lit):
     picture = np.repeat(spot()[..., None], 3, axis=2) * [0.5, 0.3, 0.25] + [0.4, 0.2, 0.15]
-    round_view = np.where(inside[..., None], picture, 0.0).clip(0, 1).astype(np.float32)
-    options = Options(fov_deg=70.0)
-    calibration, _ = read_calibration(options, round_view)
-    assert BORDERED in reconstruct_values("a", round_view, calibration, options).warnings
-    whole = picture.clip(0, 1).astype(np.float32)
-    assert BORDERED not in reconstruct_values("a", whole, calibration, options).warnings
+    return np.where(lit[..., None], picture, 0.0).clip(0, 1).astype(np.float32)
+
+
+def notes_of(picture, fov_of="width"):
+    options = Options(fov_deg=70.0, fov_of=fov_of, estimators=("brightest_point",))
+    warnings = reconstruct_values("a", picture, read_calibration(options, picture)[0], options).warnings
+    return [each for each in warnings if each.startswith(BORDERED)]
+
+
+Y, X = np.mgrid[:160, :200] + 0.5
+ROUND = np.hypot(X - 110, Y - 80) < 75
+
+
+def test_dark_borders_are_named_and_the_note_can_be_obeyed():
+    (note,) = notes_of(tissue(ROUND))
+    first, end, top, low = (
+        int(v) for v in re.findall(r"(\d+) to (\d+)", note)[0] + re.findall(r"(\d+) to (\d+)", note)[1]
+    )
+    assert (first, end, top, low) == pytest.approx((35, 184, 5, 154), abs=2)
+    assert "--fov-of view" in note
+    # dark corners alone are no borders: nothing is left to crop
+    assert notes_of(np.ascontiguousarray(tissue(ROUND)[top : low + 1, first : end + 1])) == []
+    assert notes_of(tissue(ROUND), "view") == []
+    assert notes_of(tissue(np.ones((160, 200), bool))) == []
+    assert notes_of(tissue(np.abs(X - 100) + np.abs(Y - 80) < 160)) == []
+    # straight borders, which no circle explains
+    (straight,) = notes_of(tissue((X > 20) & (X < 190)))
+    assert "columns 20 to 189 of 200" in straight
+    assert "rows" not in straight
+    assert "--fov-of view" not in straight
+
+
+def test_a_field_of_view_may_span_the_round_view():
+    options = Options(fov_deg=70.0, fov_of="view")
+    calibration, (told,) = read_calibration(options, tissue(ROUND))
+    camera = calibration.camera
+    assert (camera.cx, camera.cy) == pytest.approx((110, 80), abs=0.7)
+    assert camera.fx == pytest.approx(75 / np.tan(np.radians(35.0)), rel=0.02)
+    assert calibration.priors == calibration_of_view(70.0, 200, 160).priors
+    assert "across the picture's round view" in told
+    with pytest.raises(InputError, match="--fov-of view: no round view was found"):
+        read_calibration(options, tissue(np.ones((160, 200), bool)))
 
 
 def test_a_full_calibration_leaves_nothing_open(tmp_path):
@@ -129,6 +165,31 @@ def test_a_full_calibration_leaves_nothing_open(tmp_path):
     told = load_calibration(path)
     assert assumptions(told, None, "fine") == [NEAR_MISSES]
     assert assumptions(replace(told, priors=replace(told.priors, plane=True)), None, "fine") == []
+
+
+def test_what_a_file_states_is_given_and_not_assumed(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlights_mm = [[3, 0, 0]]\ndistance_range_mm = [20, 60]\n"
+        "[uncertainty]\nfocal_sd = 0.05\ncentre_sd_px = 15.0\n"
+    )
+    made = assumptions(load_calibration(path), None, "base")
+    assert {each.what for each in made if each.given} == {"distance of the tissue", "focal length", "principal point"}
+    assert {each.what for each in made if not each.given} == {
+        "response", "falloff towards the border", "slope of the relief", "highlights",
+    }  # fmt: skip
+    assert (
+        str(made[0])
+        == "distance of the tissue: uniform from 20 to 60 mm along the sightline (given by the calibration)"
+    )
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlight_offset_mm = [2, 4]\n[surface]\nrelief_slope_deg = 2.0\n"
+        "[uncertainty]\nfalloff_power = [0, 2]\n"
+    )
+    made = assumptions(load_calibration(path), None, "base")
+    assert {each.what for each in made if each.given} == {"light", "falloff towards the border", "slope of the relief"}
+    # A field of view states nothing of these.
+    assert not any(each.given for each in assumptions(calibration_of_view(70.0, 200, 160), None, "base"))
 
 
 def test_the_keys_that_narrow(tmp_path):

@@ -50,6 +50,17 @@ def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
     assert any("along the" in line and "found out" in line for line in score.lines)
 
 
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("kind", ["z", "ray"])
+@pytest.mark.parametrize("shift", [-4.0, 4.0])
+def test_kind_of_relative_depths_is_found_out(lens, kind, shift, tmp_path):
+    truth = sphere_truth(camera=LENSES[lens])
+    np.save(tmp_path / "a.npy", 0.5 * truth.distance * depth_factor(truth.camera, kind) + shift)
+    score = scored(tmp_path, truth)
+    assert score.conventions.depth == kind
+    assert score.cell("depth_affine")["median"] < 0.2
+
+
 def test_a_wrong_scale_is_told_and_mended_by_alignment(tmp_path):
     truths = [sphere_truth("a"), sphere_truth("b", centre=(-5.0, 0.0, 28.0))]
     for truth in truths:
@@ -162,3 +173,34 @@ def test_page_table_and_json(tmp_path):
     assert rows.filter(all_fine)["n"].to_list() == [truth.scored.sum() for truth in truths]
     # The rows of the frames add up to the figures of all.
     assert rows.filter(all_fine)["n_unanswered"].sum() == zone["all"]["n_unanswered"]
+
+
+def test_disparities_are_told_and_not_answered(tmp_path):
+    truths = [sphere_truth("a"), sphere_truth("b", centre=(-5.0, 0.0, 28.0))]
+    np.save(tmp_path / "a.npy", 1 / truths[0].distance)
+    np.save(tmp_path / "b.npy", truths[1].distance)
+    score = scored(tmp_path, *truths, depth="ray")
+    assert score.to_json()["alignments"]["affine"]["frames_turned_round"] == 1
+    assert any(line.startswith("warning: depths, affine: the factor is negative in 1 frames") for line in score.lines)
+    # The frame of depths alone is answered.
+    answers = truths[1].scored.sum() / sum(truth.scored.sum() for truth in truths)
+    cell = score.cell("depth_affine", quantity="depth_percent")
+    assert cell["share_unanswered"] == pytest.approx(1 - answers)
+    assert cell["p95"] < 1e-4
+    (tmp_path / "b.npy").unlink()
+    only = scored(tmp_path, truths[0], depth="ray")
+    assert only.cell("depth_affine")["share_unanswered"] == 1
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_alignment_does_not_depend_on_the_unit(scale):
+    truth = np.random.default_rng(0).uniform(10, 60, 1000)
+    factor, shift = align((truth - 3.0) * scale, truth, "affine")
+    assert factor * scale == pytest.approx(1.0)
+    assert shift == pytest.approx(3.0)
+
+
+def test_depths_beyond_all_measure_are_no_answer(tmp_path):
+    truth = sphere_truth()
+    np.save(tmp_path / "a.npy", truth.distance * 1e306)
+    assert scored(tmp_path, truth, depth="ray").cell("depth_affine")["share_unanswered"] == 1

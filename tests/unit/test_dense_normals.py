@@ -188,6 +188,17 @@ def test_a_frame_without_a_map_is_unanswered_as_a_whole(tmp_path):
         (lambda folder, n: (folder / "a.txt").write_text("1"), "holds no maps"),
         (lambda folder, n: np.save(folder / "a.npy", (100 * n).astype(np.int64)), "normals are int64"),
         (lambda folder, n: np.save(folder / "a_normal.npy", n[..., 0]), "has one channel"),
+        (lambda folder, n: np.save(folder / "a.npy", np.float64(1.0)), r"has shape \(\)"),
+        (lambda folder, n: np.save(folder / "a.npy", n[:0]), "has shape"),
+        (lambda folder, n: _npz(folder / "a.npy", n), "holds several arrays"),
+        (lambda folder, n: np.save(folder / "a.npy", 1e300 * n), "hold no normal"),
+        (lambda folder, n: np.save(folder / "a.npy", 1e-300 * n), "hold no normal"),
+        (lambda folder, n: np.save(folder / "a.npy", np.nan * n), "hold no normal"),
+        (lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.zeros((*n.shape[:2], 3), np.uint8)), "hold no normal"),
+        (
+            lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.full((*n.shape[:2], 4), [9, 8, 7, 0], np.uint8)),
+            "hold no normal",
+        ),
         (
             lambda folder, n: (np.save(folder / "a.npy", n), write_png(folder / "a.png", n)),
             "a second map of frame a",
@@ -200,6 +211,11 @@ def test_what_does_not_fit_is_refused_in_one_line(make, message, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         scored(tmp_path, truth)
     assert "\n" not in str(refused.value)
+
+
+def _npz(path, values):
+    with path.open("wb") as file:
+        np.savez(file, values)
 
 
 @pytest.mark.parametrize("stated", [{"encoding": "rgb"}, {"frame": "up"}, {"depth": "inverse"}, {"unit_mm": -1.0}])

@@ -157,3 +157,19 @@ def test_what_the_method_needs_is_asked_for_before_the_work(film, tmp_path):
     with pytest.raises(InputError, match="5 poses of frames without names; must be one for each of the 4 frames"):
         reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=few))
     assert not (tmp_path / "out" / "run.json").exists()
+
+
+@pytest.mark.render
+def test_more_poses_than_frames_of_a_film_are_told(film, tmp_path):
+    """The number of a film's frames is known when it has been read: the first poses are taken, with a warning."""
+    folder, options = film("convex")
+    pictures = [cv2.imread(str(file)) for file in sorted((folder / "frames").iterdir())]
+    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (320, 320))
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    table = json.loads((folder / "poses.json").read_text())
+    poses = [entry["world_from_camera"] for entry in table["frames"]]
+    (tmp_path / "poses.json").write_text(json.dumps({**table, "frames": [*poses, *poses[:2]]}))
+    with pytest.warns(UserWarning, match="6 poses for 4 frames; the first ones are taken"):
+        reconstruct_sequence(tmp_path / "film.avi", tmp_path / "out", replace(options, poses=tmp_path / "poses.json"))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Uniform
-from simtest.cli.reconstruct import _print_assumed, _print_counts
+from simtest.cli.reconstruct import _print_assumed, _print_counts, _print_silent
 from simtest.detection.blobs import Highlight, Kind
 from simtest.detection.regions import Region
 from simtest.detection.view_mask import View
@@ -22,7 +22,7 @@ from simtest.geometry import Camera
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import LIGHT_AT_CAMERA, assumptions, calibration_of_view
 from simtest.reconstruction.description import Drawing, PictureRecord, SpecularityRecord, members
-from simtest.reconstruction.overlay import ISOPHOTE, draw_overlay
+from simtest.reconstruction.overlay import ISOPHOTE, NUMBER, draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
 
 WIDTH, HEIGHT = 320, 240
@@ -93,6 +93,34 @@ def test_the_covariance_across_the_view_is_foreshortened(tmp_path):
     assert xy == pytest.approx(0, abs=1e-9)
 
 
+def test_an_empty_error_has_a_reason(tmp_path, capsys):
+    silent = replace(estimate((15, 15)), budget=None, covariance=None)
+    cut, beside = replace(silent, flags=("partial_arc",)), replace(silent, flags=("unresolved", "light_offset"))
+    four = {"brightest_point": cut, "cone_axis": beside, "circle_pose": silent, "mine": cut, "curved": estimate((1, 1))}
+    _, data = page_of([spot(0, (15, 15), four, "brightest_point")], tmp_path)
+    told = {row["name"]: row["silent"] for row in data["spots"][0]["rows"]}
+    words = explanations.UNTOLD_ERROR
+    assert told == {
+        "brightest_point": words["no_isophote"], "cone_axis": words["light_offset"],
+        "circle_pose": words["circle_pose"], "mine": words["other"], "curved": "",
+    }  # fmt: skip
+    _print_silent([spot(0, (15, 15), four, "brightest_point"), spot(1, (15, 15), four, "curved")])
+    assert capsys.readouterr().out == f"no ± at 1 best normal: {words['no_isophote']}\n"
+
+
+def test_numbers_of_the_overlay_stand_on_a_dark_ground():
+    white = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    made = draw_overlay(white, [spot(0, (150, 100), {"cone_axis": estimate((150, 100))}, "cone_axis")])
+    scale = made.shape[1] // WIDTH
+    x, y, w, h = spot(0, (150, 100), {}, None).box_px
+    left, low = int((x + 0.75 * w) * scale), int((y + 0.25 * h) * scale)
+    ground = made[low - 12 : low + 3, left : left + 9]
+    yellow = (ground == NUMBER).all(axis=-1)
+    assert yellow.any()
+    # 64: a quarter of white; the letter's own dark edge alone would leave white between its strokes
+    assert ground[~yellow].max(axis=-1).mean() < 100
+
+
 def test_glints_belong_to_their_cloud(tmp_path):
     spots = [*many(2), cloud_spot(2, [many(2)[1].peak_px, (100, 100)], (120.0, 110.0))]
     assert members(spots) == {1: 2}
@@ -124,6 +152,20 @@ def left_out(kind, at):
     edge = np.array(RING) + at
     region = Region((at[0] - 5, at[1] - 5, 10, 10), np.array(at), 0.5)
     return Highlight(region, kind, 0.2, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
+
+
+def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path, capsys):
+    first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
+    record = replace(record_of(many(1)), assumed=[first, *(replace(each, given=True) for each in others)])
+    write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Given by the calibration, not exactly: distance of the tissue, focal length" in page
+    assert "Assumed, because nothing states it: light</summary>" in page
+    _print_assumed(record.assumed)
+    _, *lines = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[:2] for line in (lines[0], lines[-1])] == [
+        ["given", "distance of the tissue"], ["assumed", "light"]
+    ]  # fmt: skip
 
 
 def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path, capsys):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
+from simtest.estimators.two_views import PoseError
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.poses import UNTOLD_ERROR, read_poses
 
@@ -98,6 +99,19 @@ MALFORMED = {
     "quaternion of length 2": ("a.txt", "0 0 0 0 0 0 0 2\n"),
     "holds no pose; must": ("a.txt", "# nothing\n"),
     "no text": ("a.txt", None),
+    "units: unknown; did you mean unit?": ("a.json", json.dumps({"units": "m", "poses": [np.eye(4).tolist()]})),
+    "translation_err: unknown; did you mean translation_error?": (
+        "a.json", json.dumps({"translation_err": 0.1, "poses": [np.eye(4).tolist()]})),
+    "line 1: units: unknown; did you mean unit?": ("a.txt", "# Units = mm\n0 0 0 0 0 0 0 1\n"),
+    "names its frame 3; must be the name of a file": (
+        "a.json", json.dumps([{"frame": 3, "world_from_camera": np.eye(4).tolist()}])),
+    "holds frames and poses; must hold one list": ("a.json", json.dumps({"frames": [], "poses": []})),
+    "[[true": ("a.json", json.dumps([[[True, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]).replace(" ", "")),
+    "matrix of numbers": ("a.json", json.dumps([[["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])),
+    "4 x 4 matrix of numbers": ("a.json", f"[[[1, 0, 0, {10**400}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),
+    "a position of 1e+306 mm": ("a.json", "[[[1, 0, 0, 1e306], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),
+    "unit = ['m']": ("a.json", json.dumps({"unit": ["m"], "poses": [np.eye(4).tolist()]})),
+    "translation_error = true": ("a.json", json.dumps({"translation_error": True, "poses": [np.eye(4).tolist()]})),
 }  # fmt: skip
 
 
@@ -117,3 +131,15 @@ def test_malformed_files_are_one_line(words, tmp_path):
 def test_a_missing_file_is_one_line(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_poses(tmp_path / "none.json")
+
+
+def test_an_error_that_is_not_stated_is_assumed_not_zero(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("# Unit = mm\n# Translation_Error: 0.05\n# file: 'bag'\n1 2 3 4 0 0 0 1\n")
+    read = read_poses(path)
+    assert read.error.translation == 0.05
+    assert read.error.rotation == UNTOLD_ERROR.rotation
+    assert not read.error_told
+    np.testing.assert_array_equal(read.world_from_camera[0, :3, 3], [2, 3, 4])
+    path.write_text("# translation_error: 0\n# rotation_error_deg: 0\n1 2 3 4 0 0 0 1\n")
+    assert (read_poses(path).error, read_poses(path).error_told) == (PoseError(0.0, 0.0), True)

@@ -50,7 +50,7 @@ def priors_message(priors: Priors) -> dict[str, Any]:
             name: None if prior is None else _distribution(prior) | {"told": _is_told(priors, name)}
             for name, prior in named.items()
         },
-        "camera": asdict(priors.camera),
+        "camera": priors.camera.deviations,
         "plane": priors.plane,
     }
 

@@ -99,8 +99,13 @@ class AxesEvidence:
         Raises
         ------
         InputError
-            If none fits, or the best cannot be told from the next; `what` names the maps.
+            If there is no normal, none fits, or the best cannot be told from the next; `what` names the maps.
         """
+        if not self.cosines:
+            raise InputError(
+                f"{what}: hold no normal: every pixel is NaN, 0, transparent or too long or short for a unit vector; "
+                "say --frame to score them as unanswered"
+            )
         best, second, gap, error = self._compare()
         if self.mean[best] < LEAST_COSINE:
             angle = np.degrees(np.arccos(np.clip(self.mean[best], -1, 1)))

@@ -166,7 +166,7 @@ class Evidence:
                 )
         if self.has_depths:
             how = "as stated" if self.options.depth else (
-                "found out: spread of truth over depth " + ", ".join(
+                "found out: spread of what an affine alignment leaves " + ", ".join(
                     f"{value:.3g} along the {'axis' if kind == 'spread_z' else 'ray'}"
                     for kind, value in self.depth.to_json().items()))  # fmt: skip
             told.append(f"depths: along the {'axis (z)' if chosen.depth == 'z' else 'ray'}, {how}")

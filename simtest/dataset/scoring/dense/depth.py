@@ -72,6 +72,9 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
     depth, truth = depth[::every], truth[::every]
     columns = [depth / truth] if how == "scale" else [depth / truth, 1 / truth]
     design = np.stack(columns, axis=1)
+    # Units differ by orders of magnitude: columns of about 1 keep the equations well conditioned.
+    scale = np.median(design, axis=0)
+    design = design / scale
     fitted = _start(design)
     for _ in range(ROUNDS):
         residual = np.abs(design @ fitted - 1)
@@ -81,6 +84,7 @@ def align(depth: Array, truth: Array, how: Alignment) -> tuple[float, float]:
         last, fitted = fitted, np.linalg.lstsq(weighed.T @ design, weighed.sum(axis=0), rcond=None)[0]
         if np.allclose(last, fitted, rtol=1e-10, atol=1e-12):
             break
+    fitted = fitted / scale
     return float(fitted[0]), float(fitted[1]) if how == "affine" else 0.0
 
 
@@ -113,18 +117,23 @@ def normals_of_distance(distance: Array, rays: Array) -> Array:
 
 @dataclass
 class DepthEvidence:
-    """How well depths fit the truth as each kind, over all frames that were added."""
+    """How well depths fit the truth as each kind, over all frames that were added.
+
+    Each kind is judged after its own affine alignment: the shift of relative depths would otherwise hide the kind.
+    """
 
     spreads: dict[DepthKind, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
-    """Spread of the logarithm of truth over depth, a frame: 0 where a factor alone is missing."""
+    """Spread of the relative residuals, a frame: 0 where a factor and a shift alone are missing."""
 
     def add(self, depth: Array, distance: Array, factors: dict[DepthKind, Array]) -> None:
         """Add a frame: depths, true distances and `depth_factor` of its answered pixels, shape (N,)."""
         if len(depth) < LEAST_PIXELS:
             return
-        spreads = {kind: _spread(np.log(distance * factors[kind] / depth)) for kind in KINDS}
-        for kind, value in spreads.items():
-            self.spreads[kind].append(value)
+        for kind in KINDS:
+            sound = np.isfinite(factors[kind])
+            true, own = distance[sound] * factors[kind][sound], depth[sound]
+            factor, shift = align(own, true, "affine")
+            self.spreads[kind].append(_spread((factor * own + shift) / true - 1))
 
     @property
     def best(self) -> DepthKind:

@@ -25,6 +25,9 @@ ENCODINGS: dict[Encoding, str] = {
 
 SHORTEST = 0.1
 
+FARTHEST, NOTHING = 1e12, 1e-3
+"""Numbers beyond the first stand for infinity; three channels below the second hold no direction."""
+
 _ENDINGS = {"normal": "normal", "normals": "normal", "depth": "depth"}
 """Last words of a file's name that say which kind it is: NAME_normal.png."""
 
@@ -149,8 +152,11 @@ def read_map(one: MapFile, size: tuple[int, int]) -> RawMap:
 
 
 def kind_of(values: npt.NDArray[np.generic]) -> Kind:
-    """Return what a map without a telling name holds: depths where it has one channel, or three equal ones."""
-    return "depth" if values.ndim == 2 or bool((values == values[:, :, :1]).all()) else "normal"
+    """Return what a map without a telling name holds: depths where it has one channel, or three equal ones.
+
+    Three channels of nothing but zeros are normals without an answer.
+    """
+    return "depth" if values.ndim == 2 or bool((values == values[:, :, :1]).all() and values.any()) else "normal"
 
 
 def channel_vectors(raw: RawMap, encoding: Encoding) -> Array:
@@ -159,6 +165,8 @@ def channel_vectors(raw: RawMap, encoding: Encoding) -> Array:
     In integers no answer is 0 in all channels, or nearly the middle of all.
     """
     values = raw.values.astype(float)
+    # Numbers that stand for infinity; their squares overflow.
+    values[~(np.abs(values) < FARTHEST)] = np.nan
     largest = raw.largest
     if encoding == "components":
         vectors = values
@@ -174,7 +182,8 @@ def channel_vectors(raw: RawMap, encoding: Encoding) -> Array:
         # What is shorter than a tenth is the grey of "no direction", no rounded unit vector.
         vectors[np.linalg.norm(vectors, axis=-1) < SHORTEST] = np.nan
     elif encoding == "unit":
-        vectors[(values == 0).all(axis=-1)] = np.nan
+        # 0, or nearly: three components of -1 are no unit vector.
+        vectors[(np.abs(values) < NOTHING).all(axis=-1)] = np.nan
     if raw.clear is not None:
         vectors[raw.clear] = np.nan
     return vectors
@@ -206,7 +215,7 @@ def decode_depth(raw: RawMap, unit_mm: float | None) -> Array:
             "then take the aligned figures)"
         )
     depth = raw.values.astype(float) * (1.0 if unit_mm is None else unit_mm)
-    depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+    depth[~(np.isfinite(depth) & (depth > 0) & (depth < FARTHEST))] = np.nan
     if raw.clear is not None:
         depth[raw.clear] = np.nan
     return depth

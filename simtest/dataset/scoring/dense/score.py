@@ -69,6 +69,13 @@ class DenseScore:
         """What is told in words: conventions, alignments, and what was not answered."""
         told = self.evidence.lines(self.conventions)
         for how, found in self.scorer.alignment_summary().items():
+            if turned := found["frames_turned_round"]:
+                told.append(
+                    f"warning: depths, {how}: the factor is negative in {turned} frames, whose pixels count as "
+                    "unanswered; inverse depths (disparities) must be inverted first"
+                )
+            if not found["frames"]:
+                continue
             factor = found["factor"]
             text = f"depths, {how}: factor {factor['median']:.4g} ({factor['least']:.4g} to {factor['largest']:.4g})"
             if "shift_mm" in found:

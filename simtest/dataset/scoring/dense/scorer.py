@@ -91,7 +91,8 @@ class Scorer:
             for how in ALIGNMENTS:
                 a, b = align(depth[fitted_on], true[fitted_on], how)
                 self.alignments.setdefault(how, []).append((a, b))
-                aligned = (a * depth + b) / factor
+                # A factor below 0 turns the depths round: they are inverse ones, or no depths.
+                aligned = (a * depth + b) / factor if a > 0 else np.full(depth.shape, np.nan)
                 aligned[~(aligned > 0)] = np.nan
                 distances[depth_source(how)] = aligned
                 # A factor turns no normal.
@@ -124,13 +125,20 @@ class Scorer:
             })  # fmt: skip
 
     def alignment_summary(self) -> JsonObject:
-        """Return median, least and largest factor and shift of each alignment over the frames."""
+        """Return median, least and largest factor and shift of each alignment over the frames.
+
+        Frames whose factor is not positive are counted apart; their depths count as unanswered.
+        """
         summary: JsonObject = {}
         for how, pairs in self.alignments.items():
-            values = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
-            if how == "none" or not len(values):
+            found = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
+            values = found[found[:, 0] > 0]
+            if how == "none" or not len(found):
                 continue
-            own: JsonObject = {"frames": len(values)}
+            own: JsonObject = {"frames": len(values), "frames_turned_round": len(found) - len(values)}
+            if not len(values):
+                summary[how] = own
+                continue
             for column, name in enumerate(("factor", "shift_mm")):
                 if name == "factor" or how == "affine":
                     part = values[:, column]
