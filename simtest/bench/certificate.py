@@ -1,6 +1,7 @@
 """The certificate of a run: what was run, on what, by which core, with which results; checked when it is read."""
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,10 +35,13 @@ class Certificate:
         Of its file.
     content : dict
         As it stands there, without its own hash.
+    digest : str
+        Its own hash.
     """
 
     path: Path
     content: JsonObject
+    digest: str = ""
 
     @property
     def core(self) -> JsonObject:
@@ -93,7 +97,7 @@ def read_certificate(path: Path) -> Certificate:
     if path.is_dir():
         path = path / CERTIFICATE
     try:
-        told = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        told = _parsed(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read as a certificate ({why})") from error
@@ -104,10 +108,29 @@ def read_certificate(path: Path) -> Certificate:
     stated = told.pop(OF_CERTIFICATE, None)
     if missing := sorted(_KEYS - told.keys()):
         raise InputError(f"{shown(path)}: has no key {missing[0]}; a certificate has {', '.join(sorted(_KEYS))}")
-    if stated != digest_of(told):
+    if not isinstance(stated, str) or stated != digest_of(told):
         raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
     validate(CertificateForm, told, str(path))
-    return Certificate(path, told)
+    return Certificate(path, told, stated)
+
+
+def _parsed(text: str) -> Any:
+    """Return what JSON text holds; raise `ValueError` for what has no hash or no one meaning."""
+
+    def once(pairs: list[tuple[str, Any]]) -> JsonObject:
+        if len(table := dict(pairs)) < len(pairs):
+            raise ValueError("a key stands twice")
+        return table
+
+    def finite(number: str) -> float:
+        if not math.isfinite(value := float(number)):
+            raise ValueError(f"{shown(number, 20)}: must be a finite number")
+        return value
+
+    told = json.loads(text, object_pairs_hook=once, parse_float=finite, parse_constant=finite)
+    # What is nested too deeply to be written has no hash.
+    digest_of(told)
+    return told
 
 
 def check_suite(certificate: Certificate, suite: Suite) -> None:

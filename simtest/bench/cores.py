@@ -15,12 +15,12 @@ from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.estimators.process.command import INTERPRETERS
+from simtest.estimators.process.command import INTERPRETERS, parse_core
 from simtest.estimators.process.naming import core_hashes, core_name, core_records
 from simtest.estimators.protocol import BatchEstimator, Estimator
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.runtime.files import JsonObject
+from simtest.runtime.files import Json, JsonObject
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realiser
 
@@ -37,8 +37,9 @@ def load_core(text: str) -> tuple[str, AnyEstimator]:
 def core_record(text: str) -> JsonObject:
     """Return what a certificate tells of a core, without paths.
 
-    `sha256` is of the core's own files. An interpreter or another program of the machine, such as docker, is no part
-    of it, since it differs from machine to machine: it stands under `program`.
+    `sha256` is of the core's own files and of the words of its command. An interpreter or another program of the
+    machine, such as docker, is no part of it, since it differs from machine to machine: it stands under `program`.
+    Modules that a script loads are seen only where the command or the TOML file (`core.files`) names them.
 
     Raises
     ------
@@ -53,13 +54,23 @@ def core_record(text: str) -> JsonObject:
     ((_, hashes),) = core_hashes([text]).items()
     (program, digest), *files = hashes.items()
     own = files if _is_shared(Path(program)) else [(program, digest), *files]
+    # Files by name, without folders: the same core lies elsewhere on another machine.
+    named: Json = sorted([Path(file).name, of_file] for file, of_file in own)
     version = record.get("version")
     return {
         "name": core_name(text), "kind": "command", "version": None if version is None else str(version),
-        # Files by name, without folders: the same core lies elsewhere on another machine.
-        "sha256": digest_of(sorted([Path(file).name, of_file] for file, of_file in own)) if own else None,
+        "sha256": digest_of({"files": named, "words": _words(parse_core(text).arguments[1:])}),
         "program": {"name": Path(program).name, "sha256": digest},
     }  # fmt: skip
+
+
+def _words(arguments: Sequence[str]) -> list[str]:
+    """Return the words of a command as they are on every machine: paths without their folders."""
+    words = []
+    for word in arguments:
+        option, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
+        words.append(f"{option}{equals}{Path(value).name if value.startswith('/') else value}")
+    return words
 
 
 def _is_shared(program: Path) -> bool:

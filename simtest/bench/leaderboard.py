@@ -8,6 +8,7 @@ from typing import Any
 from simtest.bench.certificate import CERTIFICATE, Certificate, check_suite, read_certificate
 from simtest.bench.phrases import COLUMNS, NONE, degrees, part_cells, spanned
 from simtest.bench.suite import Suite
+from simtest.bench.verified import mark_of
 from simtest.bench.verify import check_quick
 from simtest.errors import InputError
 from simtest.pages.html import environment
@@ -50,11 +51,14 @@ class Board:
         By the mean of the parts' penalised errors.
     parts : dict
         By each part's penalised error.
+    verified : dict
+        Whether certificates that were run again hold, by their hashes.
     """
 
     seeds: str
     overall: list[Ranked]
     parts: dict[str, list[Ranked]]
+    verified: dict[str, bool]
 
     def to_json(self) -> JsonObject:
         """Return the ranks by core."""
@@ -62,17 +66,32 @@ class Board:
             "seeds": self.seeds,
             "overall": _names(self.overall),
             "parts": {part: _names(rows) for part, rows in self.parts.items()},
+            "verified": {_name(row.certificate): mark_of(row.certificate, self.verified) for row in self.overall},
         }
+
+    @property
+    def leader(self) -> str:
+        """Who leads, as a sentence: over all parts, or on each where no core has run them all."""
+        if self.overall[0].first:
+            return f"{self.overall[0].certificate.core['name']} has the smallest error over all parts"
+        leaders = [(part, rows[0]) for part, rows in self.parts.items() if rows[0].first]
+        told = [f"{row.certificate.core['name']} has the smallest error on the part {part}" for part, row in leaders]
+        return ", ".join(told) or "No core has answered"
 
 
 def _names(rows: list[Ranked]) -> JsonObject:
     """Return the ranks of a table, by core and version, best first."""
-    cores = [(row.certificate.core, row.rank) for row in rows]
-    return {f"{core['name']} {core['version'] or ''}".strip(): rank for core, rank in cores}
+    return {_name(row.certificate): row.rank for row in rows}
 
 
-def read_entries(folder: Path, suite: Suite) -> list[Board]:
+def _name(certificate: Certificate) -> str:
+    return f"{certificate.core['name']} {certificate.core['version'] or ''}".strip()
+
+
+def read_entries(folder: Path, suite: Suite, verified: dict[str, bool] | None = None) -> list[Board]:
     """Read the certificates below a folder and rank them; those of different seeds are ranked apart.
+
+    `verified` says which of them hold after a run again (`simtest.bench.verified`).
 
     Raises
     ------
@@ -91,7 +110,7 @@ def read_entries(folder: Path, suite: Suite) -> list[Board]:
         if problems := check_quick(certificate, suite).problems:
             raise InputError(f"{shown(file)}: {problems[0]}")
         entries.setdefault(_seeds(certificate), []).append(certificate)
-    return [_board(suite, seeds, held) for seeds, held in sorted(entries.items())]
+    return [_board(suite, seeds, held, verified or {}) for seeds, held in sorted(entries.items())]
 
 
 def _is_certificate(file: Path) -> bool:
@@ -110,7 +129,7 @@ def _seeds(certificate: Certificate) -> str:
     return f"public seed {told['seed']}" if certificate.commitment is None else f"sealed, {certificate.commitment}"
 
 
-def _board(suite: Suite, seeds: str, certificates: list[Certificate]) -> Board:
+def _board(suite: Suite, seeds: str, certificates: list[Certificate], verified: dict[str, bool]) -> Board:
     def overall(certificate: Certificate) -> tuple[float | None, Sequence[float] | None]:
         told = certificate.content["overall"]
         return told["penalised_deg"], told["penalised_interval"]
@@ -127,7 +146,7 @@ def _board(suite: Suite, seeds: str, certificates: list[Certificate]) -> Board:
         for part in suite.spec.parts
         if any(part.name in entry.parts for entry in certificates)
     }
-    return Board(seeds, ranked(certificates, overall), parts)
+    return Board(seeds, ranked(certificates, overall), parts, verified)
 
 
 def ranked(certificates: list[Certificate], figure: Figure) -> list[Ranked]:
@@ -155,7 +174,7 @@ def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
     make_folder(page.parent)
     made_by = provenance.environment()
     html = environment().get_template("leaderboard.html.j2").render(
-        suite=suite, boards=boards, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about,
+        suite=suite, boards=boards, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about, mark=mark_of,
         provenance={"commit": made_by["commit"] or NONE, "simtest": made_by["version"]},
     )  # fmt: skip
     write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))

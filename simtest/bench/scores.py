@@ -1,7 +1,9 @@
 """The figures of a part: accuracy with intervals over scenes, refusals and misses, and the uncertainty."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -104,8 +106,16 @@ def scenes_of(rows: pl.DataFrame, frames: Mapping[str, int]) -> Array:
 
 def results_hash(rows: pl.DataFrame) -> str:
     """Return the SHA-256 of a part's rows: of what was answered and how it was judged, in their order."""
-    held: list[Json] = [list(row) for row in rows.select(HASHED).fill_nan(None).iter_rows()]
+    held: list[Json] = [list(map(_plain, row)) for row in rows.select(HASHED).iter_rows()]
     return digest_of([list(HASHED), held])
+
+
+def _plain(value: Any) -> Json:
+    """Return a value as it is hashed; JSON knows neither NaN nor infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    plain: Json = value
+    return plain
 
 
 def _interval(values: Array, scenes: Array, median: bool = False) -> Interval | None:

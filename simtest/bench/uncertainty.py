@@ -45,7 +45,8 @@ class UncertaintyScore:
     verdict : str
         overconfident or underconfident where a test of the coverage says so, calibrated where not, else too few.
     inflation : float or None
-        Factor on the covariances with which 95 % of the regions would hold the true normal.
+        Factor on the covariances with which 95 % of the regions would hold the true normal; None where no factor
+        would do, since too many covariances are singular.
     semi_axis_deg : float or None
         Sharpness: median of the regions' mean semi-axis (the square root of both semi-axes' product), deg.
     energy_deg : float or None
@@ -71,16 +72,20 @@ def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore
     Parameters
     ----------
     answered : polars.DataFrame
-        Rows of results with status "ok" and a true highlight.
+        Rows of results with status "ok" and a true highlight. A stated covariance without a finite Mahalanobis
+        distance is singular.
     scenes : ndarray of int, shape (N,)
         Which scene each row is of: rows of one scene are not independent.
     """
-    squared = answered["mahalanobis2"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    stated = np.isfinite(squared)
+    distances = answered["mahalanobis2"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    covariances = answered.select("cov_11", "cov_12", "cov_22").cast(pl.Float64).to_numpy().astype(float)
+    # A singular region holds no true normal: it is one that was stated and missed, not one that was left open.
+    squared: Array = np.where(np.isnan(distances) & ~np.isnan(covariances).any(axis=1), np.inf, distances)
+    stated = ~np.isnan(squared)
     n, limit = int(stated.sum()), chi_squared.quantile(LEVEL, 2)
     if n == 0:
         return UncertaintyScore(0, None, None, UNTESTED, None, None, None)
-    inside = squared[stated] <= limit
+    inside = (squared[stated] <= limit).astype(float)
     error = coverage_error(inside, scenes[stated])
     share = float(np.mean(inside))
     # Wilson's interval for as many independent rows as would have this error.
@@ -88,11 +93,18 @@ def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore
     coordinates, covariances = _misses(answered)
     semi_axis = energy = None
     if len(covariances):
-        areas = np.sqrt(np.maximum(np.linalg.det(covariances), 0.0))
-        semi_axis = float(np.degrees(np.median(np.sqrt(limit * areas))))
-        energy = float(np.degrees(np.mean(energy_scores(coordinates, covariances))))
-    inflation = float(np.quantile(squared[stated], LEVEL) / limit)
+        with np.errstate(all="ignore"):
+            areas = np.sqrt(np.maximum(np.linalg.det(covariances), 0.0))
+            semi_axis = finite(np.degrees(np.median(np.sqrt(limit * areas))))
+            energy = finite(np.degrees(np.mean(energy_scores(coordinates, covariances))))
+    with np.errstate(invalid="ignore"):
+        inflation = finite(np.quantile(squared[stated], LEVEL) / limit)
     return UncertaintyScore(n, share, interval, verdict_of(share, error, n), inflation, semi_axis, energy)
+
+
+def finite(value: float | np.floating) -> float | None:
+    """Return a figure as a certificate holds it; None in place of what is not finite."""
+    return float(value) if np.isfinite(value) else None
 
 
 def coverage_error(inside: Array, scenes: Array) -> float:
@@ -165,7 +177,7 @@ def energy_scores(misses: Array, covariances: Array) -> Array:
 
 def _misses(answered: pl.DataFrame) -> tuple[Array, Array]:
     """Return the true normals' coordinates about the proposed ones, rad, and the covariances, where one is stated."""
-    columns = ["normal_x", "normal_y", "normal_z", "error_deg", "cov_11", "cov_12", "cov_22", "mahalanobis2"]
+    columns = ["normal_x", "normal_y", "normal_z", "error_deg", "cov_11", "cov_12", "cov_22"]
     names = ["truth_x", "truth_y", "truth_z"]
     held = answered.select(columns + names).drop_nulls()
     values = held.select(columns).to_numpy().astype(float)

@@ -19,7 +19,10 @@ WIDTH = 170
 """Columns of the table of parts; in fewer its words would be cut."""
 
 SuiteVersion = Annotated[str, Parameter(name="--suite", help="Version of the suite.")]
-Sealed = Annotated[Path | None, Parameter(help="File of sealed seeds; default the public seeds.", converter=named_path)]
+Sealed = Annotated[
+    Path | None,
+    Parameter(help="File of sealed seeds, - for standard input; default the public seeds.", converter=named_path),
+]
 Core = Annotated[str | None, Parameter(help='Estimator by name, or a command: "command: ./core --flag".')]
 Maps = Annotated[
     Path | None,
@@ -49,6 +52,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a core on the frozen cases; print its table and write certificate.json. A stopped run goes on."""
+    from simtest.bench.certificate import CERTIFICATE
     from simtest.bench.run import run_bench, run_maps
     from simtest.bench.suite import load_suite
     from simtest.cli.printing import print_files
@@ -75,6 +79,8 @@ def run(
         return
     _print_parts(made.content)
     print(made.certificate)
+    if sealed is not None:
+        print(f"sealed: the folders in {out} tell what the seeds draw; publish {CERTIFICATE} alone until they are open")
 
 
 @bench.command
@@ -92,6 +98,9 @@ def verify(
         Path | None, Parameter(help="Folder of the maps that the certificate is of.", converter=named_path)
     ] = None,
     sealed: Sealed = None,
+    verified: Annotated[
+        Path | None, Parameter(help="List that gets the finding, for bench table.", converter=named_path)
+    ] = None,
     quick: Annotated[bool, Parameter(negative="", help="Check hashes and consistency alone; run nothing.")] = False,
     engine: EngineName = "local",
     workers: Workers = 1,
@@ -110,11 +119,14 @@ def verify(
 
     from simtest.bench.certificate import read_certificate
     from simtest.bench.suite import load_suite
+    from simtest.bench.verified import keep_verified
     from simtest.bench.verify import check_quick, check_seeds, verify_run
     from simtest.cli.printing import print_json
     from simtest.cli.progress import progress_bar
     from simtest.runtime.engines import make_engine
 
+    if quick and verified is not None:
+        raise InputError("--verified: lists certificates that were run again; leave out --quick")
     told = read_certificate(certificate)
     suite = load_suite(str(told.content["suite"].get("version")))
     if quick:
@@ -126,11 +138,14 @@ def verify(
         with TemporaryDirectory() if out is None else nullcontext(str(out)) as folder, progress_bar() as progress:
             chosen = make_engine(engine, workers, address)
             found = verify_run(told, suite, Path(folder), seeds, core, maps, chosen, progress)
+        if verified is not None:
+            keep_verified(verified, told, found)
     if as_json:
-        print_json(found.to_json())
+        print_json({**found.to_json(), "run_again": not quick})
     else:
         print(*found.notes, *found.problems, sep="\n")
-        print("the certificate holds" if found.holds else f"{len(found.problems)} things speak against it")
+        holds = "the certificate is consistent; nothing was run" if quick else "the certificate holds: it was run again"
+        print(holds if found.holds else f"{len(found.problems)} things speak against it")
     return 0 if found.holds else 1
 
 
@@ -141,6 +156,9 @@ def table(
     *,
     out: Annotated[Path, Parameter(help="The page; or a folder, which gets index.html.", converter=named_path)],
     suite: SuiteVersion = "v1",
+    verified: Annotated[
+        Path | None, Parameter(help="List of the certificates that bench verify has run again.", converter=named_path)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a page that ranks the certificates below a folder.
@@ -152,10 +170,11 @@ def table(
     """
     from simtest.bench.leaderboard import read_entries, write_leaderboard
     from simtest.bench.suite import load_suite
+    from simtest.bench.verified import read_verified
     from simtest.cli.printing import print_files
 
     read = load_suite(suite)
-    boards = read_entries(folder, read)
+    boards = read_entries(folder, read, None if verified is None else read_verified(verified, required=True))
     page = write_leaderboard(read, boards, out)
     print_files([page], as_json, **({"boards": [board.to_json() for board in boards]} if as_json else {}))
 

@@ -1,8 +1,10 @@
 """A run of the benchmark on a tiny suite: its certificate, its verification and its place in the table."""
 
 import copy
+import io
 import json
 import platform
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,79 +13,32 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.bench.certificate import CERTIFICATE, OF_CERTIFICATE, check_suite, read_certificate, write_certificate
+from simtest.bench.certificate import CERTIFICATE, check_suite, read_certificate
+from simtest.bench.compare import compare
+from simtest.bench.cores import core_record
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
-from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
+from simtest.bench.leaderboard import read_entries
 from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
-from simtest.bench.suite import HASHES, SUITE, Suite, digest_of, frames_of, load_suite, read_suite, resolved_tables
-from simtest.bench.verify import check_quick, check_seeds, compare, verify_run
+from simtest.bench.seal import SEALED, seal
+from simtest.bench.suite import Suite, digest_of, frames_of
+from simtest.bench.verify import check_quick, check_seeds, verify_run
+from simtest.cli import bench
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
-from simtest.runtime.files import write_json
 from simtest.runtime.provenance import file_hash
-from simtest.spec import load_scene
-from simtest.spec.toml_files import toml_tables
-
-SUITE_TEXT = """
-name = "tiny"
-title = "Tiny"
-description = "Two small planes."
-format = 1
-seed = 5
-[[parts]]
-name = "smooth"
-title = "Smooth"
-description = "Planes."
-[[parts]]
-name = "dense"
-title = "Dense"
-description = "Maps."
-kind = "maps"
-[[cases]]
-part = "smooth"
-name = "plane"
-draws = 3
-realisations = 2
-[cases.draw]
-"surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
-[[cases]]
-part = "dense"
-name = "plane"
-draws = 2
-[cases.draw]
-"surface.tilt_deg" = { kind = "uniform", low = 1.0, high = 8.0 }
-"""
+from tests.bench_tiny import COMMITMENT, copied, tiny_suite
 
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    folder = tmp_path_factory.mktemp("suites") / "v1"
-    small = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
-    tables = resolved_tables(load_scene("plane", small | {"sensor.noise_sigma": 0.02}))
-    tables.pop("name")
-    for part in ("smooth", "dense"):
-        (folder / part).mkdir(parents=True)
-        (folder / part / "plane.toml").write_text(toml_tables(tables))
-    (folder / SUITE).write_text(SUITE_TEXT)
-    read = read_suite(folder)
-    write_json(folder / HASHES, {"suite": read.digest, "cases": read.hashes})
-    return load_suite("v1", folder)
+    return tiny_suite(tmp_path_factory.mktemp("suites") / "v1")
 
 
 @pytest.fixture(scope="module")
 def made(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> BenchRun:
     return run_bench(suite, "cone_axis", tmp_path_factory.mktemp("run"), public_seeds(suite))
-
-
-def _copied(made: BenchRun, folder: Path, change: Any = None) -> Path:
-    """Write a certificate with a change and a hash that fits it."""
-    content = copy.deepcopy(made.content)
-    if change:
-        change(content)
-    folder.mkdir(parents=True, exist_ok=True)
-    return write_certificate(folder, content)
 
 
 @pytest.mark.render
@@ -133,11 +88,11 @@ def test_a_certificate_is_verified_by_running_again(suite: Suite, made: BenchRun
 
 @pytest.mark.render
 def test_other_seeds_are_other_frames(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
-    sealed = run_bench(suite, "cone_axis", tmp_path, Seeds("secret", "its commitment"))
-    assert sealed.content["seeds"] == {"kind": "sealed", "commitment": "its commitment"}
+    sealed = run_bench(suite, "cone_axis", tmp_path, Seeds("secret", COMMITMENT))
+    assert sealed.content["seeds"] == {"kind": "sealed", "commitment": COMMITMENT}
     assert sealed.content["parts"]["smooth"]["results"] != made.content["parts"]["smooth"]["results"]
     told = read_certificate(sealed.certificate)
-    check_seeds(told, suite, Seeds("secret", "its commitment"))
+    check_seeds(told, suite, Seeds("secret", COMMITMENT))
     for seeds, words in (
         (public_seeds(suite), "--sealed must name"),
         (Seeds("x", "other"), "was run with other seeds"),
@@ -155,135 +110,10 @@ def test_a_certificate_runs_no_command(suite: Suite, made: BenchRun, tmp_path: P
     command = f"touch {tmp_path / 'started'}"
     (tmp_path / "core.toml").write_text(f"[core]\nname = 'x'\ncommand = '{command}'\n")
     name = f"command: {command}" if kind == "command" else str(tmp_path / "core.toml")
-    path = _copied(made, tmp_path / "entry", lambda content: content["core"].update(name=name))
+    path = copied(made, tmp_path / "entry", lambda content: content["core"].update(name=name))
     with pytest.raises(InputError, match="is not installed here"):
         verify_run(read_certificate(path), suite, tmp_path / "run", public_seeds(suite))
     assert not (tmp_path / "started").exists()
-
-
-@pytest.mark.render
-def test_medians_that_differ_are_told(made: BenchRun) -> None:
-    found = copy.deepcopy(made.content)
-    part = found["parts"]["smooth"]
-    part["results"], part["median_deg"] = "other", part["median_deg"] + 5e-4
-    assert compare(made.content, found).holds
-    part["median_deg"] += 1e-3
-    assert "medians differ by 0.0015 deg" in compare(made.content, found).problems[0]
-    part["median_deg"], part["penalised_deg"] = (
-        made.content["parts"]["smooth"]["median_deg"],
-        part["penalised_deg"] + 16,
-    )
-    # one highlight of six may be answered otherwise, by up to 90 deg
-    assert "penalised errors differ by 16 deg; at most 15 is allowed" in compare(made.content, found).problems[0]
-    part["penalised_deg"] -= 16
-    told = copy.deepcopy(made.content)
-    for content, coverage in ((told, 0.9), (found, 0.4)):
-        content["parts"]["smooth"]["uncertainty"].update(coverage=coverage, n=6)
-    assert "coverages differ by 0.5; at most 0.167" in compare(told, found).problems[0]
-    found["parts"]["smooth"]["uncertainty"]["coverage"] = 0.8
-    assert compare(told, found).holds
-    part["uncertainty"] = made.content["parts"]["smooth"]["uncertainty"]
-    part["answered"] = 4
-    assert compare(made.content, found).problems == ("smooth: answered 6, here 4; at most 1 may differ",)
-
-
-@pytest.mark.render
-def test_another_core_or_machine_is_told(made: BenchRun) -> None:
-    found = copy.deepcopy(made.content)
-    found["environment"]["processor"] = "another one"
-    assert any("another one" in note for note in compare(made.content, found).notes)
-    assert compare(made.content, found).holds
-    found["core"]["sha256"] = "abc"
-    assert compare(made.content, found).problems == ("core sha256: stated None, here abc",)
-
-
-@pytest.mark.render
-def test_an_altered_certificate_is_refused(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
-    held = json.loads(made.certificate.read_text())
-    held["parts"]["smooth"]["median_deg"] *= 0.5
-    path = tmp_path / CERTIFICATE
-    path.write_text(json.dumps(held))
-    with pytest.raises(InputError, match="was altered"):
-        read_certificate(path)
-    # with a hash that fits, the figures do not follow from the rows beside it
-    del held[OF_CERTIFICATE]
-    (tmp_path / "smooth").mkdir()
-    (tmp_path / "smooth" / "results.parquet").write_bytes(
-        (made.certificate.parent / "smooth" / "results.parquet").read_bytes()
-    )
-    path.write_text(json.dumps({**held, OF_CERTIFICATE: digest_of(held)}))
-    assert check_quick(read_certificate(path), suite).problems == (
-        "smooth: median_deg does not follow from the results",
-    )
-
-
-@pytest.mark.render
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda c: c["suite"].update(version="v2"), "is of version .v2."),
-        (lambda c: c["cases"].update({"smooth/plane": "0" * 64}), "case smooth/plane is not that of"),
-        (lambda c: c.update(format=9), "format = 9; this release reads 1"),
-        (lambda c: c.update(kind="other"), "is no certificate"),
-        (lambda c: c.pop("core"), "has no key core"),
-        (lambda c: c["parts"]["smooth"].update(missed=3), "do not add up to n = 6"),
-        (lambda c: c["overall"].update(penalised_deg=0.0), "overall: does not follow"),
-        (lambda c: c["cases"].clear(), "case smooth/plane is not that of"),
-        (lambda c: c["parts"].update(soft=c["parts"]["smooth"]), "part soft is none of|part 'soft' is none of"),
-        (lambda c: c["seeds"].update(seed=6), "neither a commitment nor the public seed 5"),
-        (lambda c: c["parts"]["smooth"].update(penalised_deg=0.001), "does not follow from the mean and the counts"),
-        (lambda c: c["parts"]["smooth"].update(mean_deg=None), "do not go with 6 answers"),
-        (lambda c: c["parts"]["smooth"].pop("n"), r"parts.smooth.n"),
-        (lambda c: c["parts"]["smooth"].update(median_deg="0.1"), r"parts.smooth.median_deg"),
-        (lambda c: c["parts"]["smooth"]["uncertainty"].update(verdict="best"), r"uncertainty.verdict"),
-        (lambda c: c.update(parts=[]), "parts"),
-        (lambda c: c["core"].update(name=["a"]), r"core.name"),
-        (lambda c: c.update(timing={}), r"timing.request"),
-    ],
-)
-def test_the_table_refuses_what_is_not_right(
-    suite: Suite, made: BenchRun, tmp_path: Path, change: Any, told: str
-) -> None:
-    _copied(made, tmp_path / "entry", change)
-    with pytest.raises(InputError, match=told) as raised:
-        read_entries(tmp_path, suite)
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.render
-def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
-    def named(name: str, low: float, high: float, seeds: Any = None) -> None:
-        def change(content: Any) -> None:
-            content["core"]["name"] = name
-            content["seeds"] = seeds or content["seeds"]
-            figures = {"penalised_deg": (low + high) / 2, "penalised_interval": [low, high]}
-            content["parts"]["smooth"].update(figures, mean_deg=(low + high) / 2)
-            # the headline of a single part is that part's
-            content["overall"].update(figures)
-
-        _copied(made, tmp_path / "all" / name, change)
-
-    named("best", 1.0, 2.0)
-    named("tied", 1.5, 2.5)
-    named("middle", 2.2, 3.0)
-    named("<worst>", 4.0, 5.0)
-    named("sealed one", 1.0, 2.0, {"kind": "sealed", "commitment": "abc"})
-    boards = read_entries(tmp_path / "all", suite)
-    ranks = [(row.certificate.core["name"], row.rank) for row in boards[0].overall]
-    assert ranks == [("best", "1–2"), ("tied", "1–3"), ("middle", "2–3"), ("<worst>", "4")]
-    assert [row.rank for row in boards[1].overall] == ["1"]
-    page = write_leaderboard(suite, boards, tmp_path / "table").read_text()
-    assert "&lt;worst&gt;" in page
-    assert "<worst>" not in page
-    assert page.count("<h1>") == 1
-
-
-def test_a_core_without_a_figure_has_no_rank(tmp_path: Path) -> None:
-    from simtest.bench.certificate import Certificate
-
-    held = [Certificate(tmp_path / name, {"value": value}) for name, value in (("a", None), ("b", 1.0))]
-    rows = ranked(held, lambda certificate: (certificate.content["value"], None))
-    assert [(row.certificate.path.name, row.rank) for row in rows] == [("b", "1"), ("a", "–")]
 
 
 @pytest.mark.render
@@ -314,6 +144,11 @@ def test_maps_are_scored_on_the_dense_part(suite: Suite, tmp_path: Path) -> None
     assert part["stated"] == {"encoding": "components", "frame": "opencv", "depth": None, "unit_mm": None}
     again = verify_run(told, suite, tmp_path / "again", public_seeds(suite), maps=maps)
     assert again.problems == ()
+    forged = copy.deepcopy(told.content)
+    forged["parts"]["dense"]["results"] = "0" * 64
+    assert compare(forged, told.content).holds
+    forged["parts"]["dense"]["zones"]["highlight"]["mean_deg"] = 0.0
+    assert compare(forged, told.content).problems[0].startswith("dense.zones.highlight.mean_deg: differs by")
     # What is no map is no part of the method.
     (maps / "notes.txt").write_text("mine")
     assert maps_record(maps, made_score(maps))["sha256"] == told.core["sha256"]
@@ -363,13 +198,11 @@ def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
     """A core that answers with the sightline of the peak, in a process of its own."""
     core = tmp_path / "core.py"
     core.write_text(CORE)
-    import sys
-
     made = run_bench(suite, f"command: {sys.executable} {core}", tmp_path / "run", public_seeds(suite))
     told = made.content["core"]
     assert (told["kind"], told["name"], told["version"]) == ("command", "core", "1.5")
     # The hash is of the script: another machine has another interpreter.
-    assert told["sha256"] == digest_of([["core.py", file_hash(core)]])
+    assert told["sha256"] == digest_of({"files": [["core.py", file_hash(core)]], "words": ["core.py"]})
     assert told["program"] == {"name": Path(sys.executable).name, "sha256": file_hash(Path(sys.executable))}
     found = copy.deepcopy(made.content)
     found["core"]["program"]["sha256"] = "0" * 64
@@ -381,6 +214,26 @@ def test_a_command_is_run_as_a_core(suite: Suite, tmp_path: Path) -> None:
     assert rows["estimator"].unique().to_list() == ["core"]
     with pytest.raises(InputError, match="--core must say"):
         verify_run(read_certificate(made.certificate), suite, tmp_path / "again", public_seeds(suite))
+
+
+@pytest.mark.render
+def test_a_core_s_hash_is_of_its_words_and_files(tmp_path: Path) -> None:
+    """Another option, another file or another content is another core; another folder is not."""
+
+    def sha256(folder: Path, words: str) -> Any:
+        return core_record(f"command: {sys.executable} {folder / 'core.py'} {words}")["sha256"]
+
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        (folder / "core.py").write_text(CORE)
+        (folder / "weights.bin").write_bytes(b"1")
+    plain = sha256(tmp_path / "a", "--fast")
+    assert plain == sha256(tmp_path / "b", "--fast")
+    weights = sha256(tmp_path / "a", f"--weights={tmp_path / 'a' / 'weights.bin'}")
+    assert weights == sha256(tmp_path / "b", f"--weights={tmp_path / 'b' / 'weights.bin'}")
+    (tmp_path / "b" / "weights.bin").write_bytes(b"2")
+    others = {sha256(tmp_path / "b", f"--weights={tmp_path / 'b' / 'weights.bin'}"), sha256(tmp_path / "a", "--slow")}
+    assert len({plain, weights, *others}) == 4
 
 
 CORE = """
@@ -410,3 +263,30 @@ for line in source:
 
 def test_the_suite_of_the_tests_is_checked(suite: Suite, made: BenchRun) -> None:
     check_suite(read_certificate(made.certificate), suite)
+
+
+@pytest.mark.render
+def test_the_commands_say_what_they_have_checked(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A sealed run warns of its folders; --quick runs nothing and says so; a run again is listed and marked."""
+    monkeypatch.setattr("simtest.bench.suite.load_suite", lambda *_: suite)
+    seal(suite, tmp_path)
+    file = tmp_path / SEALED
+    bench.run(out=tmp_path / "run", core="brightest_point", sealed=file)
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"tell what the seeds draw; publish {CERTIFICATE} alone" in told
+    secret = json.loads(file.read_text())["secret"]
+    part_seed = Seeds(secret).of_part(suite, "smooth")
+    text = (tmp_path / "run" / CERTIFICATE).read_text()
+    assert secret not in text
+    assert str(part_seed) not in text
+    monkeypatch.setattr("sys.stdin", io.StringIO(file.read_text()))
+    assert bench.verify(tmp_path / "run", sealed=Path("-"), verified=tmp_path / "list") == 0
+    assert "the certificate holds: it was run again" in capsys.readouterr().out
+    assert bench.verify(tmp_path / "run", quick=True) == 0
+    assert "the certificate is consistent; nothing was run" in capsys.readouterr().out
+    with pytest.raises(InputError, match="leave out --quick"):
+        bench.verify(tmp_path / "run", quick=True, verified=tmp_path / "list")
+    bench.table(tmp_path / "run", out=tmp_path / "table", verified=tmp_path / "list")
+    assert "run again</td>" in (tmp_path / "table" / "index.html").read_text()

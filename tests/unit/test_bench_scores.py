@@ -1,5 +1,7 @@
 """Figures of the benchmark: the uncertainty's scores on distributions that are known, and the penalty of refusals."""
 
+import json
+
 import numpy as np
 import polars as pl
 import pytest
@@ -103,7 +105,35 @@ def test_rows_of_one_scene_do_not_count_as_independent() -> None:
 
 def test_few_regions_get_no_verdict() -> None:
     assert _score(0.01, count=40).verdict == "too few"
-    assert score_uncertainty(_rows(3).with_columns(mahalanobis2=None), np.arange(3)).n == 0
+    unstated = dict.fromkeys(["cov_11", "cov_12", "cov_22", "mahalanobis2"])
+    assert score_uncertainty(_rows(3).with_columns(**unstated), np.arange(3)).n == 0
+
+
+@pytest.mark.parametrize(
+    ("covariance", "distance"),
+    [((0.0, 0.0, 0.0), None), ((1e-4, 1e-4, 1e-4), float("nan")), ((1e-320, 0.0, 1e-320), float("inf"))],
+)
+def test_a_singular_covariance_is_stated_and_missed(
+    covariance: tuple[float, float, float], distance: float | None
+) -> None:
+    """A core that states it for all answers is overconfident; for some of them, these lie outside."""
+    names = dict(zip(("cov_11", "cov_12", "cov_22"), map(pl.lit, covariance), strict=True))
+    singular = _rows(200).with_columns(**names, mahalanobis2=pl.lit(distance, pl.Float64))
+    score = score_uncertainty(singular, np.arange(200))
+    assert (score.n, score.coverage, score.verdict, score.inflation) == (200, 0.0, "overconfident", None)
+    assert score.energy_deg is not None
+    rows = pl.concat([_rows(200), singular.head(20)])
+    assert score_uncertainty(rows, np.arange(220)).verdict == "overconfident"
+    assert len(results_hash(rows)) == 64
+    assert results_hash(rows) == results_hash(rows.clone())
+
+
+def test_a_covariance_beyond_all_bounds_has_no_figures() -> None:
+    """What is not finite is no number of JSON: the certificate could not be written at the end of a run."""
+    names = {name: pl.lit(1e308) for name in ("cov_11", "cov_22")}
+    score = score_part(_rows(100).with_columns(**names, mahalanobis2=pl.lit(float("inf"))), {"plane": 4})
+    json.dumps(score.to_json(), allow_nan=False)
+    assert score.uncertainty.semi_axis_deg is None
 
 
 def test_the_energy_score_is_that_of_samples() -> None:

@@ -1,5 +1,6 @@
 """The frozen benchmark: its cases are pinned, and a changed one is refused."""
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -160,15 +161,34 @@ def test_what_is_no_sealed_file_is_refused(suite: Suite, tmp_path: Path, content
 
 @pytest.mark.parametrize("key", ["secret", "salt"])
 def test_a_commitment_cannot_be_opened_in_two_ways(suite: Suite, tmp_path: Path, key: str) -> None:
-    """The same text, split into salt and secret elsewhere, has the same hash: the form of both is fixed."""
+    """The same text, split into salt and secret elsewhere, is another commitment, and the form of both is fixed."""
     seal(suite, tmp_path)
     held = json.loads((tmp_path / SEALED).read_text())
-    other = "salt" if key == "secret" else "secret"
-    assert commitment_of(suite, "b c", "a") == commitment_of(suite, "c", "a b")
-    for value in ("b c", held[key][:-1], held[key].upper() + "G", "22"):
-        (tmp_path / "forged.json").write_text(json.dumps({**held, key: value, other: held[other]}))
-        with pytest.raises(InputError, match=f"{key} has {len(value)} characters; must be 64 of 0-9a-f"):
+    assert commitment_of(suite, "b c", "a") != commitment_of(suite, "c", "a b")
+    wrong = (
+        "b c",
+        held[key][:-1],
+        held[key].upper() + "G",
+        "22",
+        "\ud800",
+        held[key] + "\n",
+        None,
+        [held[key]],
+        10**63,
+    )
+    for value in wrong:
+        (tmp_path / "forged.json").write_text(json.dumps({**held, key: value}))
+        told = f"has {len(value)} characters" if isinstance(value, str) else "is no text"
+        with pytest.raises(InputError, match=f"{key} {told}; must be 64 of 0-9a-f$"):
             open_seal(suite, tmp_path / "forged.json")
+
+
+def test_a_seal_is_read_from_standard_input(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commitment = seal(suite, tmp_path)
+    monkeypatch.setattr("sys.stdin", io.StringIO((tmp_path / SEALED).read_text()))
+    assert open_seal(suite, Path("-")).commitment == commitment
+    with pytest.raises(InputError, match="--sealed -: cannot be read"):
+        open_seal(suite, Path("-"))
 
 
 SURFACES = {
