@@ -147,7 +147,8 @@ def test_poses_in_the_wrong_unit_are_told(film, tmp_path, factor, told):
 
 
 @pytest.mark.render
-def test_poses_with_the_axes_of_opengl_are_told(film, tmp_path):
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_poses_with_the_axes_of_opengl_are_told(film, tmp_path, name):
     """On right poses, `test_a_sequence_with_poses_tells_the_shape` asserts that nothing is said."""
     folder, options = film("saddle")
     table = json.loads((folder / "poses.json").read_text())
