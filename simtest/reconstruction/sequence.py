@@ -261,7 +261,7 @@ def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flip
     if is_flipped:
         told += (
             "\nwarning: the frames fit clearly better with y and z of the camera reversed; the axes must be x right, "
-            "y down, z forward, and OpenGL, Blender and NeRF have y up, z backward. Signs are wrong otherwise"
+            "y down, z forward, and OpenGL, Blender and NeRF have y up, z backward. Told signs may be wrong"
         )
     elif 2 * misfits > len(compared):
         told += "\nmost fit no curvature: are the poses world_from_camera, in mm, of these frames?"
