@@ -55,9 +55,13 @@ def score_dense(
 
     command = shlex.join(["simtest", *sys.argv[1:]])
     folder = out or Path("reports/scores") / (name or maps.resolve().name)
-    with progress_bar("writing the page") as progress:
-        options = MapOptions(name, encoding, frame, depth, unit_mm)
-        score = score_maps(str(maps), on, folder, options, command, progress)
+    options = MapOptions(name, encoding, frame, depth, unit_mm)
+    try:
+        with progress_bar("writing the page") as progress:
+            score = score_maps(str(maps), on, folder, options, command, progress)
+    except KeyboardInterrupt:
+        # The sums over frames are held in memory alone.
+        raise KeyboardInterrupt("an earlier page stays; the same command begins anew") from None
     if as_json:
         print_files([score.page], as_json, **score.to_json())
         return

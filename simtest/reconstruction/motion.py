@@ -12,7 +12,7 @@ import numpy as np
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.two_views import MovedView, PoseError, RankedHypotheses, rank_by_motions
+from simtest.estimators.two_views import CLEAR, MovedView, PoseError, RankedHypotheses, rank_by_motions
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.tracking import TrackedFrame
@@ -31,6 +31,9 @@ MOST_OFFSET = 0.05
 
 NEEDED = "curved"
 """Estimator of the curvatures whose signs are asked."""
+
+_FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From camera axes x right, y up, z backward, as OpenGL and Blender have them, to ours."""
 
 _BENDS = {1: "convex", -1: "concave", 0: "undecided"}
 
@@ -88,6 +91,26 @@ def judge_by_motion(
     return made
 
 
+def fits_flipped_axes(
+    judged: Sequence[TrackedFrame], poses: Sequence[Array | None], error: PoseError, priors: Priors
+) -> bool:
+    """Return whether the frames fit clearly better if the poses' camera axes are those of OpenGL.
+
+    Wrong axes are not always found so: where the motion is short, or along x alone, both fit. The median over the
+    highlights decides, by a squared distance that is less by the `CLEAR` of a told sign. See `judge_by_motion`, which
+    made `judged`.
+    """
+    turned = judge_by_motion(judged, [None if pose is None else pose @ _FLIPPED for pose in poses], error, priors)
+    pairs = [
+        (given.motion.distance2, other.motion.distance2)
+        for frame, flipped in zip(judged, turned, strict=True)
+        for given, other in zip(frame.specularities, flipped.specularities, strict=True)
+        if given.motion is not None and other.motion is not None
+    ]
+    gained = [given - other for given, other in pairs if given is not None and other is not None]
+    return bool(gained) and float(np.median(gained)) > CLEAR
+
+
 def _normal(estimates: Mapping[str, Estimate | Failure]) -> Estimate | None:
     """Return the normal of a highlight that judges others, by an estimator for a light at the camera."""
     for name in (NEEDED, "cone_axis"):
@@ -107,16 +130,20 @@ def _judge(
         return _undecided(first if isinstance(first, Failure) else Failure(Reason.NOT_KNOWN, "no curvature"))
     assert priors.distance_mm is not None
     lengths = np.array([np.linalg.norm(other[:3, 3] - pose[:3, 3]) for _, other, _ in track]) / priors.distance_mm.mean
+    to_others = lengths[[other is not frame for other, _, _ in track]]
+    motions = (float(to_others.min()), float(to_others.max())) if len(to_others) else None
     near = np.flatnonzero((lengths >= LEAST_MOTION) & (lengths <= MOST_MOTION))
     chosen = [track[i] for i in near[np.unique(np.linspace(0, len(near) - 1, MOST_VIEWS).round().astype(int))]] \
         if len(near) else []  # fmt: skip
     if not chosen:
         told = f"{LEAST_MOTION:g} to {MOST_MOTION:g} of the distance away"
-        return _undecided(Failure(Reason.NO_ESTIMATE, f"its track has no other frame {told}"))
+        undecided = _undecided(Failure(Reason.NO_ESTIMATE, f"its track has no other frame {told}"))
+        return replace(undecided, motions=motions)
     views = [MovedView([estimate], np.linalg.inv(other) @ pose, error) for _, other, estimate in chosen]
     ranked = rank_by_motions(first, views, priors)
     indices = tuple(other.index for other, _, _ in chosen)
-    return _undecided(ranked, indices) if isinstance(ranked, Failure) else _record(ranked, indices)
+    record = _undecided(ranked, indices) if isinstance(ranked, Failure) else _record(ranked, indices)
+    return replace(record, motions=motions)
 
 
 def _undecided(failure: Failure, frames: tuple[int, ...] = ()) -> MotionRecord:

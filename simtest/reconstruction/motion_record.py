@@ -29,6 +29,8 @@ class MotionRecord:
     distance2, freedom : float, int
         Squared Mahalanobis distance of that hypothesis, and its degrees of freedom; `fits` says whether it is one that
         chance explains.
+    motions : tuple of float, optional
+        Shortest and longest motion to another frame of its track, as shares of the distance; None where there is none.
     """
 
     status: str
@@ -41,6 +43,7 @@ class MotionRecord:
     distance2: float | None = None
     freedom: int = 0
     fits: bool = False
+    motions: tuple[float, float] | None = None
 
     @property
     def shape(self) -> str:

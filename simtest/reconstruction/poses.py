@@ -31,6 +31,8 @@ ROUNDED = 1e-3
 
 LISTS = ("frames", "views", "accepted", "poses")
 MATRICES = ("world_from_camera", "model_from_camera")
+NERF = "transform_matrix"
+"""Key of a pose in NeRF's files: with other axes, in an arbitrary unit."""
 SETTINGS = ("unit", "translation_error", "rotation_error_deg")
 NAMES = ("frame", "picture", "image", "name")
 
@@ -165,6 +167,11 @@ def _from_json(text: str, where: str) -> Read:
         matrix = entry
         if isinstance(entry, dict):
             matrix = next((entry[key] for key in MATRICES if key in entry), None)
+            if matrix is None and NERF in entry:
+                raise InputError(
+                    f"{at}: no {' or '.join(MATRICES)} but {NERF}, whose camera has y up and z backward; "
+                    "docs/howto/motion.md shows how to convert it"
+                )
             named = next((entry[key] for key in NAMES if entry.get(key) is not None), None)
             if named is not None and not isinstance(named, str):
                 raise InputError(f"{at}: names its frame {shown(str(named), 40)}; must be the name of a file")

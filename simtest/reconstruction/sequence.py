@@ -15,7 +15,14 @@ from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
-from simtest.reconstruction.motion import NEEDED, check_priors, judge_by_motion
+from simtest.reconstruction.motion import (
+    LEAST_MOTION,
+    MOST_MOTION,
+    NEEDED,
+    check_priors,
+    fits_flipped_axes,
+    judge_by_motion,
+)
 from simtest.reconstruction.motion_record import COLUMNS as MOTION_COLUMNS
 from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
@@ -143,7 +150,7 @@ def _reconstruct(
     found = sum(len(frame.specularities) for frame in run.frames)
     return SequenceResult(
         run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files, run.assumed,
-        _told_by_motion(run.frames, poses),
+        _told_by_motion(run.frames, poses, run.is_flipped),
     )  # fmt: skip
 
 
@@ -155,6 +162,7 @@ class _Run:
         self.frames: list[TrackedFrame] = []
         self.taken = self.failed = 0
         self.first_error = ""
+        self.is_flipped = False
         self.assumed: Sequence[Assumption] = ()
         self._calibration: Calibration | None = None
         self._cautions: list[str] = []
@@ -210,7 +218,9 @@ class _Run:
         assert self.options.camera is not None
         names, indices = [frame.name for frame in self.frames], [frame.index for frame in self.frames]
         told = poses.of_frames(names, indices, by_name)
-        self.frames = judge_by_motion(self.frames, told, poses.error, load_calibration(self.options.camera).priors)
+        priors = load_calibration(self.options.camera).priors
+        self.frames = judge_by_motion(self.frames, told, poses.error, priors)
+        self.is_flipped = fits_flipped_axes(self.frames, told, poses.error, priors)
         for frame in self.frames:
             path = self.folder / f"{frame.index:06d}.json"
             data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
@@ -233,20 +243,36 @@ def _read_done(path: Path, name: str) -> TrackedFrame | None:
     return frame if frame.name == name else None
 
 
-def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None) -> str | None:
+def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flipped: bool) -> str | None:
     """Say how many highlights' curvatures motion told; None without poses."""
     if poses is None:
         return None
     judged = [spot.motion for frame in frames for spot in frame.specularities if spot.motion is not None]
     shapes = Counter(each.shape for each in judged)
     counts = ", ".join(f"{count} {shape}" for shape, count in shapes.most_common())
-    misfits = sum(each.distance2 is not None and not each.fits for each in judged)
+    compared = [each for each in judged if each.distance2 is not None]
+    misfits = sum(not each.fits for each in compared)
     error = poses.error
     stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
-    return (
+    told = (
         f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
         f"error of the poses {'told' if poses.error_told else 'assumed'}: {stated}"
     )
+    if is_flipped:
+        told += (
+            "\nwarning: the frames fit clearly better with y and z of the camera reversed; the axes must be x right, "
+            "y down, z forward, and OpenGL, Blender and NeRF have y up, z backward. Told signs may be wrong"
+        )
+    elif 2 * misfits > len(compared):
+        told += "\nmost fit no curvature: are the poses world_from_camera, in mm, of these frames?"
+    motions = [each.motions for each in judged if each.motions is not None]
+    if motions and all(longest < LEAST_MOTION or shortest > MOST_MOTION for shortest, longest in motions):
+        shortest, longest = min(least for least, _ in motions), max(most for _, most in motions)
+        told += (
+            f"\nmotions are {shortest:.2g} to {longest:.2g} of the distance, and {LEAST_MOTION:g} to {MOST_MOTION:g} "
+            "are needed: is the unit of the poses right?"
+        )
+    return told
 
 
 def _settings(source: Path, options: Options) -> JsonObject:

@@ -132,6 +132,34 @@ def test_wrong_options_are_one_line(run, here, tmp_path, options, message):
     assert not (tmp_path / "scored" / "dense.json").exists()
 
 
+def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, tmp_path, monkeypatch):
+    from simtest.dataset.scoring.dense import from_folder
+
+    def render(*_):
+        raise AssertionError("rendered")
+
+    monkeypatch.setattr(from_folder, "scored_frames", render)
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "stranger.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
+    assert code != 0
+    assert "no map is called as a frame (found stranger.npy" in errors[-1]
+
+
+def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, tmp_path, monkeypatch):
+    from simtest.dataset.scoring.dense import from_folder
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(from_folder, "scored_frames", stop)
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
+    assert code == 130
+    assert errors[-1] == "simtest: stopped; an earlier page stays; the same command begins anew"
+
+
 def test_options_of_maps_are_refused_for_a_table(run, here, tmp_path):
     (tmp_path / "table.csv").write_text("frame,x_px,y_px,normal_x,normal_y,normal_z\n")
     code, _, errors = here("score", tmp_path / "table.csv", "--on", run[0], "--frame", "opengl")

@@ -102,6 +102,7 @@ def test_a_sequence_with_poses_tells_the_shape(film, name, tmp_path):
     assert track["shapes"] == [expected] * len(PLACES)
     assert f"{expected}, 4 of 4" in (tmp_path / "out" / "index.html").read_text()
     assert made.motion.startswith(f"bends of 4 highlights: 4 {expected}; 0 fit no curvature")
+    assert "\n" not in made.motion
 
 
 @pytest.mark.render
@@ -119,9 +120,44 @@ def test_wrong_poses_tell_nothing_wrong(film, tmp_path):
     made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
     bends, rows = shapes_in(tmp_path / "out")
     assert "4 fit no curvature" in made.motion
+    assert made.motion.splitlines()[1:] == [
+        "most fit no curvature: are the poses world_from_camera, in mm, of these frames?"
+    ]
     assert all(row["sign_1"] == row["sign_2"] == "0" for row in rows)
     # What one picture tells without any motion stays: an abs(1 + d k) below 1 is concave.
     assert all("convex" not in each for each in bends.values())
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    ("factor", "told"), [(1e-3, "motions are 3e-05 to"), (1e3, "of the distance, and 0.002 to 0.2")]
+)
+def test_poses_in_the_wrong_unit_are_told(film, tmp_path, factor, told):
+    folder, options = film("convex")
+    table = json.loads((folder / "poses.json").read_text())
+    for entry in table["frames"]:
+        for row in entry["world_from_camera"][:3]:
+            row[3] *= factor
+    wrong = tmp_path / "poses.json"
+    wrong.write_text(json.dumps(table))
+    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+    (line,) = made.motion.splitlines()[1:]
+    assert told in line
+    assert line.endswith("are needed: is the unit of the poses right?")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_poses_with_the_axes_of_opengl_are_told(film, tmp_path, name):
+    """On right poses, `test_a_sequence_with_poses_tells_the_shape` asserts that nothing is said."""
+    folder, options = film("saddle")
+    table = json.loads((folder / "poses.json").read_text())
+    for entry in table["frames"]:
+        entry["world_from_camera"] = (np.array(entry["world_from_camera"]) @ np.diag([1.0, -1, -1, 1])).tolist()
+    wrong = tmp_path / "poses.json"
+    wrong.write_text(json.dumps(table))
+    made = reconstruct_sequence(folder / "frames", tmp_path / "out", replace(options, poses=wrong))
+    assert "fit clearly better with y and z of the camera reversed" in made.motion.splitlines()[1]
 
 
 @pytest.mark.render

@@ -84,6 +84,8 @@ MALFORMED = {
     "holds no pose": ("a.json", "[]"),
     "must be a 4 x 4 matrix": ("a.json", "[[1, 2, 3]]"),
     "no world_from_camera or model_from_camera": ("a.json", '[{"frame": "a.png"}]'),
+    "but transform_matrix, whose camera has y up": (
+        "a.json", json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}]})),
     "determinant 1": ("a.json", json.dumps([np.diag([1.0, 1, -1, 1]).tolist()])),
     "must be rigid": ("a.json", json.dumps([np.diag([1.0, 1, 2, 1]).tolist()])),
     "NaN": ("a.json", "[[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),

@@ -8,9 +8,9 @@ from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.record import read_record
 
 
-def count_frames(folder: Path) -> int:
-    """Return how many frames were exported of a run or dataset; raise `InputError` where none was."""
-    return len(read_record(folder).frames)
+def frame_names(folder: Path) -> list[str]:
+    """Return the names of the frames that were exported of a run or dataset; raise `InputError` where none was."""
+    return list(read_record(folder).frames)
 
 
 def frames_of(folder: Path, progress: Progress | None = None, total: int = 0) -> Iterator[FrameTruth]:

@@ -109,11 +109,14 @@ class DenseScore:
         }  # fmt: skip
 
 
-def score_frames(frames: Frames, method: Method, options: MapOptions, on: str = "") -> DenseScore:
+def score_frames(
+    frames: Frames, method: Method, options: MapOptions, on: str = "", is_checked: bool = False
+) -> DenseScore:
     """Score a method's maps on frames, one at a time.
 
     Conventions that nobody stated are those that fit the truth of all frames best. The frames are scored by those
-    that fit the frames so far; where all of them together say otherwise, all are scored once more.
+    that fit the frames so far; where all of them together say otherwise, all are scored once more. `is_checked` says
+    that the names of the method's maps were checked against the frames before.
 
     Raises
     ------
@@ -126,7 +129,8 @@ def score_frames(frames: Frames, method: Method, options: MapOptions, on: str = 
     names: list[str] = []
     sources = _sources(method)
     score = _pass(frames, method, options, None, evidence, sources, names)
-    method.check(names)
+    if not is_checked:
+        method.check(names)
     what = f"maps {shown(method.name)}"
     if score is None:
         raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
@@ -231,15 +235,17 @@ def score_maps(
     InputError
         If a folder or a map cannot be read, no convention fits, or two fit alike.
     """
-    from simtest.dataset.scoring.dense.from_folder import count_frames, frames_of
+    from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
 
     options = options or MapOptions()
     options.check()
     method = open_method(maps)
-    total = count_frames(on)
+    names = frame_names(on)
     _refuse_run(out)
+    # Before anything is rendered, which takes long.
+    method.check(names)
     with exclusive_folder(out):
-        score = score_frames(lambda: frames_of(on, progress, total), method, options, str(on))
+        score = score_frames(lambda: frames_of(on, progress, len(names)), method, options, str(on), is_checked=True)
         write_score(score, out, command)
     return score
 
