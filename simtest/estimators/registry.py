@@ -10,6 +10,7 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
+from simtest.runtime.resources import shown
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
         if "," in name and not is_core(name):
             each = " ".join(f"--estimator {part.strip()}" for part in name.split(","))
             raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
+        if not is_core(name) and (" " in name.strip() or "/" in name):
+            raise InputError(
+                f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' "
+                "before it"
+            )
         # Raises where the name is not clear.
         short, given = _core(name) if is_core(name) else (name, ESTIMATORS.load(name))
         if short in loaded:

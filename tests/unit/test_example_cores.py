@@ -1,7 +1,6 @@
 """The example cores in other languages: each answers as the one in Python does, on the same requests."""
 
 import ast
-import os
 import shlex
 import shutil
 import subprocess
@@ -28,10 +27,8 @@ pytestmark = pytest.mark.skipif(not CORES.is_dir(), reason="the checkout's examp
 
 @pytest.fixture(scope="module")
 def asked():
-    """Sixty requests of patches from fresh random numbers; the seed shows where one fails."""
-    seed = int.from_bytes(os.urandom(4), "little")
-    print("seed", seed)
-    rng, cameras = np.random.default_rng(seed), core_driver.random_cameras()
+    """Sixty requests of random patches."""
+    rng, cameras = np.random.default_rng(20261123), core_driver.random_cameras()
     pairs = [(core_driver.random_patch(rng, cameras[i % 3]), cameras[i % 3]) for i in range(REQUESTS)]
     return [(*core_driver.isophote_request(i, *pair), *pair) for i, pair in enumerate(pairs)]
 

@@ -234,3 +234,9 @@ def test_a_command_has_the_name_of_what_the_user_wrote(folder, command, name):
     text = f"command: {command}"
     assert parse_core(text).name == name
     assert short_names(["cone_axis", text]) == ("cone_axis", name)
+
+
+@pytest.mark.parametrize("name", ["python script.py", "./program"])
+def test_a_command_without_its_prefix_is_told_so(folder, name):
+    with pytest.raises(InputError, match="is no estimator's name; a program of yours needs 'command: ' before it"):
+        load_estimators([name])

@@ -249,7 +249,9 @@ class Child:
             what = "the request was not read"
         else:
             what = f"an answer was begun ({reader.waiting} bytes) but not ended" if reader.waiting else "no answer"
-        return f"{what} within {limit_s:g} s{self.said()}"
+        # The likeliest cause of silence.
+        hint = " (nothing was written: is standard output flushed?)" if what == "no answer" else ""
+        return f"{what} within {limit_s:g} s{hint}{self.said()}"
 
     def said(self) -> str:
         """Return the last of what the core wrote to standard error, as the end of a sentence."""
