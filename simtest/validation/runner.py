@@ -149,7 +149,7 @@ def run_experiment(
     return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
 
 
-def _is_coloured(cases: Sequence[Case]) -> bool:
+def is_coloured(cases: Sequence[Case]) -> bool:
     """Return whether a scene has the colour of tissue."""
     return any("albedo" in case.data.get("reflectance", {}) for case in cases)
 
@@ -168,7 +168,7 @@ def run_experiments(
     started, clock = datetime.now(UTC), time.monotonic()
     # The variant is chosen here: a worker on another machine may have another environment.
     expanded = [expand(experiment) for experiment, _ in wanted]
-    variant = backend.requested_variant(variant, coloured=any(map(_is_coloured, expanded)))
+    variant = backend.requested_variant(variant, coloured=any(map(is_coloured, expanded)))
     jobs = [
         _Job(experiment, folder, cases, fingerprint(experiment, cases, variant))
         for (experiment, folder), cases in zip(wanted, expanded, strict=True)
