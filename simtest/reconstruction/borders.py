@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from simtest.detection.view_mask import DARK, View, brightest_channel
+from simtest.detection.view_mask import DARK, View
 
 BORDERED = "the picture has dark borders"
 """How the note about borders begins."""
@@ -25,8 +25,8 @@ def visible_box(picture: npt.NDArray[np.floating], view: View) -> tuple[Span, Sp
     if view.circle is not None:
         circle = view.circle
         return _span(circle.cx, circle.radius, width), _span(circle.cy, circle.radius, height)
-    lit = brightest_channel(np.ascontiguousarray(picture)) >= DARK
-    return _lit_span(np.asarray(lit.any(axis=0))), _lit_span(np.asarray(lit.any(axis=1)))
+    lit = (picture >= DARK).reshape(height, width, -1)
+    return _lit_span(np.asarray(lit.any(axis=(0, 2)))), _lit_span(np.asarray(lit.any(axis=(1, 2))))
 
 
 def border_note(picture: npt.NDArray[np.floating], view: View) -> str:

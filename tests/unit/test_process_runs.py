@@ -261,6 +261,7 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
     assert wait_until(lambda: not processes_with(mark))
 
 
+@pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
 @pytest.mark.parametrize("kind", ["published", "experiment"])
 def test_a_run_closes_its_cores(tmp_path, kind, request):
     mark = f"--mark={tmp_path.name}"
@@ -316,6 +317,7 @@ def test_a_changed_program_is_another_run(tmp_path, published):
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
 
 
+@pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
 def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, published):
     # Every request breaks down: at the sixth in a row the core is not asked any more, in each part anew.
     arguments = {"realisations": 3, "estimators": [command(BAD_CORE, "exit")]}
@@ -368,6 +370,7 @@ def test_a_worker_of_a_dataset_finds_its_core_in_any_folder(tmp_path, monkeypatc
     assert read_manifest(tmp_path / "data").dataset["estimators"] == [named]
 
 
+@pytest.mark.filterwarnings("ignore:.*is kept, since:UserWarning")
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
     def validate():
         return simtest.validate(published, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "exit")])
