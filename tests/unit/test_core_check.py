@@ -66,7 +66,8 @@ IN_ANSWERS = {
     "half_line": "core_timeout: an answer was begun",
     "half_array": "core_timeout: an answer was begun",
     "flood": "a line longer than",
-    "flood_after": "more than one answer",
+    # What follows an answer is read with it, before the next request, or as the next answer: as the pipe brings it.
+    "flood_after": "more than one answer|nobody asked for|a line longer than",
     "exit_after": "core_died: the core ended with exit code 0",
     "late": "core_timeout",
     "grandchild": "core_died: the core ended with exit code 0",
