@@ -30,7 +30,7 @@ def visible_box(picture: npt.NDArray[np.floating], view: View) -> tuple[Span, Sp
 
 
 def border_note(picture: npt.NDArray[np.floating], view: View) -> str:
-    """Say which columns and rows are dark borders, and what to do; empty where there are none to speak of."""
+    """Return a note of the dark borders' columns and rows, and what to do; empty where there are none to speak of."""
     columns, rows = visible_box(picture, view)
     height, width = picture.shape[:2]
     named = [

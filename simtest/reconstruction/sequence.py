@@ -244,7 +244,7 @@ def _read_done(path: Path, name: str) -> TrackedFrame | None:
 
 
 def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flipped: bool) -> str | None:
-    """Say how many highlights' curvatures motion told; None without poses."""
+    """Return how many highlights' curvatures motion told, as a sentence; None without poses."""
     if poses is None:
         return None
     judged = [spot.motion for frame in frames for spot in frame.specularities if spot.motion is not None]

@@ -221,7 +221,7 @@ class _Job:
 
 
 def _warn_of_kept(finished: Sequence[_Job]) -> None:
-    """Say that the answers of a core are those of an earlier run: not all that it reads is known."""
+    """Warn that the answers of a core are those of an earlier run: not all that it reads is known."""
     kept = [job.folder for job in finished if any(map(is_core, job.experiment.estimators))]
     if kept:
         warnings.warn(

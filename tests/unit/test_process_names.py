@@ -28,7 +28,7 @@ def no_core_stays():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Give a folder with a program, a script that is not executable, and a model."""
+    """Return a folder with a program, a script that is not executable, and a model."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "program").symlink_to(shutil.which("true"))
     (tmp_path / "script.py").write_text(BAD_CORE.read_text())
