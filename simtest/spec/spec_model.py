@@ -109,8 +109,18 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
             e for e in errors
             if not (e["type"] == "too_short" and any(p != e["loc"] and p[: len(e["loc"])] == e["loc"] for p in paths))
         ]  # fmt: skip
+        errors = sorted(errors, key=lambda e: _is_missing_by_typo(e, errors))
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
+
+
+def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
+    """Return whether a key is missing beside an unknown one of a similar name, which is then the error to tell."""
+    *table, key = error["loc"] or ("",)
+    beside = (e["loc"] for e in errors if e["type"] == "extra_forbidden")
+    return error["type"] == "missing" and any(
+        list(location[:-1]) == table and close_names(location[-1], [key], alike=0.5) for location in beside
+    )
 
 
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ from simtest.estimators.process.child import END_S, Child
 from simtest.estimators.process.command import CoreCommand, parse_core
 from simtest.estimators.process.core import Core, Hello, hello_of
 from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
+from simtest.estimators.process.naming import core_name
 from simtest.estimators.process.wire import PROTOCOL, CoreFault, encode
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array
@@ -121,11 +122,13 @@ def check_core(text: str) -> CoreReport:
     Raises
     ------
     InputError
-        If the program or the file cannot be used.
+        If the program or the file cannot be used, or the core is called as an installed estimator is.
     """
     # A command may end with the name of a TOML file too, which is an argument of it.
     is_named = text.startswith(PREFIX) or (is_core(text) and (len(text.split()) == 1 or Path(text).exists()))
-    command = parse_core(text if is_named else f"{PREFIX} {text}")
+    name = text if is_named else f"{PREFIX} {text}"
+    core_name(name)
+    command = parse_core(name)
     report = CoreReport(text)
     core = Core(command)
     try:

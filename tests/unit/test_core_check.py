@@ -231,3 +231,10 @@ def test_the_command_prints_lines_or_json_and_exits_with_the_verdict(here):
     assert report["hello"]["name"] == "bad core"
     assert report["steps"][1]["text"].endswith("no licence for this highlight")
     assert here("core", "check", "no_such_core")[0] == 2
+
+
+def test_a_core_called_as_an_installed_estimator_is_refused(tmp_path):
+    script = tmp_path / "cone_axis.py"
+    script.write_text(BAD.read_text())
+    with pytest.raises(InputError, match="is called cone_axis, as an installed estimator is"):
+        check_core(shlex.join([sys.executable, str(script)]))

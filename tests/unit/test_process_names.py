@@ -50,7 +50,9 @@ def folder(tmp_path, monkeypatch):
         ("command: .", "no program '.' on PATH"),
         ("command: ./model.onnx", "./model.onnx is not executable"),
         ("command: ./script.py", "./script.py is not executable"),
-        ("command: script.py", "a program in this folder is named ./"),
+        ("command: script.py", 'a script is called with what runs it: "python script.py"'),
+        ("command: model.onnx", "a program in this folder is named ./"),
+        ("typo.toml", "core.comand = 'python a.py': unknown key"),
         ("command: /dev/null", "/dev/null is a device"),
         ("missing.toml", "missing.toml"),
         ("inside.toml", "inside.toml"),
@@ -58,6 +60,7 @@ def folder(tmp_path, monkeypatch):
 )
 def test_a_command_that_cannot_be_run_is_refused_in_one_line(folder, text, words):
     (folder / "inside.toml").mkdir()
+    (folder / "typo.toml").write_text('[core]\nname = "mine"\ncomand = "python a.py"\n')
     with pytest.raises(InputError) as caught:
         load_estimators([text])
     assert words.replace("no program ", "no program '", 1) in str(caught.value) or words in str(caught.value)

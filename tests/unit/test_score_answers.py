@@ -162,6 +162,14 @@ def test_what_is_no_table_is_refused(record, tmp_path, content, what):
     assert "\n" not in str(error.value)
 
 
+def test_a_table_of_utf16_is_named_as_one(record, tmp_path):
+    path = tmp_path / "mine.csv"
+    write(path, GOOD)
+    path.write_text(path.read_text(), encoding="utf-16")
+    with pytest.raises(InputError, match=r"is UTF-16; must be a CSV table in UTF-8"):
+        read_answers(path, record, "mine")
+
+
 def test_a_broken_parquet_file_is_refused(record, tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match=r"t.parquet: no Parquet table"):

@@ -214,9 +214,9 @@ def _covariances(table: Table, is_answer: Mask) -> Array:
     first, mixed, second = made.T
     for name, value in (("cov_11", first), ("cov_22", second)):
         if (row := table.first(is_answer & ((value < 0) | (value > LARGEST_VARIANCE)))) is not None:
-            raise table.refuse(
-                row, f"{name} = {value[row]:g}: must be a variance in rad^2, 0 to {LARGEST_VARIANCE:.4g}"
-            )
+            unit = " (deg^2 times (pi / 180)^2 is rad^2)" if value[row] > 0 else ""
+            allowed = f"a variance in rad^2, 0 to {LARGEST_VARIANCE:.4g}{unit}"
+            raise table.refuse(row, f"{name} = {value[row]:g}: must be {allowed}")
     largest = np.sqrt(np.maximum(first * second, 0))
     if (row := table.first(is_answer & (np.abs(mixed) > largest * (1 + 1e-6) + 1e-15))) is not None:
         bound = f"at most sqrt(cov_11 cov_22) = {largest[row]:g} in size"

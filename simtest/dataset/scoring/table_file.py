@@ -1,5 +1,6 @@
 """Reads a table of answers, CSV or Parquet: its columns as numbers and texts."""
 
+import codecs
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -57,6 +58,8 @@ def read_table(path: Path) -> Table:
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror}); must be a CSV or Parquet table") from error
     is_parquet = path.suffix.lower() in (".parquet", ".pq")
+    if not is_parquet and _is_utf16(path):
+        raise InputError(f"{shown(path)}: is UTF-16; must be a CSV table in UTF-8")
     try:
         # As text: whether a value is a number is judged below, where the row is known.
         frame = pl.read_parquet(path, hive_partitioning=False) if is_parquet else pl.read_csv(path, infer_schema=False)
@@ -80,6 +83,12 @@ def read_table(path: Path) -> Table:
             kind = "text" if name in texts else "numbers"
             raise InputError(f"{shown(path)}: column {name} is {frame[name].dtype}; must hold {kind}") from error
     return Table(path, numbers, texts, frame.height)
+
+
+def _is_utf16(path: Path) -> bool:
+    """Return whether a file begins with the mark of UTF-16, as spreadsheets save "Unicode text"."""
+    with path.open("rb") as file:
+        return file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def _check_columns(path: Path, columns: Sequence[str]) -> None:

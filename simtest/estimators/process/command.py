@@ -28,6 +28,9 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 INTERPRETERS = re.compile(r"(python|pypy|octave|matlab|julia|java|node|ruby|perl|Rscript|bash|sh|env)([-0-9.]|$)")
 """Names of programs that run a file, by how they begin."""
 
+SCRIPTS = {".py": "python", ".m": "octave-cli", ".jl": "julia", ".js": "node", ".R": "Rscript", ".sh": "bash"}
+"""What runs a script, by the end of its name."""
+
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -174,14 +177,24 @@ def _exists(path: Path) -> bool:
         return False
 
 
+def _called(word: str) -> str:
+    """Return how a script is called; nothing if its name does not tell what runs it."""
+    interpreter = SCRIPTS.get(Path(word).suffix)
+    return f'a script is called with what runs it: "{interpreter} {shown(word, 80)}"' if interpreter else ""
+
+
 def _program(what: str, word: str, folder: Path) -> Path:
     """Return the absolute path of a program; raise `InputError` where it is missing or cannot be run."""
     if "/" not in word:
         found = shutil.which(word)
         # A directory of the name beside the user is no program, but a likely mistake.
         if found is None:
-            near = " (a program in this folder is named ./ and its name)" if _exists(folder / word) else ""
-            raise InputError(f"{what}: no program {shown(word, 80)!r} on PATH{near}")
+            near = (
+                ""
+                if not _exists(folder / word)
+                else _called(word) or "a program in this folder is named ./ and its name"
+            )
+            raise InputError(f"{what}: no program {shown(word, 80)!r} on PATH{f' ({near})' if near else ''}")
         return Path(os.path.abspath(found))
     path = folder / word
     if not _exists(path):
@@ -191,6 +204,8 @@ def _program(what: str, word: str, folder: Path) -> Path:
             f"{what}: {shown(word, 200)} is a {'folder' if path.is_dir() else 'device'}; must be a program"
         )
     if not os.access(path, os.X_OK):
-        raise InputError(f"{what}: {shown(word, 200)} is not executable; chmod +x, or name its interpreter before it")
+        raise InputError(
+            f"{what}: {shown(word, 200)} is not executable; must be a program ({_called(word) or 'chmod +x'})"
+        )
     # Links stay: a virtual environment's Python is one.
     return Path(os.path.normpath(path))
