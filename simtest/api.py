@@ -352,6 +352,9 @@ class Extras:
     depth_scale_mm: float | None = None
     """mm of one step of an integer depth map."""
 
+    reference_format: str | None = None
+    """Data set whose map the reference is."""
+
 
 def reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras | None = None
@@ -400,10 +403,12 @@ def _reconstruct_picture(
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
     reference = None
-    if extras.reference is not None or extras.pose is not None:
+    if (extras.reference, extras.pose, extras.reference_format) != (None, None, None):
         from simtest.validation.reference_surface import load_reference
 
-        reference = load_reference(extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm)
+        reference = load_reference(
+            extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm, extras.reference_format
+        )
     # linear light, detect, estimate, describe
     record = reconstruct_values(str(image), picture, calibration, options, cautions)
     if not record.specularities:

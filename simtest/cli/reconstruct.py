@@ -67,6 +67,9 @@ Every = Annotated[
     ),
 ]
 Reference = Annotated[Path | None, Parameter(help="Mesh in mm, or depth map, that the normals are compared with.")]
+ReferenceFormat = Annotated[
+    str | None, Parameter(help="Data set whose map the reference is: c3vd, simcol3d, ucl or endoslam.")
+]
 Pose = Annotated[
     Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
 ]
@@ -98,6 +101,7 @@ def reconstruct(
     target: Target = "fine",
     every: Every = False,
     reference: Reference = None,
+    reference_format: ReferenceFormat = None,
     camera_from_model: Pose = None,
     depth: Depth = None,
     depth_scale: DepthScale = None,
@@ -116,7 +120,7 @@ def reconstruct(
     from simtest.reconstruction.picture import Options, parse_roi
 
     sequence = is_sequence(image)
-    if sequence and (reference or camera_from_model or depth):
+    if sequence and (reference or reference_format or camera_from_model or depth):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
@@ -128,7 +132,8 @@ def reconstruct(
         return
     from simtest.api import Extras, reconstruct_picture
 
-    record, files = reconstruct_picture(image, out, options, Extras(reference, camera_from_model, depth, depth_scale))
+    extras = Extras(reference, camera_from_model, depth, depth_scale, reference_format)
+    record, files = reconstruct_picture(image, out, options, extras)
     if as_json:
         print_files(files, as_json, **record.to_json())
         return

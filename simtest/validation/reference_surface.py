@@ -112,9 +112,12 @@ Reference = MeshReference | DepthReference
 
 
 def load_reference(
-    path: Path | None, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None
-) -> Reference | None:
-    """Read a reference: a mesh with its pose, or a depth map in the camera frame; None where no file is named.
+    path: Path | None, pose: Path | None, camera: Camera, depth_scale_mm: float | None = None,
+    map_format: str | None = None,
+) -> Reference | None:  # fmt: skip
+    """Read a reference: a mesh with its pose, or a map in the camera frame; None where no file is named.
+
+    `map_format` names the data set whose map it is (`simtest.validation.references`); None: a plain depth map.
 
     Raises
     ------
@@ -124,14 +127,22 @@ def load_reference(
     if path is None:
         if pose is not None:
             raise InputError("--camera-from-model: needs --reference, the mesh that it places")
+        if map_format is not None:
+            raise InputError(f"--reference-format {shown(map_format)}: needs --reference, the map of that format")
         return None
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if pose is not None:
             raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
+        if map_format is not None:
+            from simtest.validation.references.read import load_map_reference
+
+            return load_map_reference(path, map_format, camera, depth_scale_mm)
         depth = read_depth(path, depth_scale_mm)
         points = depth_points(depth, camera)
         normals = depth_normals(points)
         return DepthReference(normals, str(path), depth_problems(points[..., 2], normals, camera))
+    if map_format is not None:
+        raise InputError(f"--reference-format {shown(map_format)}: is for maps; --reference {shown(path)} is a mesh")
     if pose is None:
         raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare

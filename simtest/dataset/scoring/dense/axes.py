@@ -4,25 +4,15 @@ Axes are written as the camera's own axis (x right, y down, z forward) that each
 "x,-y,-z" says that red holds x, green holds -y (up) and blue holds -z (towards the camera).
 """
 
-import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.axes import ALL, NAMED, matrix
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import shown
-
-NAMED = {"opencv": "x,y,z", "opengl": "x,-y,-z", "directx": "x,y,-z"}
-"""Common axes by name: y down and z forward; y up and z towards the camera; y down and z towards the camera."""
-
-ALL = tuple(
-    ",".join(f"{sign}{axis}" for sign, axis in zip(signs, axes, strict=True))
-    for axes in itertools.permutations("xyz")
-    for signs in itertools.product(("", "-"), repeat=3)
-)
-"""All 48 assignments of channels to axes."""
 
 LEAST_COSINE = 0.5
 """A mean cosine between map and truth below this, 60 deg, is no fit."""
@@ -46,20 +36,6 @@ def parse_axes(text: str) -> str:
             "x,-y,-z"
         )
     return axes
-
-
-def described(axes: str) -> str:
-    """Return axes with their name, if they have one."""
-    name = next((name for name, own in NAMED.items() if own == axes), None)
-    return axes if name is None else f"{axes} ({name})"
-
-
-def matrix(axes: str) -> Array:
-    """Return the signed permutation, shape (3, 3), that maps a channel vector to the camera frame."""
-    turned = np.zeros((3, 3))
-    for channel, axis in enumerate(axes.split(",")):
-        turned["xyz".index(axis[-1]), channel] = -1.0 if axis[0] == "-" else 1.0
-    return turned
 
 
 _MATRICES = np.stack([matrix(axes) for axes in ALL])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from simtest.dataset.scoring.dense.axes import AxesEvidence, described, parse_axes, to_camera, unit
+from simtest.dataset.scoring.dense.axes import AxesEvidence, parse_axes, to_camera, unit
 from simtest.dataset.scoring.dense.depth import KINDS, DepthEvidence, DepthKind, depth_factor
 from simtest.dataset.scoring.dense.frame_truth import FrameTruth
 from simtest.dataset.scoring.dense.map_files import (
@@ -18,6 +18,7 @@ from simtest.dataset.scoring.dense.map_files import (
     length_error,
 )
 from simtest.errors import InputError
+from simtest.geometry.axes import described
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import shown
