@@ -1,6 +1,6 @@
 """The camera of a scene, and camera files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,8 +9,7 @@ from pydantic import Field, model_validator
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, ViewMask
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
-from simtest.runtime.resources import shown
-from simtest.spec.camera_tables import camera_toml
+from simtest.runtime.arrays import Array
 from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
@@ -33,9 +32,6 @@ PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface", "uncertainty"})
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
-
-OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
-MATLAB_SUFFIX = ".mat"
 
 
 class BrownConradySpec(Spec):
@@ -180,9 +176,9 @@ def load_camera(path: str | Path) -> Camera:
     Parameters
     ----------
     path : str or Path
-        By its suffix: YAML (.yml, .yaml), XML or JSON as OpenCV or ROS (camera_info) write them; .mat as MATLAB saves a
-        struct of ``toStruct(cameraParams)``; anything else TOML with the keys of `CameraSpec`, at top level or under
-        ``[camera]``.
+        A camera file of OpenCV, ROS, MATLAB, COLMAP, NeRF, Kalibr, Vicalib, OCamCalib or C3VD, recognised by what it
+        holds, or TOML with the keys of `CameraSpec`, at top level or under ``[camera]``. FILE#ID names one camera of
+        several.
 
     Raises
     ------
@@ -198,17 +194,12 @@ def load_camera(path: str | Path) -> Camera:
     >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
     True
     """
+    # Imported on demand: scenes need no format but TOML.
+    from simtest.spec.camera_formats.files import read_table, recognise
+
     path = Path(path)
-    kind = path.suffix.lower()
-    # Imported on demand: OpenCV and SciPy are slow to load, and scenes need neither.
-    if kind in OPENCV_SUFFIXES:
-        from simtest.spec.camera_formats.opencv import read_opencv
-
-        return _validated(read_opencv(path), path)
-    if kind == MATLAB_SUFFIX:
-        from simtest.spec.camera_formats.matlab import read_matlab
-
-        return _validated(read_matlab(path), path)
+    if recognise(path) != "toml":
+        return _validated(read_table(path), path)
     # The camera's keys under [camera], or at top level beside the other tables of a calibration file
     data = {key: value for key, value in read_toml(path).items() if key not in NOT_OF_THE_CAMERA}
     table = data.get("camera", data)
@@ -219,19 +210,13 @@ def load_camera(path: str | Path) -> Camera:
     return _validated(table, path)
 
 
-def is_toml(path: Path) -> bool:
-    """Return whether `load_camera` reads a file as TOML: its suffix is none of OpenCV's, ROS' or MATLAB's."""
-    return path.suffix.lower() not in (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
-
-
 def _validated(table: Mapping[str, Any], path: Path) -> Camera:
     return validate(CameraSpec, table, str(path)).model()
 
 
-CAMERA_FORMATS = ("toml", "opencv", "ros")
-
-
-def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "opencv", "ros"] | None = None) -> None:
+def save_camera(
+    camera: Camera, path: str | Path, format: str | None = None, poses: Sequence[tuple[str, Array]] | None = None
+) -> None:
     """Write a camera file that `load_camera` reads back.
 
     Parameters
@@ -240,9 +225,11 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
         What to write.
     path : str or Path
         The file; replaced if it exists.
-    format : {"toml", "opencv", "ros"}, optional
-        Default by the suffix: .toml is simtest's own; .yml, .yaml, .xml and .json are OpenCV's. "ros" is a camera_info
-        file (.yml, .yaml).
+    format : {"toml", "opencv", "ros", "colmap"}, optional
+        Default by the suffix: .toml is simtest's own; .yml, .yaml, .xml and .json are OpenCV's, .txt is COLMAP's
+        cameras.txt. "ros" is a camera_info file (.yml, .yaml).
+    poses : list of (str, ndarray), optional
+        Names of frames and their world_from_camera, shape (4, 4), OpenCV axes, where the format holds poses.
 
     Raises
     ------
@@ -258,25 +245,7 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
     True
     """
-    path = Path(path)
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
     # Imported on demand, as in `load_camera`.
-    from simtest.runtime.files import write_atomically
-    from simtest.runtime.machine_errors import cannot_write
-    from simtest.spec.camera_formats.opencv import opencv_text, ros_text
+    from simtest.spec.camera_formats.writing import write_camera
 
-    suffixes = {"toml": (".toml",), "opencv": OPENCV_SUFFIXES, "ros": (".yml", ".yaml")}
-    chosen = format or ("toml" if path.suffix.lower() == ".toml" else "opencv")
-    if chosen not in suffixes:
-        raise InputError(f"format = {shown(chosen)!r}: must be one of {', '.join(CAMERA_FORMATS)}")
-    if path.suffix.lower() not in suffixes[chosen]:
-        raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(suffixes[chosen])}")
-    if chosen == "toml":
-        text = camera_toml(camera)
-    else:
-        text = ros_text(camera) if chosen == "ros" else opencv_text(camera, path.suffix.lower())
-    try:
-        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise cannot_write(error, shown(path), path) from error
+    write_camera(camera, path, format, poses)

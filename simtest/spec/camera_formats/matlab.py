@@ -14,11 +14,17 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
+from simtest.spec.camera_formats.common import Table
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 
 
-def read_matlab(path: Path) -> dict[str, Any]:
+def read_cameras(path: Path) -> dict[str, Table]:
+    """Return the file's one camera, whose id is empty; see `read_matlab`."""
+    return {"": read_matlab(path)}
+
+
+def read_matlab(path: Path) -> Table:
     """Read a calibration of MATLAB as the table of a `CameraSpec`.
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
