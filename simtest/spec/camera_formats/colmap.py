@@ -4,7 +4,6 @@ The centre of the first pixel is (0.5, 0.5), as in simtest. Camera axes are Open
 camera_from_world: a quaternion w x y z, then a translation in the reconstruction's unit.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.geometry.quaternions import quaternion_of, rotation_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import Poses, Table, inverse, mask_text, number
+from simtest.spec.camera_formats.common import Poses, Table, inverse, mask_of_text, mask_text, number
 from simtest.spec.toml_files import read_text
 
 MODELS: dict[str, tuple[str, ...]] = {
@@ -51,7 +50,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
     for count, line in enumerate(read_text(path, "camera").splitlines(), 1):
         at, words = f"{where}: line {count}", line.split()
         if line.startswith(MASK):
-            mask = _mask(line.removeprefix(MASK), at)
+            mask = mask_of_text(line.removeprefix(MASK), at)
         if not words or words[0].startswith("#"):
             continue
         name = words[0]
@@ -61,16 +60,6 @@ def read_cameras(path: Path) -> dict[str, Table]:
         if mask is not None:
             cameras[name]["view_mask"], mask = mask, None
     return cameras
-
-
-def _mask(text: str, at: str) -> Table:
-    try:
-        made = json.loads(text)
-    except ValueError:
-        made = None
-    if not isinstance(made, dict):
-        raise InputError(f"{at}: view_mask {shown(text, 60)}: must be a JSON object")
-    return made
 
 
 def _camera(words: Sequence[str], at: str) -> Table:

@@ -2,8 +2,11 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -11,6 +14,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import ViewMask
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown, suggestion
+from simtest.spec.toml_files import read_text
 
 Table = dict[str, Any]
 """A camera as the table of a `CameraSpec`."""
@@ -23,6 +27,33 @@ ROUNDED = 1e-3
 
 MOST_SHOWN = 12
 """Cameras of a file that a message lists."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; raise `InputError` where the file holds none."""
+    where, text = shown(path), read_text(path, "camera")
+    try:
+        # OpenCV has long written 1. for 1.0, which is no JSON.
+        data = json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
+    except RecursionError:
+        raise InputError(f"{where}: not valid JSON: nested too deeply") from None
+    except ValueError as error:
+        raise InputError(f"{where}: not valid JSON: {shown(error, 80)}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{where}: holds a {type(data).__name__}; must be an object of keys and values")
+    return data
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """Read an XML file without a document type, and return its root; raise `InputError` where it is malformed."""
+    where, text = shown(path), read_text(path, "camera")
+    # Entities, which a document type declares, can grow without end; no calibration has any.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{where}: not valid XML: document types and entities are not allowed")
+    try:
+        return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        raise InputError(f"{where}: not valid XML: {shown(error, 80)}") from error
 
 
 def number(value: Any, where: str, name: str, whole: bool = False) -> float:
@@ -92,6 +123,17 @@ def chosen(cameras: Mapping[str, Table], wanted: str | None, where: str) -> Tabl
 def mask_text(mask: ViewMask) -> str:
     """Return a view mask as JSON, for formats that skip what they do not know."""
     return json.dumps(mask_table(mask))
+
+
+def mask_of_text(text: Any, where: str) -> Table:
+    """Return the table of a `ViewMaskSpec` that `mask_text` wrote."""
+    try:
+        made = json.loads(text)
+    except (TypeError, ValueError):
+        made = None
+    if not isinstance(made, dict):
+        raise InputError(f"{where}: view mask {shown(repr(text), 60)}: must be a JSON object")
+    return made
 
 
 def mask_table(mask: ViewMask) -> dict[str, float]:

@@ -111,6 +111,8 @@ def read_cameras(path: str | Path) -> dict[str, Table]:
     """
     path, _ = split_id(path)
     kind = recognise(path)
+    if path.is_dir():
+        path = path / "cameras.txt"
     if kind in ("colmap images", "photometric", "toml"):
         raise InputError(f"{shown(path)}: {NAMES[kind]}: holds no camera that is read here; must be a camera file")
     return _readers()[kind](path)
@@ -131,6 +133,11 @@ def _readers() -> dict[str, Callable[[Path], dict[str, Table]]]:
         "opencv": late("opencv", "read_cameras"),
         "matlab": late("matlab", "read_cameras"),
         "colmap": late("colmap", "read_cameras"),
+        "transforms": late("transforms", "read_cameras"),
+        "kalibr": late("kalibr", "read_cameras"),
+        "vicalib": late("vicalib", "read_cameras"),
+        "ocamcalib": late("omnidirectional", "read_ocamcalib"),
+        "c3vd": late("omnidirectional", "read_c3vd"),
     }
 
 
@@ -149,7 +156,8 @@ def read_table(path: str | Path) -> Table:
 def read_poses(path: str | Path) -> Poses:
     """Read the poses that a file of another program holds: names of frames, and world_from_camera, shape (4, 4).
 
-    Axes are OpenCV's: x right, y down, z forward. The unit of length is the file's: COLMAP's and NeRF's is arbitrary.
+    Axes are OpenCV's: x right, y down, z forward. The unit of length is the file's: COLMAP's and NeRF's is arbitrary,
+    Kalibr's is made mm.
 
     Raises
     ------
@@ -166,8 +174,17 @@ def read_poses(path: str | Path) -> Poses:
         from simtest.spec.camera_formats.colmap import read_images
 
         poses = read_images(path)
+    elif kind == "transforms":
+        from simtest.spec.camera_formats import transforms
+
+        poses = transforms.read_poses(path)
+    elif kind == "kalibr":
+        from simtest.spec.camera_formats import kalibr
+
+        poses = kalibr.read_poses(path)
     else:
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no poses; must be COLMAP's images.txt or transforms.json")
+        must = "COLMAP's images.txt, transforms.json or a Kalibr chain"
+        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no poses; must be {must}")
     if not poses:
         raise InputError(f"{shown(path)}: holds no pose; must hold one for each frame")
     return poses

@@ -17,7 +17,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Table
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
@@ -301,6 +301,8 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
         raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {whose} ignores it; save as TOML instead")
     matrix = camera.K - np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]])
     lens = camera.distortion
+    if isinstance(lens, Scaramuzza):
+        raise InputError(f"camera.distortion: {whose} has no Scaramuzza lens; save as TOML or for MATLAB instead")
     if isinstance(lens, KannalaBrandt):
         return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
     values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]

@@ -12,7 +12,7 @@ from simtest.runtime.resources import shown, suggestion
 from simtest.spec.camera_formats.common import Poses
 from simtest.spec.camera_tables import camera_toml
 
-Format = Literal["toml", "opencv", "ros", "colmap"]
+Format = Literal["toml", "opencv", "ros", "colmap", "transforms", "matlab"]
 
 FORMATS: tuple[Format, ...] = get_args(Format)
 
@@ -21,10 +21,12 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "opencv": (".yml", ".yaml", ".xml", ".json"),
     "ros": (".yml", ".yaml"),
     "colmap": (".txt",),
+    "transforms": (".json",),
+    "matlab": (".mat",),
 }
 """Suffixes of the files of each format; the first format that has a suffix is its default."""
 
-WITH_POSES = ("colmap",)
+WITH_POSES = ("colmap", "transforms")
 """Formats that hold poses."""
 
 
@@ -80,6 +82,14 @@ def _contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> d
             files[path.with_name("images.txt")] = images_text(poses).encode()
             files[path.with_name("points3D.txt")] = POINTS_TEXT.encode()
         return files
+    if format == "transforms":
+        from simtest.spec.camera_formats.transforms import transforms_text
+
+        return {path: transforms_text(camera, poses).encode()}
+    if format == "matlab":
+        from simtest.spec.camera_formats.matlab import matlab_bytes
+
+        return {path: matlab_bytes(camera)}
     from simtest.spec.camera_formats.opencv import opencv_text, ros_text
 
     return {path: (ros_text(camera) if format == "ros" else opencv_text(camera, path.suffix.lower())).encode()}
