@@ -113,8 +113,10 @@ def read_cameras(path: str | Path) -> dict[str, Table]:
     kind = recognise(path)
     if path.is_dir():
         path = path / "cameras.txt"
-    if kind in ("colmap images", "photometric", "toml"):
-        raise InputError(f"{shown(path)}: {NAMES[kind]}: holds no camera that is read here; must be a camera file")
+    if kind == "photometric":
+        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no lens; give it as --photometric beside a camera file")
+    if kind in ("colmap images", "toml"):
+        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no camera; must be a camera file of another program")
     return _readers()[kind](path)
 
 
