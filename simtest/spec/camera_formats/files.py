@@ -53,10 +53,10 @@ _JSON_KINDS: tuple[tuple[str, Kind], ...] = (
 )
 _YAML_KINDS: tuple[tuple[str, Kind], ...] = ((r"^cam\d+\s*:", "kalibr"),)
 _TEXT_KINDS: tuple[tuple[str, Kind], ...] = (
-    (r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s", "colmap"),
-    (r"^\s*\d+(\s+[-+.\deE]+){7}\s+\d+\s+\S", "colmap images"),
-    (r"^\s*#?\s*polynomial coefficients|^\s*\d+(\s+[-+]?\d*\.?\d+([eE][-+]?\d+)?){5,}\s*$", "ocamcalib"),
-    (r"^\s*a0\s*[=:]", "c3vd"),
+    (r"^[ \t]*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d", "colmap"),
+    (r"^[ \t]*\d+([ \t]+[-+.\deE]+){7}[ \t]+\d+[ \t]+\S", "colmap images"),
+    (r"^[ \t]*#?[ \t]*polynomial coefficients|^[ \t]*\d+([ \t]+[-+.\deE]+){5,}[ \t]*$", "ocamcalib"),
+    (r"^[ \t]*a0[ \t]*[=:]", "c3vd"),
 )
 
 
