@@ -64,7 +64,7 @@ def split_id(path: str | Path) -> tuple[Path, str | None]:
     """Return the file and the camera's id of "FILE#ID"; no id where there is none, or a file has that very name."""
     path = Path(path)
     head, mark, wanted = path.name.rpartition("#")
-    if not mark or not head or path.exists():
+    if not mark or not head or _holds(path, Path.exists):
         return path, None
     return path.with_name(head), wanted
 
@@ -77,7 +77,7 @@ def recognise(path: str | Path) -> Kind:
     """
     path, _ = split_id(path)
     suffix = path.suffix.lower()
-    if path.is_dir() and (path / "cameras.txt").is_file():
+    if _holds(path / "cameras.txt", Path.is_file):
         return "colmap"
     if suffix == MATLAB_SUFFIX:
         return "matlab"
@@ -94,6 +94,14 @@ def recognise(path: str | Path) -> Kind:
     if suffix in OPENCV_SUFFIXES:
         return _first(_YAML_KINDS, head, "opencv")
     return _first((*_TEXT_KINDS, *_YAML_KINDS), head, "toml")
+
+
+def _holds(path: Path, test: Callable[[Path], bool]) -> bool:
+    """Return whether a test of a path holds; a name that no file can have is refused where the file is read."""
+    try:
+        return test(path)
+    except (OSError, ValueError):
+        return False
 
 
 def _first(kinds: tuple[tuple[str, Kind], ...], head: str, otherwise: Kind) -> Kind:
