@@ -42,8 +42,7 @@ def load_calibration(
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-    from typing import Any
-    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640
@@ -99,8 +98,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-    from typing import Any
-    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640
