@@ -69,7 +69,7 @@ class Peristalsis(_Periodic):
     A w(z, t) (r/R) exp((1 - (r/R)^2)/2), w = (1 + cos(2 pi (z/wavelength - t/period)))/2: by A at most, at r = R.
     """
 
-    kind: Literal["peristalsis"] = "peristalsis"
+    type: Literal["peristalsis"] = "peristalsis"
     axis: Direction = Field(description="along which the waves travel, model frame, any length; through centre_mm")
     radius_mm: Size = Field(description="distance from the axis at which the displacement is largest, mm")
     wavelength_mm: Size = Field(description="distance between contractions along the axis, mm")
@@ -78,9 +78,7 @@ class Peristalsis(_Periodic):
     def stretch(self) -> float:
         """Bound sqrt((A sqrt(e)/R)^2 + (pi A/wavelength)^2): of the parts across the axis and along it."""
         amplitude = abs(self.amplitude_mm)
-        return math.hypot(
-            amplitude * math.exp(0.5) / self.radius_mm, math.pi * amplitude / self.wavelength_mm
-        )
+        return math.hypot(amplitude * math.exp(0.5) / self.radius_mm, math.pi * amplitude / self.wavelength_mm)
 
     @property
     def _lengths(self) -> tuple[str, ...]:
@@ -94,7 +92,7 @@ class Breathing(_Periodic):
     by A s (1 - warp (1 - cos(2 pi b/wavelength))/2); then all is turned by s turn_deg about `axis`, through centre_mm.
     """
 
-    kind: Literal["breathing"] = "breathing"
+    type: Literal["breathing"] = "breathing"
     direction: Direction = Field(description="of the motion, model frame, any length")
     along: Direction = Field((1.0, 0.0, 0.0), description="along which the motion varies, model frame, any length")
     wavelength_mm: Size = Field(100.0, description="of this variation, mm")
@@ -118,7 +116,7 @@ class Dent(_Periodic):
     Points move along `direction` by A s exp(-|X - centre|^2/(2 radius^2)), s = (1 - cos(2 pi t/period))/2.
     """
 
-    kind: Literal["dent"] = "dent"
+    type: Literal["dent"] = "dent"
     direction: Direction = Field(description="in which the probe presses, model frame, any length")
     radius_mm: Size = Field(description="standard deviation of the dent, mm")
 
@@ -132,4 +130,4 @@ class Dent(_Periodic):
         return ("radius_mm",)
 
 
-Deformation = Annotated[Peristalsis | Breathing | Dent, Field(discriminator="kind")]
+Deformation = Annotated[Peristalsis | Breathing | Dent, Field(discriminator="type")]

@@ -55,7 +55,7 @@ class MapJets:
         """
         K = self.inverse_transpose
         g = np.einsum("nij,nj->ni", K, gradient)
-        bent = hessian - np.einsum("ni,nijk->njk", g, self.hessian)
+        bent = hessian - (g[:, None] @ self.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3)
         return g, np.asarray(K @ bent @ np.swapaxes(K, 1, 2))
 
 
@@ -72,8 +72,8 @@ class _Part(ABC):
     def jets(self, points: Array) -> MapJets:
         u, first, second = self.displacement(points, 2)
         R = self.turn
-        jacobian = R @ (np.eye(3) + first)
-        return MapJets(self._turned(points + u), jacobian, np.einsum("ij,njkl->nikl", R, second))
+        second = (R @ second.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
+        return MapJets(self._turned(points + u), R @ (np.eye(3) + first), second)
 
     def moved(self, points: Array) -> Array:
         return self._turned(points + self.displacement(points, 0)[0])
@@ -163,9 +163,7 @@ class _Along(_Part):
 
     def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
         v = self._direction
-        return tuple(
-            np.asarray(np.multiply.outer(v, part).swapaxes(0, 1)) for part in self.amount(points, order)
-        )
+        return tuple(np.asarray(np.multiply.outer(v, part).swapaxes(0, 1)) for part in self.amount(points, order))
 
 
 class _Breath(_Along):
@@ -247,13 +245,12 @@ class DeformationAt:
 
     def jets(self, points: Array) -> MapJets:
         """Return the map and its derivatives at points at rest, shape (N, 3), model frame, mm."""
-        count = len(points)
-        jets = MapJets(points, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3, 3)))
-        for part in self._parts:
+        jets = self._parts[0].jets(points)
+        for part in self._parts[1:]:
             # Chain rule; H = J2 H1 + H2[J1, J1].
             own, J = part.jets(jets.value), jets.jacobian
-            bent = np.einsum("nij,njkl->nikl", own.jacobian, jets.hessian)
-            bent += np.einsum("niab,naj,nbk->nijk", own.hessian, J, J, optimize=True)
+            bent = (own.jacobian @ jets.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
+            bent += np.swapaxes(J, 1, 2)[:, None] @ own.hessian @ J[:, None]
             jets = MapJets(own.value, own.jacobian @ J, bent)
         return jets
 

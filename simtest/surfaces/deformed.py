@@ -150,7 +150,7 @@ class DeformedSurface(SurfaceModel):
         t = hits.distance.copy()
         # The renderer's hit lies on a flat triangle of the deformed mesh.
         for _ in range(NEWTON_STEPS):
-            X, points, step, jets = self._tangent_step(origins + t[:, None] * directions, directions, hits, t)
+            points, step, jets = self._tangent_step(origins + t[:, None] * directions, directions, hits, t)
             t = t + step
             with np.errstate(invalid="ignore"):
                 moving = np.abs(step) > CONVERGED * t
@@ -162,7 +162,7 @@ class DeformedSurface(SurfaceModel):
 
     def _tangent_step(
         self, at: Array, directions: Array, hits: RayHits, t: Array
-    ) -> tuple[Array, SurfacePoints, Array, MapJets]:
+    ) -> tuple[SurfacePoints, Array, MapJets]:
         """Meet the tangents of the rays' curves at rest with the surface; return how far along the rays that is."""
         X = self.deformation.at_rest(at)
         jets = self.deformation.jets(X)
@@ -172,7 +172,7 @@ class DeformedSurface(SurfaceModel):
         reach = REACH * t
         start = RayHits(reach, hits.face, hits.barycentric)
         points = self.rest.points(X - reach[:, None] * tangent, tangent, start)
-        return X, points, (points.distance - reach) / speed, jets
+        return points, (points.distance - reach) / speed, jets
 
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points and normals move between neighbouring rays (see `SurfaceModel.motion`)."""
