@@ -7,6 +7,7 @@ the other frame's camera. It needs no search for matches, so it is true where a 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -27,6 +28,14 @@ the smooth surface."""
 
 NEAR = 0.05
 """Within this share of the distance the mesh may seem to hide a point at a grazing ray: the exact surface decides."""
+
+EXACT = 1e-9
+"""The same share for points at the edges of what both frames see, where the exact surface decides."""
+
+JUMP = 0.02
+"""Where the distances of neighbours differ by more than this share there is an edge."""
+
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
 Moved = Callable[[Array], Array]
 """Maps points of the world, shape (N, 3), mm, at one frame's moment to where the same material is at the other's."""
@@ -126,6 +135,10 @@ def flow_between(session: Session, first: SeenSurface, second: SeenSurface, move
     if second.instrument is not None:
         hidden |= _at(second.instrument, target[candidates]) > 0
     state[candidates] = np.where(hidden, HIDDEN, SEEN)
+    # At the edges of what both see a point may be hidden by less than the slack.
+    edge = candidates[_edges(state.reshape(size), first).reshape(-1)[candidates]]
+    at = np.searchsorted(index, edge)
+    state[edge[_not_shown(session, second.world_from_camera[:3, 3], there[at])]] = HIDDEN
     flow = target.reshape(*size, 2) - first.camera.pixel_centres()
     return Flow(flow, state.reshape(size))
 
@@ -149,6 +162,26 @@ def hides(session: Session, centre: Array, points: Array) -> Mask:
             # A ray that grazes the mesh and misses the exact surface is free.
             hidden[near] = exact < distance[near] * (1 - SLACK)
     return hidden
+
+
+def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
+    """Return which points, world frame, mm, are not the exact surface's points on the rays from a camera centre."""
+    towards = points - centre
+    distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+    exact = session.exact_distances(np.broadcast_to(centre, points.shape), towards / distance[:, None])
+    # Another point, nearer, or farther where the mesh lets the ray pass; a ray without a solution touches at best.
+    return ~(np.abs(exact - distance) < EXACT * distance)
+
+
+def _edges(state: npt.NDArray[np.uint8], frame: SeenSurface) -> Mask:
+    """Return which pixels that both frames see lie beside one that they do not, or at a jump of the distance."""
+    seen = state == SEEN
+    gone = ((state == NONE) | (state == HIDDEN)).astype(np.uint8)
+    beside = cv2.dilate(gone, _NEIGHBOURS) > 0
+    distance = np.linalg.norm(frame.position - frame.world_from_camera[:3, 3], axis=-1).astype(np.float32)
+    far = cv2.dilate(np.nan_to_num(distance, nan=0.0), _NEIGHBOURS)
+    near = cv2.erode(np.nan_to_num(distance, nan=np.inf), _NEIGHBOURS)
+    return np.asarray(seen & (beside | (far / (1 + JUMP) > near)))
 
 
 def _at(image: npt.NDArray[np.uint8], points_px: Array) -> npt.NDArray[np.uint8]:
