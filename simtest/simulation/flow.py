@@ -144,7 +144,10 @@ def flow_between(session: Session, first: SeenSurface, second: SeenSurface, move
 
 
 def hides(session: Session, centre: Array, points: Array) -> Mask:
-    """Return which points of a session's surface, shape (N, 3), it hides itself from a camera centre; world frame, mm."""
+    """Return which points of a session's surface, shape (N, 3), it hides itself from a camera; world frame, mm.
+
+    `centre` is that of one camera, shape (3,), or of each point's, shape (N, 3).
+    """
     towards = points - centre
     distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
     directions = towards / distance[:, None]
