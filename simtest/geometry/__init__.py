@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
     from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
     from simtest.geometry.gaussian_smoothing import smooth
+    from simtest.geometry.omnidirectional import Scaramuzza
     from simtest.geometry.patch import Patch
     from simtest.runtime.arrays import Array, Image, Index, Mask
 
@@ -28,6 +29,7 @@ _HOMES = {
     "simtest.geometry.distortion": ("BrownConrady", "Distortion", "KannalaBrandt"),
     "simtest.geometry.ellipse_fit": ("FittedConic", "fit_ellipse", "fit_ellipses"),
     "simtest.geometry.gaussian_smoothing": ("smooth",),
+    "simtest.geometry.omnidirectional": ("Scaramuzza",),
     "simtest.geometry.patch": ("Patch",),
     "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
 }
@@ -47,6 +49,7 @@ __all__ = [
     "KannalaBrandt",
     "Mask",
     "Patch",
+    "Scaramuzza",
     "ViewMask",
     "circle_pose",
     "circle_poses",

@@ -117,7 +117,7 @@ class Camera:
         Principal point, px, pixel centres at integer + 0.5.
     skew : float
         px.
-    distortion : BrownConrady or KannalaBrandt, optional
+    distortion : BrownConrady, KannalaBrandt or Scaramuzza, optional
         The lens between sightlines and normalised image coordinates; default none.
     view_mask : ViewMask, optional
         The part of the image that is seen; default all of it.
@@ -252,8 +252,8 @@ class Camera:
         """Return the pixels, shape (..., 2), at which the lens images points or directions, shape (..., 3).
 
         These are in the camera frame. Like `unproject` it describes the lens alone, also outside the image and the view
-        mask; what is in view, `contains` decides. NaN where the lens images nothing: z <= 0 (but for a fisheye, which
-        sees sideways and backwards), and where the lens folds over.
+        mask; what is in view, `contains` decides. NaN where the lens images nothing: z <= 0 (but for lenses that
+        see sideways and backwards), and where the lens folds over.
         """
         P = np.asarray(points, dtype=float)
         if self.distortion is not None:

@@ -5,26 +5,16 @@ first monotone branch only, from the optical axis outwards: beyond it the lens w
 two directions.
 """
 
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.checks import check_number
+from simtest.geometry.lens_curves import CLOSE, NEWTON_STEPS, STEEPEST, check_finite, first_root, invert
+from simtest.geometry.omnidirectional import Scaramuzza
 from simtest.runtime.arrays import Array, Mask
-
-Curve = Callable[[Array], tuple[Array, Array]]
-
-NEWTON_STEPS = 100
-STEEPEST = 1e6
-"""Largest tangent of a field angle for which a perspective lens is evaluated."""
-
-CLOSE = 4 * float(np.finfo(float).eps)
-REAL_ROOT = 1e-9
-"""An imaginary part below this share of a root's size is rounding."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +55,7 @@ class BrownConrady:
     k6: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        check_finite(self)
 
     @cached_property
     def limit(self) -> float:
@@ -79,7 +69,7 @@ class BrownConrady:
         above, below = self._radial_polynomials
         # Numerator of the slope of sqrt(u) above/below.
         slope = (above + 2 * u * above.deriv()) * below - 2 * u * above * below.deriv()
-        return float(np.sqrt(_first_root(slope))), float(np.sqrt(_first_root(below)))
+        return float(np.sqrt(first_root(slope))), float(np.sqrt(first_root(below)))
 
     @cached_property
     def _reach(self) -> float:
@@ -121,7 +111,7 @@ class BrownConrady:
         if tangential:
             # Tangential terms may carry a point a little beyond what the radial part alone reaches.
             reach = np.minimum(radius, 0.99 * self._reach)
-        inner = _invert(self._radial, reach, self.limit, self._reach)
+        inner = invert(self._radial, reach, self.limit, self._reach)
         with np.errstate(invalid="ignore", divide="ignore"):
             xy = np.where(radius[..., None] > 0, target * (inner / radius)[..., None], target)
         # refine: the tangential terms too
@@ -225,13 +215,13 @@ class KannalaBrandt:
     k4: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        check_finite(self)
 
     @cached_property
     def limit_angle(self) -> float:
         """End of the first monotone branch, rad; pi where it does not fold over."""
         slope = Polynomial([1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
-        return float(min(np.pi, np.sqrt(_first_root(slope))))
+        return float(min(np.pi, np.sqrt(first_root(slope))))
 
     def distort(self, rays: npt.ArrayLike) -> Array:
         """Return image coordinates as `BrownConrady.distort` does; NaN beyond the branch, and straight behind."""
@@ -250,7 +240,7 @@ class KannalaBrandt:
         target = np.asarray(m, dtype=float)
         radius = np.hypot(target[..., 0], target[..., 1])
         top = self.limit_angle
-        theta = _invert(self._radial, radius, top, float(self._radial(np.array(top))[0]))
+        theta = invert(self._radial, radius, top, float(self._radial(np.array(top))[0]))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(radius > 0, np.sin(theta) / radius, theta)
         return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
@@ -262,48 +252,16 @@ class KannalaBrandt:
         return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
 
 
-Distortion = BrownConrady | KannalaBrandt
+Distortion = BrownConrady | KannalaBrandt | Scaramuzza
+
+LENSES: dict[str, type[Distortion]] = {
+    "brown_conrady": BrownConrady,
+    "kannala_brandt": KannalaBrandt,
+    "scaramuzza": Scaramuzza,
+}
+"""Lenses by the names that they have in files."""
 
 
-def _check_finite(model: Distortion) -> None:
-    for name, value in zip(model.__dataclass_fields__, astuple(model), strict=True):
-        check_number(f"distortion.{name}", value)
-
-
-def _first_root(polynomial: Polynomial) -> float:
-    """Return the smallest positive real root of a polynomial that is 1 at 0; inf where there is none."""
-    # The reversed polynomial, whose first coefficient is that 1, has the inverse roots: tiny last coefficients then
-    # make roots near 0 instead of a companion matrix with huge entries.
-    inverse = np.roots(polynomial.coef)
-    real = np.real(inverse)[np.abs(np.imag(inverse)) <= REAL_ROOT * np.abs(inverse)]
-    most = float(max(real, default=0.0))
-    return 1 / most if most > 1 / STEEPEST**2 else np.inf
-
-
-def _invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
-    """Solve curve(x) = value >= 0 for x in [0, top), by Newton steps kept inside a bracket; NaN without a solution.
-
-    The curve, which returns value and slope, is 0 at 0 and rises to `reach`, which may be inf, at `top`.
-    """
-    wanted = np.ravel(value).astype(float)
-    found = np.full(wanted.shape, np.nan)
-    open_ = np.flatnonzero((wanted < reach) & np.isfinite(wanted))
-    # start: the identity, or the middle of the bracket
-    low, high, target = np.zeros(len(open_)), np.full(len(open_), top), wanted[open_]
-    x = np.minimum(target, 0.5 * high)
-    for _ in range(NEWTON_STEPS):
-        # narrow the bracket, then take Newton's step where it stays inside, else bisect
-        reached, slope = curve(x)
-        gap = reached - target
-        low, high = np.where(gap < 0, x, low), np.where(gap > 0, x, high)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            after = x - gap / slope
-        after = np.where((after >= low) & (after <= high), after, (low + high) / 2)
-        # points leave the iteration as they converge
-        done = (np.abs(after - x) <= CLOSE * x) | (np.abs(gap) <= CLOSE * target)
-        found[open_[done]] = after[done]
-        open_, target, low, high, x = (part[~done] for part in (open_, target, low, high, after))
-        if not len(open_):
-            break
-    found[open_] = x
-    return found.reshape(np.shape(value))
+def lens_name(lens: Distortion) -> str:
+    """Return the name that a lens has in files."""
+    return next(name for name, kind in LENSES.items() if isinstance(lens, kind))

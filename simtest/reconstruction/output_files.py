@@ -11,7 +11,7 @@ import numpy as np
 
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.geometry import Camera, KannalaBrandt
+from simtest.geometry import BrownConrady, Camera
 from simtest.reconstruction.constraints import constraints_arrays, constraints_json
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
@@ -135,8 +135,9 @@ def arrows_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: Se
 
 def _surface_point(result: Estimate, camera: Camera, depth_mm: float) -> Array | None:
     """Return the point at a depth on the sightline of a normal; None where there is no such sightline or depth."""
-    ray = camera.unproject(result.look_px)
-    point = depth_mm * (ray if isinstance(camera.distortion, KannalaBrandt) else ray / ray[2])
+    ray, lens = camera.unproject(result.look_px), camera.distortion
+    # Depth is along the optical axis of a perspective lens, along the sightline of one that sees sideways.
+    point = depth_mm * (ray / ray[2] if lens is None or isinstance(lens, BrownConrady) else ray)
     return np.asarray(point) if np.isfinite(point).all() else None
 
 

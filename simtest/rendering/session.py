@@ -32,7 +32,7 @@ from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.rest_map import rest_map
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
-from simtest.runtime.arrays import Array, Image, IntArray
+from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.motion import Motion
 from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
@@ -395,6 +395,25 @@ class Session:
         else:
             points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
         return exact.truth_maps(points, shading, geometric, centres.shape[:2])
+
+    def depths(self) -> Array:
+        """Return the exact distance of the surface at each pixel's centre, shape (H, W), mm; NaN off the surface.
+
+        The values are those of `truth`, without instruments, at a fraction of its cost.
+        """
+        if self._truth is not None:
+            return self._truth.depth
+        rays = self.sightlines.in_view(self.camera.pixel_centres().reshape(-1, 2))
+        distance = block_truth.distances(self.mi, self.surface, *rays, as_hits(self._centre_hits())[0])
+        return distance.reshape(self.camera.height, self.camera.width)
+
+    def exact_distances(self, origins: Array, directions: Array) -> Array:
+        """Return how far along rays of the model frame, shape (N, 3), the exact surface lies, mm; NaN: it does not."""
+        return self.surface.distances(origins, directions, self.exact_hits(origins, directions))
+
+    def blocked(self, origins: Array, directions: Array, reach: Array) -> Mask:
+        """Return which rays of the model frame, shape (N, 3), meet the rendered shape before `reach`, shape (N,), mm."""
+        return exact.trace_blocked(self.mi, self._built.scene, origins, directions, reach)
 
     def lit(self, positions: Array, light: int) -> Any:
         """Return which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""

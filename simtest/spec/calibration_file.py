@@ -6,7 +6,8 @@ from pathlib import Path
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
-from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, is_toml, load_camera
+from simtest.spec.camera_formats.files import FOREIGN_SUFFIXES, recognise
+from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.spec_model import validate
 from simtest.spec.toml_files import read_toml
 
@@ -17,8 +18,8 @@ def load_calibration(path: str | Path) -> Calibration:
     Parameters
     ----------
     path : str or Path
-        TOML with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level, under any name
-        that is not by its suffix a file of OpenCV, ROS or MATLAB; or anything else that `load_camera` reads.
+        TOML with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level; or anything
+        else that `load_camera` reads.
 
     Returns
     -------
@@ -43,7 +44,7 @@ def load_calibration(path: str | Path) -> Calibration:
     # camera
     camera = load_camera(path)
     # everything else, which only TOML holds
-    data = read_toml(path) if is_toml(path) else {}
+    data = read_toml(path) if recognise(path) == "toml" else {}
     if not isinstance(data.get("camera"), Mapping):
         # The camera's keys stand at top level, before the other tables.
         data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
@@ -83,7 +84,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     path = Path(path)
     if not isinstance(calibration, Calibration):
         raise InputError(f"calibration is a {type(calibration).__name__}: must be a simtest.Calibration")
-    if not is_toml(path):
+    if path.suffix.lower() in FOREIGN_SUFFIXES:
         raise InputError(f"{shown(path)}: a calibration is TOML, not {path.suffix}; name it .toml")
     # Imported on demand: reading needs neither.
     from simtest.runtime.files import write_atomically

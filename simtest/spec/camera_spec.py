@@ -1,16 +1,16 @@
 """The camera of a scene, and camera files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
-from simtest.runtime.resources import shown
-from simtest.spec.camera_tables import camera_toml
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.field_of_view import FovExtent, focal_of_view
+from simtest.runtime.arrays import Array
 from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
@@ -33,9 +33,6 @@ PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "rig", "surface", "uncertainty"})
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
-
-OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
-MATLAB_SUFFIX = ".mat"
 
 
 class BrownConradySpec(Spec):
@@ -79,7 +76,28 @@ class KannalaBrandtSpec(Spec):
         return KannalaBrandt(**self.model_dump(exclude={"type"}))
 
 
-DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec, Field(discriminator="type")]
+class ScaramuzzaSpec(Spec):
+    """An omnidirectional lens: the model of OCamCalib, of MATLAB's fisheye calibration and of C3VD.
+
+    The image point (x, y) sees the direction (x, y, 1 + k2 r^2 + k3 r^3 + k4 r^4), r its distance from the centre, and
+    lies (c x + d y, e x + y) focal lengths from the principal point. Of the coefficients in pixels, fx = fy = a0,
+    k2 = a2 a0, k3 = a3 a0^2 and k4 = a4 a0^3. It images angles of 90 deg and beyond.
+    """
+
+    type: Literal["scaramuzza"] = "scaramuzza"
+    k2: Coefficient = 0.0
+    k3: Coefficient = 0.0
+    k4: Coefficient = 0.0
+    c: float = Field(1.0, gt=0, le=1e3, description="of the matrix ((c, d), (e, 1))")
+    d: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
+    e: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
+
+    def model(self) -> Scaramuzza:
+        """Return the lens as the geometry package uses it."""
+        return Scaramuzza(**self.model_dump(exclude={"type"}))
+
+
+DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec | ScaramuzzaSpec, Field(discriminator="type")]
 
 
 class ViewMaskSpec(Spec):
@@ -101,6 +119,10 @@ class CameraSpec(Spec):
     height: int = Field(406, ge=1, le=16384, description="px")
     fx: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along x, px")
     fy: float = Field(406.0, ge=1e-3, le=1e6, description="focal length along y, px")
+    fov_deg: float | None = Field(
+        None, ge=0.05, le=360, description="instead of fx and fy: field of view of the lens, deg, with square pixels"
+    )
+    fov_of: FovExtent = Field("width", description="what fov_deg spans: the image's width, height or diagonal")
     cx: PrincipalPoint | None = Field(None, description="principal point, px; default the image's centre")
     cy: PrincipalPoint | None = Field(None, description="principal point, px; default the image's centre")
     skew: float = Field(0.0, ge=-1e6, le=1e6, description="px")
@@ -108,6 +130,33 @@ class CameraSpec(Spec):
         None, description="the lens; default none, a pinhole. It must not fold over inside the image or the view mask"
     )
     view_mask: ViewMaskSpec | None = Field(None, description="default: the whole image is seen")
+
+    @model_validator(mode="after")
+    def _focal_lengths(self) -> "CameraSpec":
+        if self.fov_deg is None:
+            if "fov_of" in self.model_fields_set:
+                raise ValueError(f"fov_of = {self.fov_of!r}: needs fov_deg")
+            return self
+        if self.skew != 0:
+            raise ValueError(f"skew = {self.skew:g}: must be 0 with fov_deg, which means square pixels")
+        if given := sorted({"fx", "fy"} & self.model_fields_set):
+            raise ValueError(f"fov_deg and {' and '.join(given)} exclude each other; give one of them")
+        try:
+            lens = None if self.distortion is None else self.distortion.model()
+            focal = focal_of_view(self.fov_deg, (self.width, self.height), self._centre_px, lens, self.fov_of)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        # Known from here on; a frozen model has no other way.
+        self.__dict__.update(fx=focal, fy=focal)
+        return self
+
+    @model_serializer(mode="wrap")
+    def _one_focal_length(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write the field of view or the focal lengths, never both: they exclude each other when they are read."""
+        table: dict[str, Any] = handler(self)
+        for key in ("fov_deg", "fov_of") if self.fov_deg is None else ("fx", "fy"):
+            table.pop(key, None)
+        return table
 
     @model_validator(mode="after")
     def _plausible(self) -> "CameraSpec":
@@ -141,10 +190,14 @@ class CameraSpec(Spec):
                 raise ValueError(str(error).removeprefix("camera.")) from None
         return self
 
+    @property
+    def _centre_px(self) -> tuple[float, float]:
+        return _centre(self.cx, self.cy, (self.width / 2, self.height / 2))
+
     def model(self) -> Camera:
         """Return the camera as the geometry package uses it."""
         middle = (self.width / 2, self.height / 2)
-        cx, cy = _centre(self.cx, self.cy, middle)
+        cx, cy = self._centre_px
         lens = None if self.distortion is None else self.distortion.model()
         mask = None
         if self.view_mask is not None:
@@ -180,9 +233,9 @@ def load_camera(path: str | Path) -> Camera:
     Parameters
     ----------
     path : str or Path
-        By its suffix: YAML (.yml, .yaml), XML or JSON as OpenCV or ROS (camera_info) write them; .mat as MATLAB saves a
-        struct of ``toStruct(cameraParams)``; anything else TOML with the keys of `CameraSpec`, at top level or under
-        ``[camera]``.
+        A camera file of OpenCV, ROS, MATLAB, COLMAP, NeRF, Kalibr, Vicalib, OCamCalib or C3VD, recognised by what it
+        holds, or TOML with the keys of `CameraSpec`, at top level or under ``[camera]``. FILE#ID names one camera of
+        several.
 
     Raises
     ------
@@ -198,40 +251,30 @@ def load_camera(path: str | Path) -> Camera:
     >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
     True
     """
+    # Imported on demand: scenes need no format but TOML.
+    from simtest.spec.camera_formats.files import read_table, recognise
+
     path = Path(path)
-    kind = path.suffix.lower()
-    # Imported on demand: OpenCV and SciPy are slow to load, and scenes need neither.
-    if kind in OPENCV_SUFFIXES:
-        from simtest.spec.camera_formats.opencv import read_opencv
-
-        return _validated(read_opencv(path), path)
-    if kind == MATLAB_SUFFIX:
-        from simtest.spec.camera_formats.matlab import read_matlab
-
-        return _validated(read_matlab(path), path)
+    if recognise(path) != "toml":
+        return _validated(read_table(path), path)
     # The camera's keys under [camera], or at top level beside the other tables of a calibration file
     data = {key: value for key, value in read_toml(path).items() if key not in NOT_OF_THE_CAMERA}
     table = data.get("camera", data)
     # A scene's camera has a default size and focal length; a file of its own must state them.
-    missing = [key for key in ("width", "height", "fx", "fy") if not isinstance(table, Mapping) or key not in table]
+    told = table if isinstance(table, Mapping) else {}
+    missing = [key for key in ("width", "height", *(() if "fov_deg" in told else ("fx", "fy"))) if key not in told]
     if missing:
-        raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, fx, fy")
+        raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, and fx and fy or fov_deg")
     return _validated(table, path)
-
-
-def is_toml(path: Path) -> bool:
-    """Return whether `load_camera` reads a file as TOML: its suffix is none of OpenCV's, ROS' or MATLAB's."""
-    return path.suffix.lower() not in (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
 
 
 def _validated(table: Mapping[str, Any], path: Path) -> Camera:
     return validate(CameraSpec, table, str(path)).model()
 
 
-CAMERA_FORMATS = ("toml", "opencv", "ros")
-
-
-def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "opencv", "ros"] | None = None) -> None:
+def save_camera(
+    camera: Camera, path: str | Path, format: str | None = None, poses: Sequence[tuple[str, Array]] | None = None
+) -> None:
     """Write a camera file that `load_camera` reads back.
 
     Parameters
@@ -240,9 +283,11 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
         What to write.
     path : str or Path
         The file; replaced if it exists.
-    format : {"toml", "opencv", "ros"}, optional
-        Default by the suffix: .toml is simtest's own; .yml, .yaml, .xml and .json are OpenCV's. "ros" is a camera_info
-        file (.yml, .yaml).
+    format : {"toml", "opencv", "ros", "colmap", "transforms", "matlab"}, optional
+        Default by the suffix: .toml is simtest's own; .yml, .yaml, .xml and .json are OpenCV's, .txt is COLMAP's
+        cameras.txt, .mat MATLAB's. "ros" is a camera_info file (.yml, .yaml), "transforms" transforms.json.
+    poses : list of (str, ndarray), optional
+        Names of frames and their world_from_camera, shape (4, 4), OpenCV axes, where the format holds poses.
 
     Raises
     ------
@@ -258,25 +303,7 @@ def save_camera(camera: Camera, path: str | Path, format: Literal["toml", "openc
     >>> simtest.load_camera(path) == simtest.Camera.from_fov(70.0, 640, 480)
     True
     """
-    path = Path(path)
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
     # Imported on demand, as in `load_camera`.
-    from simtest.runtime.files import write_atomically
-    from simtest.runtime.machine_errors import cannot_write
-    from simtest.spec.camera_formats.opencv import opencv_text, ros_text
+    from simtest.spec.camera_formats.writing import write_camera
 
-    suffixes = {"toml": (".toml",), "opencv": OPENCV_SUFFIXES, "ros": (".yml", ".yaml")}
-    chosen = format or ("toml" if path.suffix.lower() == ".toml" else "opencv")
-    if chosen not in suffixes:
-        raise InputError(f"format = {shown(chosen)!r}: must be one of {', '.join(CAMERA_FORMATS)}")
-    if path.suffix.lower() not in suffixes[chosen]:
-        raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(suffixes[chosen])}")
-    if chosen == "toml":
-        text = camera_toml(camera)
-    else:
-        text = ros_text(camera) if chosen == "ros" else opencv_text(camera, path.suffix.lower())
-    try:
-        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise cannot_write(error, shown(path), path) from error
+    write_camera(camera, path, format, poses)

@@ -4,7 +4,7 @@ from dataclasses import asdict
 from typing import NotRequired, TypedDict
 
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady
+from simtest.geometry.distortion import lens_name
 from simtest.spec.toml_files import toml_tables, toml_value
 
 
@@ -40,8 +40,7 @@ def camera_table(camera: Camera) -> CameraTable:
         "cx": camera.cx, "cy": camera.cy, "skew": camera.skew,
     }  # fmt: skip
     if camera.distortion is not None:
-        kind = "brown_conrady" if isinstance(camera.distortion, BrownConrady) else "kannala_brandt"
-        table["distortion"] = {"type": kind, **asdict(camera.distortion)}
+        table["distortion"] = {"type": lens_name(camera.distortion), **asdict(camera.distortion)}
     if camera.view_mask is not None:
         table["view_mask"] = {name: value for name, value in asdict(camera.view_mask).items() if value is not None}
     return table
@@ -64,7 +63,7 @@ def camera_toml(camera: Camera) -> str:
     """Return a camera as the text of simtest's own TOML file."""
     table = camera_table(camera)
     inner = {key: value for key, value in table.items() if isinstance(value, dict)}
-    lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt"}
+    lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt", "scaramuzza": "Scaramuzza"}
     kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]
     lines += [f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner]

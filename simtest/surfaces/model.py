@@ -176,6 +176,13 @@ class SurfaceModel(ABC):
         points = self.points(origins, directions, hits)
         return points if self.relief is None else self.relief.apply(points)
 
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return how far along rays the base surface lies, shape (N,), mm: `points` without normals and curvatures.
+
+        NaN where a ray has no point.
+        """
+        return self.points(origins, directions, hits).distance
+
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points of the base and their normals move between neighbouring rays.
 

@@ -14,7 +14,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.process.core import Hello, outline_names
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.distortion import BrownConrady
+from simtest.geometry.distortion import lens_name
 
 Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]
@@ -28,12 +28,11 @@ MOST_KEPT_RAYS = 1_000_000
 def camera_message(camera: Camera) -> dict[str, Any]:
     """Return a camera as a request holds it: size and K in px, pixel centres at integer + 0.5."""
     lens = camera.distortion
-    model = "brown_conrady" if isinstance(lens, BrownConrady) else "kannala_brandt"
     return {
         "width": camera.width,
         "height": camera.height,
         "K": camera.K.tolist(),
-        "distortion": None if lens is None else {"model": model, **asdict(lens)},
+        "distortion": None if lens is None else {"model": lens_name(lens), **asdict(lens)},
         "view_mask": None if camera.view_mask is None else asdict(camera.view_mask),
     }
 

@@ -1,8 +1,9 @@
-"""Camera files of MATLAB: structs of cameraParameters, saved in a .mat file of version 7 or older.
+"""Camera files of MATLAB: structs of cameraParameters or fisheyeIntrinsics, saved in a .mat file of version 7 or older.
 
 For MATLAB the centre of the first pixel is (1, 1), for simtest (0.5, 0.5): the principal point loses half a pixel.
 """
 
+import io
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,17 +13,27 @@ import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
+from simtest.spec.camera_formats.common import Table, mask_of_text, mask_text
+from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 
 
-def read_matlab(path: Path) -> dict[str, Any]:
+def read_cameras(path: Path) -> dict[str, Table]:
+    """Return the file's one camera, whose id is empty; see `read_matlab`."""
+    return {"": read_matlab(path)}
+
+
+def read_matlab(path: Path) -> Table:
     """Read a calibration of MATLAB as the table of a `CameraSpec`.
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
-    RadialDistortion and TangentialDistortion.
+    RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
+    DistortionCenter and ImageSize.
 
     Raises
     ------
@@ -30,8 +41,9 @@ def read_matlab(path: Path) -> dict[str, Any]:
         If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
     where, fields = shown(path), _struct(path)
+    mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None
     if "MappingCoefficients" in fields:
-        raise InputError(f"{where}: MappingCoefficients: MATLAB's fisheye model is not known; must be cameraParameters")
+        return _fisheye(fields, where) | {"view_mask": mask}
     matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
     # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
@@ -45,8 +57,19 @@ def read_matlab(path: Path) -> dict[str, Any]:
         "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
         "cx": float(matrix[0, 2]) - PIXEL_CENTRE, "cy": float(matrix[1, 2]) - PIXEL_CENTRE,
         "skew": float(matrix[0, 1]),
-        "distortion": {"type": "brown_conrady", **lens} if any(lens.values()) else None,
+        "distortion": {"type": "brown_conrady", **lens} if any(lens.values()) else None, "view_mask": mask,
     }  # fmt: skip
+
+
+def _fisheye(fields: Mapping[str, Any], where: str) -> Table:
+    """Return a fisheyeIntrinsics: Scaramuzza's model with x before y."""
+    mapping = _array(fields, "MappingCoefficients", 4, where).tolist()
+    height, width = _array(fields, "ImageSize", 2, where).tolist()
+    x, y = _array(fields, "DistortionCenter", 2, where).tolist()
+    c, d, e, one = _array(fields, "StretchMatrix", 4, where).tolist() if "StretchMatrix" in fields else (1, 0, 0, 1)
+    if one != 1:
+        raise InputError(f"{where}: StretchMatrix = {[[c, d], [e, one]]}: must have 1 in its last corner")
+    return scaramuzza_table((width, height), (x - PIXEL_CENTRE, y - PIXEL_CENTRE), mapping, (c, d, e), where)
 
 
 def _struct(path: Path) -> Mapping[str, Any]:
@@ -76,7 +99,8 @@ def _struct(path: Path) -> Mapping[str, Any]:
         )
         raise InputError(f"{where}: {kind}: {told}; {HOW}") from error
     # The variables themselves may be the fields of the struct.
-    found = {name: value for name, value in {"": data, **data}.items() if _is_calibration(value)}
+    nested = {name: value["Intrinsics"] for name, value in data.items() if _holds_intrinsics(value)}
+    found = {name: value for name, value in {"": data, **data, **nested}.items() if _is_calibration(value)}
     if len(found) == 1:
         return next(iter(found.values()))
     if len(found) > 1:
@@ -94,6 +118,11 @@ def _head(path: Path) -> bytes:
 
 def _is_calibration(value: Any) -> bool:
     return isinstance(value, Mapping) and bool({"IntrinsicMatrix", "K", "MappingCoefficients"} & set(value))
+
+
+def _holds_intrinsics(value: Any) -> bool:
+    """Return whether a variable is a struct of fisheyeParameters, which holds its intrinsics as a struct."""
+    return isinstance(value, Mapping) and isinstance(value.get("Intrinsics"), Mapping)
 
 
 def _matrix(fields: Mapping[str, Any], name: str, where: str) -> Any:
@@ -114,3 +143,44 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], 
         said = " or ".join(str(count) for count in allowed)
         raise InputError(f"{where}: {name} = {shown(repr(fields[name]), 80)}: must be {said} numbers")
     return value.astype(float).ravel()
+
+
+# Writing ---------------------------------------------------------------------------------------------------------
+
+
+def matlab_bytes(camera: Camera) -> bytes:
+    """Return a camera as a .mat file of version 5 that holds the struct `camera`.
+
+    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics. Raises `InputError` if MATLAB
+    has no such lens.
+    """
+    from scipy.io import savemat
+
+    lens = camera.distortion
+    fields: dict[str, Any] = {"ImageSize": np.array([camera.height, camera.width], dtype=float)}
+    if isinstance(lens, Scaramuzza):
+        if camera.fx != camera.fy or camera.skew != 0:
+            raise InputError("camera.fx, fy, skew: must be equal and 0, since MATLAB's fisheye has one scale")
+        # In pixels of the image plane: a_n = k_n / fx^(n - 1)
+        f = camera.fx
+        fields |= {
+            "MappingCoefficients": np.array([f, lens.k2 / f, lens.k3 / f**2, lens.k4 / f**3]),
+            "DistortionCenter": np.array([camera.cx, camera.cy]) + PIXEL_CENTRE,
+            "StretchMatrix": np.array([[lens.c, lens.d], [lens.e, 1.0]]),
+        }
+    elif isinstance(lens, KannalaBrandt):
+        raise InputError("camera.distortion: MATLAB has no Kannala-Brandt lens; save as TOML instead")
+    else:
+        lens = lens or BrownConrady()
+        if lens.k4 or lens.k5 or lens.k6:
+            raise InputError("camera.distortion: k4, k5, k6 must be 0, since MATLAB lacks them; save as TOML instead")
+        fields |= {
+            "K": camera.K + np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]]),
+            "RadialDistortion": np.array([lens.k1, lens.k2, lens.k3]),
+            "TangentialDistortion": np.array([lens.p1, lens.p2]),
+        }
+    if camera.view_mask is not None:
+        fields["ViewMask"] = mask_text(camera.view_mask)
+    buffer = io.BytesIO()
+    savemat(buffer, {"camera": fields})
+    return buffer.getvalue()

@@ -17,8 +17,9 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.resources import shown
+from simtest.spec.camera_formats.common import Table
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text
 
@@ -42,7 +43,12 @@ UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 """Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor, which simtest lacks."""
 
 
-def read_opencv(path: Path) -> dict[str, Any]:
+def read_cameras(path: Path) -> dict[str, Table]:
+    """Return the file's one camera, whose id is empty; see `read_opencv`."""
+    return {"": read_opencv(path)}
+
+
+def read_opencv(path: Path) -> Table:
     """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`.
 
     Raises
@@ -75,7 +81,7 @@ def read_opencv(path: Path) -> dict[str, Any]:
 def _parse(path: Path) -> Mapping[str, Any]:
     """Read a file into plain dicts, lists, numbers and text."""
     text, where = read_text(path, "camera"), shown(path)
-    kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower(), "YAML")
+    kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower()) or ("XML" if text.startswith("<") else "YAML")
     try:
         data = {"JSON": _parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
     except RecursionError:
@@ -295,6 +301,8 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
         raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {whose} ignores it; save as TOML instead")
     matrix = camera.K - np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]])
     lens = camera.distortion
+    if isinstance(lens, Scaramuzza):
+        raise InputError(f"camera.distortion: {whose} has no Scaramuzza lens; save as TOML or for MATLAB instead")
     if isinstance(lens, KannalaBrandt):
         return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
     values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]

@@ -1,0 +1,142 @@
+"""What the readers of camera files share: numbers, rigid transforms, and the choice of one camera of several."""
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.geometry.camera import ViewMask
+from simtest.runtime.arrays import Array
+from simtest.runtime.resources import shown, suggestion
+from simtest.spec.toml_files import read_text
+
+Table = dict[str, Any]
+"""A camera as the table of a `CameraSpec`."""
+
+Poses = Sequence[tuple[str, Array]]
+"""Names of frames, and their world_from_camera, shape (4, 4): OpenCV axes, in the file's unit of length."""
+
+ROUNDED = 1e-3
+"""How far a matrix may be from a rotation: files hold rounded numbers."""
+
+MOST_SHOWN = 12
+"""Cameras of a file that a message lists."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; raise `InputError` where the file holds none."""
+    where, text = shown(path), read_text(path, "camera")
+    try:
+        # OpenCV has long written 1. for 1.0, which is no JSON.
+        data = json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
+    except RecursionError:
+        raise InputError(f"{where}: not valid JSON: nested too deeply") from None
+    except ValueError as error:
+        raise InputError(f"{where}: not valid JSON: {shown(error, 80)}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{where}: holds a {type(data).__name__}; must be an object of keys and values")
+    return data
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """Read an XML file without a document type, and return its root; raise `InputError` where it is malformed."""
+    where, text = shown(path), read_text(path, "camera")
+    # Entities, which a document type declares, can grow without end; no calibration has any.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{where}: not valid XML: document types and entities are not allowed")
+    try:
+        return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        raise InputError(f"{where}: not valid XML: {shown(error, 80)}") from error
+
+
+def number(value: Any, where: str, name: str, whole: bool = False) -> float:
+    """Return a finite number, given as one or as text; raise `InputError` for anything else."""
+    try:
+        found = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        found = math.nan
+    if not math.isfinite(found) or (whole and found != round(found)):
+        kind = "whole" if whole else "finite"
+        raise InputError(f"{where}: {name} = {shown(repr(value), 60)}: must be a {kind} number")
+    return found
+
+
+def numbers(values: Any, where: str, name: str, counts: int | Sequence[int]) -> list[float]:
+    """Return a list of finite numbers of an allowed length."""
+    allowed = (counts,) if isinstance(counts, int) else tuple(counts)
+    if not isinstance(values, list | tuple):
+        raise InputError(f"{where}: {name} = {shown(repr(values), 60)}: must be a list of numbers")
+    if len(values) not in allowed:
+        said = " or ".join(str(count) for count in allowed)
+        raise InputError(f"{where}: {name}: {len(values)} values; must be {said}")
+    return [number(value, where, name) for value in values]
+
+
+def rigid(rows: Any, where: str, name: str) -> Array:
+    """Return a rigid transform, shape (4, 4), of 3 or 4 rows of 4 numbers; the rotation's rounding is taken out."""
+    if not isinstance(rows, list) or len(rows) not in (3, 4):
+        raise InputError(f"{where}: {name} = {shown(repr(rows), 60)}: must be 4 rows of 4 numbers")
+    T = np.eye(4)
+    T[: len(rows)] = [numbers(row, where, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDED) or np.linalg.det(R) < 0:
+        raise InputError(f"{where}: {name}: must begin with a rotation; R R^T is {shown((R @ R.T).round(3).tolist())}")
+    if not np.allclose(T[3], [0, 0, 0, 1]):
+        raise InputError(f"{where}: {name}: last row is {T[3].tolist()}; must be 0, 0, 0, 1")
+    U, _, V = np.linalg.svd(R)
+    T[:3, :3] = U @ V
+    return T
+
+
+def inverse(T: Array) -> Array:
+    """Return the inverse of a rigid transform, shape (4, 4)."""
+    made = np.eye(4)
+    made[:3, :3] = T[:3, :3].T
+    made[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return made
+
+
+def chosen(cameras: Mapping[str, Table], wanted: str | None, where: str) -> Table:
+    """Return the camera of an id, or the only one; raise `InputError`, which lists them, where that is unclear."""
+    if not cameras:
+        raise InputError(f"{where}: holds no camera; must hold one")
+    listed = ", ".join(list(cameras)[:MOST_SHOWN]) + (", ..." if len(cameras) > MOST_SHOWN else "")
+    if wanted is not None:
+        if wanted not in cameras:
+            raise InputError(
+                f"{where}: no camera {shown(wanted, 40)}; must be one of {listed}{suggestion(wanted, list(cameras))}"
+            )
+        return cameras[wanted]
+    tables = list(cameras.values())
+    if any(table != tables[0] for table in tables):
+        raise InputError(f"{where}: holds {len(cameras)} cameras ({listed}); name one as FILE#ID")
+    return tables[0]
+
+
+def mask_text(mask: ViewMask) -> str:
+    """Return a view mask as JSON, for formats that skip what they do not know."""
+    return json.dumps(mask_table(mask))
+
+
+def mask_of_text(text: Any, where: str) -> Table:
+    """Return the table of a `ViewMaskSpec` that `mask_text` wrote."""
+    try:
+        made = json.loads(text)
+    except (TypeError, ValueError):
+        made = None
+    if not isinstance(made, dict):
+        raise InputError(f"{where}: view mask {shown(repr(text), 60)}: must be a JSON object")
+    return made
+
+
+def mask_table(mask: ViewMask) -> dict[str, float]:
+    """Return a view mask as the table of a `ViewMaskSpec`."""
+    keys = ("radius", "corner", "half_height", "cx", "cy")
+    return {key: float(value) for key in keys if (value := getattr(mask, key)) is not None}
