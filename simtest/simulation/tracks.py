@@ -161,7 +161,7 @@ class Tracks:
         partner, deaths = _arrivals(forward, last.light, seen)
         # Back from what is left over: where a fold is near, one way may succeed where the other does not.
         rest = np.array([i for i in range(len(seen.light)) if i not in partner], dtype=np.int64)
-        backward = continuation.follow(surface, motion.reversed, seen.positions[rest], seen.light[rest])
+        backward = continuation.follow(surface.reversed, motion.reversed, seen.positions[rest], seen.light[rest])
         origins, why = _arrivals(backward, seen.light[rest], last)
         births = [ENDS] * len(seen.light)
         taken = set(partner.values())
